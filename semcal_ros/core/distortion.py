@@ -1,0 +1,135 @@
+"""Static distortion of the scan, forwards and backwards.
+
+The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and half the image width
+``n``:
+
+    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q),      r2 = |q|^2
+
+The radial term is the closed form of the division model (Fitzgibbon 2001, doi:10.1109/CVPR.2001.990465), the tangential
+one is the reading of equation (2) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, that makes sense: the printed
+bracket adds a squared displacement vector to a scalar.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Undistortion", "distort_jacobians", "distort_normalised", "undistort_normalised"]
+
+Array = NDArray[np.float64]
+
+_MAX_ITERATIONS = 50
+# Half an ulp of a coordinate of order one: Newton cannot do better in double precision.
+_TOLERANCE = 1e-14
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """Outcome of inverting the distortion.
+
+    Attributes
+    ----------
+    q
+        (n, 2) normalised ideal coordinates; NaN where ``converged`` is false.
+    converged
+        (n,) bool. False outside of the model's domain, or where Newton's method did not settle.
+    iterations
+        Number of Newton steps that were taken.
+    residual
+        (n,) distance of the re-distorted point from the input, in normalised units.
+    """
+
+    q: Array
+    converged: NDArray[np.bool_]
+    iterations: int
+    residual: Array
+
+
+def _radial(r2: Array, xi_r: Array) -> tuple[Array, Array]:
+    """Root ``s`` and factor ``lambda = 2 / (1 + s)``; NaN where ``4 xi_r r2 >= 1``."""
+    inside = 1.0 - 4.0 * xi_r * r2
+    root = np.sqrt(np.where(inside > 0.0, inside, np.nan))
+    return root, 2.0 / (1.0 + root)
+
+
+def distort_normalised(q: Array, xi_r: Array | float, xi_t: Array | float) -> Array:
+    """Distort (n, 2) normalised points; NaN rows where ``4 xi_r r2 >= 1``.
+
+    ``xi_r`` and ``xi_t`` are scalars or arrays of shape (n,).
+    """
+    r2 = np.sum(q * q, axis=1)
+    _, factor = _radial(r2, np.asarray(xi_r, dtype=np.float64))
+    tangential = np.asarray(xi_t, dtype=np.float64)[..., None] * (r2[:, None] + 2.0 * q * q)
+    return factor[:, None] * q + tangential
+
+
+def distort_jacobians(
+    q: Array, xi_r: Array | float, xi_t: Array | float
+) -> tuple[Array, Array, Array]:
+    """Distorted points with their derivatives.
+
+    Returns
+    -------
+    f, df_dq, df_dxi
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 2); the last axis of ``df_dxi`` is (xi_r, xi_t).
+    """
+    xi_radial = np.asarray(xi_r, dtype=np.float64)
+    xi_tangential = np.asarray(xi_t, dtype=np.float64)
+    r2 = np.sum(q * q, axis=1)
+    root, factor = _radial(r2, xi_radial)
+    bracket = r2[:, None] + 2.0 * q * q
+    f = factor[:, None] * q + xi_tangential[..., None] * bracket
+
+    growth = factor * factor / root  # d lambda / d(xi_r r2)
+    df_dq = 2.0 * (growth * xi_radial)[:, None, None] * q[:, :, None] * q[:, None, :]
+    df_dq = df_dq + 2.0 * xi_tangential[..., None, None] * q[:, None, :]
+    diagonal = factor[:, None] + 4.0 * xi_tangential[..., None] * q
+    df_dq[:, 0, 0] += diagonal[:, 0]
+    df_dq[:, 1, 1] += diagonal[:, 1]
+
+    df_dxi = np.stack([(growth * r2)[:, None] * q, bracket], axis=2)
+    return f, df_dq, df_dxi
+
+
+def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
+    """Invert the distortion of (n, 2) normalised points.
+
+    The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's method with the
+    analytic Jacobian. Fails (``converged`` false, NaN) where the point has no ideal counterpart on the branch that
+    contains the centre.
+    """
+    rd2 = np.sum(q_d * q_d, axis=1)
+    branch = np.isfinite(rd2) & (1.0 + xi_r * rd2 > 0.0) & (xi_r * rd2 < 1.0)
+    start = q_d / np.where(branch, 1.0 + xi_r * rd2, np.nan)[:, None]
+    if xi_t == 0.0:
+        return Undistortion(start, branch, 0, np.where(branch, 0.0, np.nan))
+
+    q = np.where(branch[:, None], start, np.nan)
+    error = np.full(len(q), np.nan)
+    done = np.zeros(len(q), dtype=bool)
+    iterations = 0
+    active = np.flatnonzero(branch)
+    while active.size and iterations < _MAX_ITERATIONS:
+        iterations += 1
+        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t)
+        miss = q_d[active] - f
+        determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+        # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.
+        good = np.isfinite(determinant) & (determinant > 0.0)
+        step = np.empty_like(miss)
+        safe = np.where(good, determinant, np.nan)
+        step[:, 0] = (jacobian[:, 1, 1] * miss[:, 0] - jacobian[:, 0, 1] * miss[:, 1]) / safe
+        step[:, 1] = (jacobian[:, 0, 0] * miss[:, 1] - jacobian[:, 1, 0] * miss[:, 0]) / safe
+        error[active] = np.hypot(miss[:, 0], miss[:, 1])
+        q[active] = q[active] + step
+        size = np.hypot(step[:, 0], step[:, 1])
+        settled = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
+        done[active[settled]] = True
+        active = active[good & ~settled & np.isfinite(size)]
+    # Rounding may keep the last step just above the tolerance: what maps back exactly is an answer.
+    done |= error <= 1e-12
+    q[~done] = np.nan
+    return Undistortion(q, done, iterations, error)

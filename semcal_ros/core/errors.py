@@ -1,0 +1,71 @@
+"""The one exception tree of the suite.
+
+Every error that a user can cause says three things on one line: what was seen, what was expected, and what to do.
+Programs catch :class:`SemcalError`; the command line prints ``str(error)`` and exits with status 2.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "BagError",
+    "CalibrationError",
+    "CalibrationFileError",
+    "ConfigError",
+    "InvalidValueError",
+    "MessageError",
+    "SemcalError",
+    "TiffError",
+]
+
+
+class SemcalError(Exception):
+    """Base of all errors raised on purpose.
+
+    Parameters
+    ----------
+    seen
+        What was found, with its value.
+    expected
+        What would have been accepted.
+    do
+        The next step for the user.
+    """
+
+    def __init__(self, seen: str, *, expected: str = "", do: str = "") -> None:
+        self.seen = seen
+        self.expected = expected
+        self.do = do
+        parts = [seen]
+        if expected:
+            parts.append(f"expected {expected}")
+        if do:
+            parts.append(do)
+        super().__init__(" ".join("; ".join(parts).split()))
+
+
+class InvalidValueError(SemcalError, ValueError):
+    """An argument is outside of what the function is defined for."""
+
+
+class CalibrationError(SemcalError):
+    """The data do not allow a calibration."""
+
+
+class CalibrationFileError(SemcalError):
+    """A calibration file is corrupt, foreign or from a newer version."""
+
+
+class ConfigError(SemcalError):
+    """A ``msg_configs`` file is wrong."""
+
+
+class MessageError(SemcalError):
+    """A ROS message has contents that cannot be used."""
+
+
+class BagError(SemcalError):
+    """A recording cannot be read or written."""
+
+
+class TiffError(SemcalError):
+    """An SEM TIFF file cannot be understood."""

@@ -1,0 +1,131 @@
+"""How well known cameras explain views of a grid: poses are fitted, cameras are not.
+
+This is the only figure by which calibrations are compared (design section 6.6): single parameters trade off against
+each other and against the poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.bundle import BundleResult, State, make_problem, refine
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.initial import pose_from_camera
+from semcal_ros.core.views import GridView
+
+__all__ = ["PoseFit", "fit_poses", "rms_by_magnification"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """Views with fitted poses.
+
+    Attributes
+    ----------
+    rotations, translations_m
+        (V, 3, 3) and (V, 3): sem frame from grid.
+    residuals_px
+        One (n, 2) array per view: observed minus projected pixels.
+    magnifications
+        (V,) magnification of each view.
+    converged
+        Whether the fit of the poses settled.
+    """
+
+    rotations: Array
+    translations_m: Array
+    residuals_px: tuple[Array, ...]
+    magnifications: Array
+    converged: bool
+
+    def rms_px(self) -> float:
+        """RMS distance over all corners, px."""
+        square = np.concatenate([np.sum(r * r, axis=1) for r in self.residuals_px])
+        return float(np.sqrt(np.mean(square)))
+
+
+def fit_poses(
+    views: Sequence[GridView],
+    camera_at: Callable[[float], ScanCamera],
+    *,
+    height_sigma_m: float = 1e-4,
+) -> PoseFit:
+    """Fit the pose of every view with the camera of its magnification held fixed.
+
+    Both signs of the tilt are tried. ``height_sigma_m`` is the prior 1-sigma of each view's height.
+
+    Raises
+    ------
+    CalibrationError
+        If there are no views, or a view's corners cannot be projected by the camera at all.
+    """
+    if not views:
+        raise CalibrationError("no views", expected="at least one view of a grid")
+    magnifications = np.unique([v.magnification for v in views])
+    cameras = [camera_at(float(g)) for g in magnifications]
+    of_view = [cameras[int(np.searchsorted(magnifications, v.magnification))] for v in views]
+    problem = make_problem(
+        views,
+        magnifications,
+        np.stack([c.parameters for c in cameras])[:, :, None],
+        norm_px=cameras[0].norm_px,
+        nominal_px_per_m=np.array([c.m for c in cameras]),
+        prior_mean=np.ones(1),
+        prior_sigma=np.ones(1),
+        height_sigma_m=height_sigma_m,
+    )
+    starts = [pose_from_camera(v, c) for v, c in zip(views, of_view, strict=True)]
+    fits = [
+        refine(
+            problem,
+            State(np.ones(1), np.stack([r[k] for r, _ in starts]), np.stack([t[k] for _, t in starts])),
+            fixed_theta=True,
+        )
+        for k in (0, 1)
+    ]
+    usable = [f for f in fits if np.isfinite(f.cost)]
+    if not usable:
+        raise CalibrationError(
+            "views that the calibration cannot project",
+            expected="images of the microscope that was calibrated",
+            do="check the magnification and the display width",
+        )
+    return _best_of(usable, problem.starts, magnifications[problem.group])
+
+
+def _best_of(fits: Sequence[BundleResult], starts: NDArray[np.intp], magnifications: Array) -> PoseFit:
+    costs = np.stack(
+        [np.add.reduceat(np.sum(f.residuals_px**2 * f.huber_weight[:, None], axis=1), starts[:-1]) for f in fits]
+    )
+    best = np.argmin(costs, axis=0)
+    return PoseFit(
+        rotations=np.stack([fits[k].state.rotations[v] for v, k in enumerate(best)]),
+        translations_m=np.stack([fits[k].state.translations_m[v] for v, k in enumerate(best)]),
+        residuals_px=tuple(
+            fits[k].residuals_px[starts[v] : starts[v + 1]] for v, k in enumerate(best)
+        ),
+        magnifications=magnifications,
+        converged=all(f.converged for f in fits),
+    )
+
+
+def rms_by_magnification(fit: PoseFit) -> dict[float, float]:
+    """RMS distance of the corners in px for each magnification, ascending."""
+    out: dict[float, float] = {}
+    for g in np.unique(fit.magnifications):
+        square = np.concatenate(
+            [
+                np.sum(r * r, axis=1)
+                for r, own in zip(fit.residuals_px, fit.magnifications, strict=True)
+                if own == g
+            ]
+        )
+        out[float(g)] = float(np.sqrt(np.mean(square)))
+    return out

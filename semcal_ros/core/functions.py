@@ -1,0 +1,135 @@
+"""Continuous functions of the magnification.
+
+Every kind is linear in its coefficients, ``f(g) = basis(g) @ coefficients``, so that one covariance matrix of all
+coefficients propagates exactly to any magnification. Outside of the range in which a function was determined it goes on
+along its tangent in log g; the caller flags that and widens the uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.polynomial import chebyshev, legendre
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["KINDS", "ContinuousFunction", "basis_row"]
+
+Array = NDArray[np.float64]
+
+KINDS = ("chebyshev_log", "chebyshev", "legendre", "linear_log", "ode")
+
+
+def _unit_interval(value: float, low: float, high: float) -> float:
+    return 2.0 * (value - low) / (high - low) - 1.0 if high > low else 0.0
+
+
+def _hat_row(value: float, knots: Array) -> Array:
+    row = np.zeros(len(knots))
+    if len(knots) == 1:
+        row[0] = 1.0
+        return row
+    i = int(np.clip(np.searchsorted(knots, value) - 1, 0, len(knots) - 2))
+    weight = (value - knots[i]) / (knots[i + 1] - knots[i])
+    row[i], row[i + 1] = 1.0 - weight, weight
+    return row
+
+
+def _ode_row(value: float, weights: Array) -> Array:
+    """First row of the transition matrix of D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x over ``value``."""
+    order = len(weights)
+    companion = np.diag(np.ones(order - 1), 1)
+    companion[-1] = -weights
+    return np.asarray(expm(companion * value)[0], dtype=np.float64)
+
+
+def basis_row(
+    kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array
+) -> Array:
+    """(size,) values of the basis functions at a magnification inside of ``g_range``."""
+    low, high = g_range
+    if kind == "chebyshev_log":
+        u = _unit_interval(np.log(g), np.log(low), np.log(high))
+        return np.asarray(chebyshev.chebvander(u, size - 1), dtype=np.float64).reshape(size)
+    if kind == "chebyshev":
+        u = _unit_interval(g, low, high)
+        return np.asarray(chebyshev.chebvander(u, size - 1), dtype=np.float64).reshape(size)
+    if kind == "legendre":
+        u = _unit_interval(g, low, high)
+        return np.asarray(legendre.legvander(u, size - 1), dtype=np.float64).reshape(size)
+    if kind == "linear_log":
+        return _hat_row(float(np.log(g)), np.log(shape))
+    return _ode_row((g - low) / (high - low) if high > low else 0.0, shape)
+
+
+@dataclass(frozen=True)
+class ContinuousFunction:
+    """One camera parameter as a function of the magnification g.
+
+    Parameters
+    ----------
+    kind
+        One of :data:`KINDS`: Chebyshev polynomial in log g or in g, Legendre polynomial in g, linear interpolation
+        in log g between knots, or the solution of a linear ordinary differential equation with constant
+        coefficients (principal differential analysis, appendix A of the paper).
+    coefficients
+        (k,) coefficients. For ``"ode"`` they are the value and its derivatives at the lower end of the range, with
+        the range scaled to [0, 1].
+    g_range
+        (lowest, highest) magnification for which the function was determined.
+    shape
+        Knots (magnifications) of ``"linear_log"``, weights w_0 ... w_(k-1) of ``"ode"``, empty otherwise.
+    """
+
+    kind: str
+    coefficients: Array
+    g_range: tuple[float, float]
+    shape: Array = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InvalidValueError(f"function kind {self.kind!r}", expected=", ".join(KINDS))
+        low, high = self.g_range
+        if not (0.0 < low <= high and np.isfinite(high)):
+            raise InvalidValueError(
+                f"magnification range {self.g_range}", expected="0 < lowest <= highest"
+            )
+        if self.coefficients.ndim != 1 or not np.all(np.isfinite(self.coefficients)):
+            raise InvalidValueError(
+                f"coefficients {self.coefficients!r}", expected="a vector of finite numbers"
+            )
+        shaped = self.kind in ("linear_log", "ode")
+        if self.size < 1 or (shaped and len(self.shape) != self.size):
+            raise InvalidValueError(
+                f"{self.size} coefficients with a shape of {len(self.shape)}",
+                expected="at least one coefficient, and a shape of equal length where the kind has one",
+            )
+        if self.kind == "linear_log" and not (
+            np.all(self.shape > 0) and np.all(np.diff(self.shape) > 0)
+        ):
+            raise InvalidValueError("knots out of order", expected="increasing magnifications")
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return len(self.coefficients)
+
+    def basis(self, g: float) -> Array:
+        """(size,) row such that ``value = basis(g) @ coefficients``; tangential in log g out of range."""
+        low, high = self.g_range
+        edge = min(max(g, low), high)
+        row = basis_row(self.kind, self.size, edge, self.g_range, self.shape)
+        if edge == g or high == low:
+            return row
+        step = 1e-4 * np.log(high / low) * (1.0 if g < low else -1.0)
+        inner = basis_row(
+            self.kind, self.size, edge * float(np.exp(step)), self.g_range, self.shape
+        )
+        return row + (inner - row) / step * float(np.log(g / edge))
+
+    def __call__(self, g: float) -> float:
+        """Value at the magnification ``g``."""
+        return float(self.basis(g) @ self.coefficients)

@@ -1,0 +1,112 @@
+"""The default calibration: one adjustment over all images at all magnifications.
+
+Its unknowns are the coefficients of the continuous functions themselves, so a magnification with few views borrows
+from its neighbours and nothing has to be interpolated afterwards (design section 6.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.bundle import BundleResult, Problem, State, refine
+from semcal_ros.core.functions import ContinuousFunction
+from semcal_ros.core.initial import initial_values
+from semcal_ros.core.problem import (
+    Functions,
+    Setup,
+    adjust,
+    build_problem,
+    constant_functions,
+    resolve_mirrored_tilts,
+    theta_of,
+    with_coefficients,
+)
+from semcal_ros.core.selection import Summary, select_functions
+
+__all__ = ["JointFit", "fit_joint"]
+
+Array = NDArray[np.float64]
+
+_SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+_MAX_ROUNDS = 5
+# Tolerance of the adjustments on the way; only the last one has to be exact.
+_COARSE = 1e-6
+# The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
+_MAX_START_RHO = 200.0
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Outcome of :func:`fit_joint`."""
+
+    functions: Functions
+    result: BundleResult
+    problem: Problem
+    rounds: int
+    settled: bool
+
+
+def _height_sigma(result: BundleResult) -> float:
+    """Expectation-maximisation update of the spread of the heights."""
+    square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
+    return float(np.clip(np.sqrt(np.mean(square)), 1e-6, 2e-3))
+
+
+def enriched(functions: Functions, sizes: Mapping[str, tuple[str, int]]) -> dict[str, ContinuousFunction]:
+    """Functions of other kinds and sizes through the values of the given ones, by least squares."""
+    out: dict[str, ContinuousFunction] = {}
+    for name, function in functions.items():
+        kind, size = sizes.get(name, (function.kind, function.size))
+        blank = ContinuousFunction(kind, np.zeros(size), function.g_range)
+        grid = np.geomspace(*function.g_range, 64)
+        basis = np.stack([blank.basis(float(g)) for g in grid])
+        values = np.array([function(float(g)) for g in grid])
+        out[name] = replace(blank, coefficients=np.linalg.lstsq(basis, values, rcond=None)[0])
+    return out
+
+
+def fit_joint(setup: Setup) -> JointFit:
+    """Calibrate from nominal values alone.
+
+    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions;
+    from there the number of coefficients of every function is chosen by leaving out one magnification at a time, until
+    the choice no longer changes.
+    """
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    functions: Functions = constant_functions(
+        setup, {"scale": start.scale_factor, "rho": min(max(start.rho, 0.0), _MAX_START_RHO)}
+    )
+    height = setup.priors.height_sigma_m
+    problem = build_problem(setup, functions, setup.views, height)
+    state = State(theta_of(functions), start.rotations, start.translations_m)
+    state, _ = resolve_mirrored_tilts(problem, state)
+
+    count = len(setup.magnifications)
+    sizes = {name: ("chebyshev_log", min(3, max(1, count - 1))) for name in _SMOOTH}
+    functions = enriched(functions, sizes)
+    problem = build_problem(setup, functions, setup.views, height)
+    result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    functions = with_coefficients(functions, result.state.theta)
+
+    settled, rounds = count < 3, 0
+    while rounds < _MAX_ROUNDS and not settled:
+        rounds += 1
+        chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH)
+        settled = rounds > 1 and chosen == sizes
+        if settled:
+            break
+        sizes = chosen
+        functions = enriched(functions, sizes)
+        problem = build_problem(setup, functions, setup.views, _height_sigma(result))
+        result = refine(problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE)
+        functions = with_coefficients(functions, result.state.theta)
+    problem = build_problem(setup, functions, setup.views, _height_sigma(result))
+    result = adjust(problem, result.state)
+    return JointFit(
+        with_coefficients(functions, result.state.theta), result, problem, rounds, settled
+    )

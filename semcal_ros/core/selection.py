@@ -1,0 +1,149 @@
+"""How many coefficients each continuous function gets.
+
+An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), which is all that a candidate
+set of functions has to be fitted to. A candidate is judged by leave-one-magnification-out cross-validation on these
+summaries: fitted to all magnifications but one, how much worse does it explain that one's images? The two outermost
+magnifications are never left out, since the calibration does not claim to hold beyond them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.bundle import BundleResult, Problem
+from semcal_ros.core.functions import ContinuousFunction
+from semcal_ros.core.model import FUNCTION_NAMES
+from semcal_ros.core.problem import Setup, variance_factor
+
+__all__ = ["Summary", "select_functions"]
+
+Array = NDArray[np.float64]
+
+_MAX_SIZE = 8
+# Gain in half chi-squares that pays for one coefficient (Akaike's criterion asks for 1).
+_GAIN_PER_COEFFICIENT = 2.0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Quadratic approximation of the reprojection error around one adjustment.
+
+    Attributes
+    ----------
+    information, right
+        (M, 10, 10) and (M, 10): the cost of a camera c at magnification i is
+        ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of the noise variance.
+    """
+
+    information: Array
+    right: Array
+
+    @classmethod
+    def of(cls, problem: Problem, result: BundleResult) -> Summary:
+        """The summary of an adjustment, scaled to the variance that its residuals show."""
+        cameras = problem.designs @ result.state.theta
+        right = np.einsum("mpq,mq->mp", result.information, cameras) + result.gradient
+        variance = variance_factor(problem, result)
+        return cls(result.information / variance, right / variance)
+
+
+class _Candidates:
+    """Cross-validation scores of candidate function sets, with the blocks of each function kept."""
+
+    def __init__(self, summary: Summary, setup: Setup, base: Mapping[str, ContinuousFunction]):
+        self.summary = summary
+        self.setup = setup
+        self.base = base
+        self.rows: dict[tuple[str, str, int], Array] = {}
+        self.scores: dict[tuple[tuple[str, int], ...], float] = {}
+
+    def _rows(self, name: str, kind: str, size: int) -> Array:
+        key = (name, kind, size)
+        if key not in self.rows:
+            blank = ContinuousFunction(kind, np.zeros(size), self.base[name].g_range)
+            rows = np.stack([blank.basis(float(g)) for g in self.setup.magnifications])
+            if name == "scale":
+                rows = rows * self.setup.nominal_px_per_m(self.setup.magnifications)[:, None]
+            self.rows[key] = rows
+        return self.rows[key]
+
+    def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
+        """Sum over the inner magnifications of the cost of predicting each from the others."""
+        key = tuple(sizes[name] for name in FUNCTION_NAMES)
+        if key not in self.scores:
+            self.scores[key] = self._score(sizes)
+        return self.scores[key]
+
+    def _score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
+        blocks = [self._rows(name, *sizes[name]) for name in FUNCTION_NAMES]
+        total = sum(b.shape[1] for b in blocks)
+        designs = np.zeros((len(self.setup.magnifications), len(blocks), total))
+        mean, precision = np.zeros(total), np.zeros(total)
+        column = 0
+        for row, (name, block) in enumerate(zip(FUNCTION_NAMES, blocks, strict=True)):
+            stop = column + block.shape[1]
+            designs[:, row, column:stop] = block
+            centre, sigma = self.setup.prior_of(name)
+            mean[column] = centre
+            precision[column:stop] = sigma**-2.0
+            column = stop
+        transposed = np.swapaxes(designs, 1, 2)
+        matrices = transposed @ self.summary.information @ designs
+        rights = (transposed @ self.summary.right[:, :, None])[:, :, 0]
+        matrix = matrices.sum(axis=0) + np.diag(precision)
+        right = rights.sum(axis=0) + precision * mean
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        left_out = (matrix - matrices[1:-1]) * np.outer(scale, scale)
+        solution = np.linalg.solve(left_out, ((right - rights[1:-1]) * scale)[:, :, None])[:, :, 0]
+        cameras = np.einsum("mpk,mk->mp", designs[1:-1], solution * scale)
+        # Relative to each magnification's own optimum, for accuracy of the difference.
+        quadratic = np.einsum("mp,mpq,mq->m", cameras, self.summary.information[1:-1], cameras)
+        linear = np.einsum("mp,mp->m", cameras, self.summary.right[1:-1])
+        return float(np.sum(0.5 * quadratic - linear))
+
+
+def select_functions(
+    summary: Summary,
+    setup: Setup,
+    functions: Mapping[str, ContinuousFunction],
+    free: Sequence[str],
+) -> dict[str, tuple[str, int]]:
+    """Greedy choice of (kind, size) for the functions named in ``free``.
+
+    Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the cross-validation gains
+    more than :data:`_GAIN_PER_COEFFICIENT` for each, and taken away again where that costs less.
+    """
+    candidates = _Candidates(summary, setup, functions)
+    limit = min(_MAX_SIZE, len(setup.magnifications) - 1)
+    sizes = {name: (functions[name].kind, functions[name].size) for name in FUNCTION_NAMES}
+    sizes.update({name: ("chebyshev_log", 1) for name in free})
+    while True:
+        score = candidates.score(sizes)
+        best: tuple[float, str, tuple[str, int]] | None = None
+        for name, option in _moves(sizes, free, limit):
+            change = option[1] - sizes[name][1]
+            trial = candidates.score({**sizes, name: option})
+            gain = score - trial - _GAIN_PER_COEFFICIENT * change
+            if gain > 1e-6 and (best is None or gain > best[0]):
+                best = (gain, name, option)
+        if best is None:
+            return {name: sizes[name] for name in free}
+        sizes[best[1]] = best[2]
+
+
+def _moves(
+    sizes: Mapping[str, tuple[str, int]], free: Sequence[str], limit: int
+) -> list[tuple[str, tuple[str, int]]]:
+    moves = []
+    for name in free:
+        kind, size = sizes[name]
+        for other in ("chebyshev_log", "chebyshev"):
+            for change in (-1, 0, 1, 2):
+                option = (other, size + change)
+                if 1 <= option[1] <= limit and option != (kind, size):
+                    moves.append((name, option))
+    return moves

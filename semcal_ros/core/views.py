@@ -1,0 +1,165 @@
+"""Views of a planar grid: what a calibration is computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+
+if TYPE_CHECKING:
+    from semcal_ros.core.corners import LatticeDetection
+
+__all__ = ["GridView", "SquareAssignment", "assign_squares", "views_from_detections"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GridView:
+    """Corresponding points of one image of a planar grid.
+
+    Attributes
+    ----------
+    magnification
+        Magnification of the image.
+    board_xy_m
+        (n, 2) positions on the grid, m.
+    image_xy
+        (n, 2) observed raw pixels.
+    sigma_px
+        (n,) 1-sigma of the observation per axis, px.
+    name
+        For messages and reports, such as the frame number.
+    """
+
+    magnification: float
+    board_xy_m: Array
+    image_xy: Array
+    sigma_px: Array
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.board_xy_m)
+        shapes = (self.board_xy_m.shape, self.image_xy.shape, self.sigma_px.shape)
+        if shapes != ((n, 2), (n, 2), (n,)):
+            raise InvalidValueError(f"view arrays of shapes {shapes}", expected="(n, 2), (n, 2), (n,)")
+        if not (np.isfinite(self.magnification) and self.magnification > 0):
+            raise InvalidValueError(
+                f"magnification {self.magnification}", expected="a positive number"
+            )
+        if not (np.all(np.isfinite(self.image_xy)) and np.all(self.sigma_px > 0)):
+            raise InvalidValueError("a view with non-finite corners", expected="finite pixels")
+
+
+@dataclass(frozen=True)
+class SquareAssignment:
+    """Which square size each view shows.
+
+    Attributes
+    ----------
+    square_m
+        (v,) side of the squares seen in each view, m.
+    scale_factor
+        Median ratio of the observed px per m to the nominal one of the display width.
+    spread
+        Largest deviation of one view from that ratio, as a factor above 1.
+    """
+
+    square_m: Array
+    scale_factor: float
+    spread: float
+
+
+def assign_squares(
+    spacing_px: Array, nominal_px_per_m: Array, squares_m: Sequence[float]
+) -> SquareAssignment:
+    """Find the square size of each view from how all spacings change with the magnification.
+
+    ``spacing_px / nominal_px_per_m`` is the square size up to one factor common to all views (a wrong display width).
+    Among all factors that map the observed sizes onto the known ones, the one with the smallest spread wins, and of
+    equally good ones the one nearest to 1.
+
+    Parameters
+    ----------
+    spacing_px
+        (v,) un-foreshortened spacing of each view.
+    nominal_px_per_m
+        (v,) nominal scale of each view, from its magnification and the display width.
+    squares_m
+        The square sizes that the grid has.
+    """
+    sizes = np.log(np.sort(np.asarray(squares_m, dtype=np.float64)))
+    observed = np.log(np.asarray(spacing_px) / np.asarray(nominal_px_per_m))
+    best: tuple[float, float, float] | None = None
+    # Any consistent factor maps the first view onto one of the sizes.
+    for offset in observed[0] - sizes:
+        for _ in range(3):
+            nearest = np.argmin(np.abs(observed[:, None] - offset - sizes[None, :]), axis=1)
+            offset = float(np.median(observed - sizes[nearest]))
+        deviation = np.abs(observed - offset - sizes[nearest])
+        spread = float(np.median(deviation) + 0.1 * deviation.max())
+        # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale decides.
+        score = max(spread, 0.05) + 0.02 * abs(offset)
+        if best is None or score < best[0]:
+            best = (score, offset, float(deviation.max()))
+    if best is None:
+        raise CalibrationError("no views", expected="at least one view with a grid")
+    _, offset, deviation_max = best
+    nearest = np.argmin(np.abs(observed[:, None] - offset - sizes[None, :]), axis=1)
+    return SquareAssignment(
+        np.exp(sizes[nearest]), float(np.exp(offset)), float(np.exp(deviation_max))
+    )
+
+
+def views_from_detections(
+    detections: Sequence[LatticeDetection],
+    magnifications: Sequence[float],
+    *,
+    display_width_m: float,
+    squares_m: Sequence[float],
+    names: Sequence[str] | None = None,
+) -> tuple[tuple[GridView, ...], SquareAssignment]:
+    """Views in metres from accepted lattice detections.
+
+    Parameters
+    ----------
+    detections
+        Accepted detections, one per image.
+    magnifications
+        Magnification of each image.
+    display_width_m
+        Display width to which the magnifications refer, m.
+    squares_m
+        The square sizes that the grid has, m.
+
+    Raises
+    ------
+    CalibrationError
+        If there is no detection, or one is not accepted.
+    """
+    if not detections:
+        raise CalibrationError(
+            "no image with a grid",
+            expected="images that show a chess grid",
+            do="check focus, contrast and that the grid fills the image",
+        )
+    for detection in detections:
+        if not detection.accepted:
+            raise CalibrationError(f"a rejected view ({detection.reason})", expected="accepted views")
+    widths = np.array([d.image_size[0] for d in detections], dtype=np.float64)
+    nominal = np.asarray(magnifications, dtype=np.float64) * widths / display_width_m
+    spacing = np.array([d.spacing_px for d in detections])
+    assignment = assign_squares(spacing, nominal, squares_m)
+    labels = names if names is not None else [str(i) for i in range(len(detections))]
+    views = tuple(
+        GridView(float(g), d.ij * float(square), d.xy, d.sigma_px, label)
+        for d, g, square, label in zip(
+            detections, magnifications, assignment.square_m, labels, strict=True
+        )
+    )
+    return views, assignment
