@@ -1,0 +1,70 @@
+"""The virtual SEM: recordings and live frames whose truth is known.
+
+It needs :mod:`semcal_ros.core` only: no ROS, no files, no clock. Time and random seeds are
+arguments.
+"""
+
+from __future__ import annotations
+
+from semcal_ros.synthetic.detector import NOISE_FREE, Detector
+from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
+from semcal_ros.synthetic.gold import GoldOnCarbon
+from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
+from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
+from semcal_ros.synthetic.microscope import Residual, VirtualMicroscope
+from semcal_ros.synthetic.plans import (
+    CALIBRATION_MAGNIFICATIONS,
+    SPECIMEN_KINDS,
+    PlannedFrame,
+    RecordingPlan,
+    calibration_plan,
+    drift_plan,
+    specimen_for,
+    zoom_plan,
+)
+from semcal_ros.synthetic.pose import Pose, random_poses
+from semcal_ros.synthetic.presets import PRESETS, preset
+from semcal_ros.synthetic.render import render_frame, render_reflectivity
+from semcal_ros.synthetic.specimens import SQUARES_M, ChessGrid, FlatSpecimen, Specimen, square_for
+from semcal_ros.synthetic.truth import TRUTH_SCHEMA, parameters_of, truth_of
+
+__all__ = [
+    "CALIBRATION_MAGNIFICATIONS",
+    "DRIFTS",
+    "NOISE_FREE",
+    "NO_DRIFT",
+    "PRESETS",
+    "SPECIMEN_KINDS",
+    "SQUARES_M",
+    "TRUTH_SCHEMA",
+    "ChessGrid",
+    "Constant",
+    "Detector",
+    "Drift",
+    "Exponential",
+    "FlatSpecimen",
+    "GoldOnCarbon",
+    "LiveFrame",
+    "LiveScene",
+    "Logistic",
+    "PlannedFrame",
+    "Pose",
+    "RecordingPlan",
+    "Residual",
+    "Saturation",
+    "Specimen",
+    "VirtualMicroscope",
+    "VirtualStage",
+    "calibration_plan",
+    "drift_plan",
+    "drift_preset",
+    "parameters_of",
+    "preset",
+    "random_poses",
+    "render_frame",
+    "render_reflectivity",
+    "specimen_for",
+    "square_for",
+    "truth_of",
+    "zoom_plan",
+]

@@ -1,0 +1,151 @@
+"""From reflectivity to grey values: beam spot, shading, shot noise, amplifier and quantisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["NOISE_FREE", "Detector"]
+
+Image = NDArray[np.float32]
+Grey = NDArray[np.uint8] | NDArray[np.uint16]
+
+# From this many electrons on, a normal distribution has the same first two moments and a skewness
+# below 0.07.
+_POISSON_LIMIT = 200.0
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Image formation after the scan.
+
+    The yield of reflectivity r is ``dark_yield + (1 - dark_yield) r``, times the shading.
+    ``electrons`` times it is the mean number of electrons in a pixel; what arrives is Poisson
+    distributed. The grey value is ``offset + gain * arrived / electrons + noise`` of full scale.
+
+    Parameters
+    ----------
+    blur_px
+        Sigma of the beam spot, px.
+    electrons
+        Electrons per pixel and averaged frame at yield 1; 0 switches shot noise off.
+    noise
+        1-sigma of the amplifier noise, of full scale.
+    dark_yield
+        Yield at reflectivity 0.
+    offset, gain
+        Brightness and contrast, of full scale.
+    shading
+        Relative change (x, y) of the yield from one border of the frame to the other.
+    vignetting
+        Relative loss of yield at the corners.
+    inverted
+        Bright becomes dark.
+    bits
+        8 or 16.
+    databar_rows
+        Rows of a data bar that are appended below the scanned field.
+    """
+
+    blur_px: float = 0.8
+    electrons: float = 300.0
+    noise: float = 0.006
+    dark_yield: float = 0.2
+    offset: float = 0.05
+    gain: float = 0.75
+    shading: tuple[float, float] = (0.06, -0.04)
+    vignetting: float = 0.03
+    inverted: bool = False
+    bits: int = 8
+    databar_rows: int = 0
+
+    def __post_init__(self) -> None:
+        if self.bits not in (8, 16):
+            raise InvalidValueError(f"{self.bits} bits", expected="8 or 16")
+        if self.blur_px < 0 or self.electrons < 0 or self.noise < 0 or self.databar_rows < 0:
+            raise InvalidValueError(
+                f"detector {self}", expected="no negative blur, dose, noise or rows"
+            )
+
+    @property
+    def pad_px(self) -> int:
+        """Border in px that the beam spot reaches."""
+        return round(4.0 * self.blur_px + 0.5) if self.blur_px > 0 else 0
+
+    def expose(self, reflectivity: Image, rng: np.random.Generator) -> Grey:
+        """Grey image of a reflectivity that extends ``pad_px`` px beyond the frame on every side.
+
+        Returns
+        -------
+        (h + databar_rows, w) uint8 or uint16.
+        """
+        signal = self._spot(reflectivity) * np.float32(1.0 - self.dark_yield)
+        signal += np.float32(self.dark_yield)
+        self._shade(signal)
+        if self.electrons > 0:
+            signal = self._count(signal, rng)
+        signal *= np.float32(self.gain)
+        signal += np.float32(self.offset)
+        if self.noise > 0:
+            noise = rng.standard_normal(signal.shape, dtype=np.float32)
+            noise *= np.float32(self.noise)
+            signal += noise
+        if self.inverted:
+            signal = np.float32(1.0) - signal
+        return self._quantise(signal)
+
+    def _spot(self, reflectivity: Image) -> Image:
+        pad = self.pad_px
+        if pad == 0:
+            return reflectivity
+        kernel = (2 * pad + 1, 2 * pad + 1)
+        blurred = cv2.GaussianBlur(reflectivity, kernel, self.blur_px)
+        return np.ascontiguousarray(blurred[pad:-pad, pad:-pad], dtype=np.float32)
+
+    def _shade(self, signal: Image) -> None:
+        y = np.linspace(-1.0, 1.0, signal.shape[0], dtype=np.float32)[:, None]
+        x = np.linspace(-1.0, 1.0, signal.shape[1], dtype=np.float32)[None, :]
+        across, along, corner = (np.float32(0.5 * v) for v in (*self.shading, self.vignetting))
+        signal *= 1.0 + across * x + along * y - corner * (x * x + y * y)
+
+    def _count(self, signal: Image, rng: np.random.Generator) -> Image:
+        mean = np.maximum(signal, 0.0) * np.float32(self.electrons)
+        if float(mean.min()) < _POISSON_LIMIT:
+            counted = rng.poisson(mean).astype(np.float32)
+        else:
+            counted = rng.standard_normal(mean.shape, dtype=np.float32)
+            counted *= np.sqrt(mean)
+            counted += mean
+        counted /= np.float32(self.electrons)
+        return counted
+
+    def _quantise(self, signal: Image) -> Grey:
+        top = 2**self.bits - 1
+        signal *= np.float32(top)
+        np.rint(signal, out=signal)
+        np.clip(signal, 0, top, out=signal)
+        if self.databar_rows > 0:
+            signal = np.concatenate([signal, _databar(self.databar_rows, signal.shape[1], top)])
+        if self.bits == 8:
+            return signal.astype(np.uint8)
+        return signal.astype(np.uint16)
+
+
+def _databar(rows: int, width: int, top: int) -> Image:
+    """Black bar with a scale line and tick marks, whose corners are none of the specimen's."""
+    bar = np.zeros((rows, width), dtype=np.float32)
+    middle = rows // 2
+    bar[middle : middle + 1, width // 16 : width // 4] = top
+    bar[max(middle - 3, 0) : middle + 4, width // 16 : width // 4 : max(width // 64, 2)] = top
+    bar[0] = top
+    return bar
+
+
+NOISE_FREE = Detector(
+    blur_px=0.0, electrons=0.0, noise=0.0, shading=(0.0, 0.0), vignetting=0.0, bits=16
+)

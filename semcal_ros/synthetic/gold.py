@@ -1,0 +1,148 @@
+"""Gold on carbon: bright particles of all sizes on a dark film, endless, textured at any zoom."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["GoldOnCarbon"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+_TILE = 1024
+_RADII_TEXELS = (6.0, 30.0)
+_MARGIN = 32  # texels around a particle's centre, beyond the largest radius and its soft edge
+_COVERAGE = 0.17
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class GoldOnCarbon:
+    """Particles on a periodic tile, laid over each other at several octaves of size, the small ones
+    on top.
+
+    Every octave turns, shifts and shrinks the tile, so that the whole does not repeat within any
+    field of view. Octaves that are smaller than a pixel contribute their mean, so a change of
+    magnification shows the same specimen.
+
+    Parameters
+    ----------
+    seed
+        Seed of the particles.
+    largest_m
+        Diameter of the largest particles.
+    octaves
+        Number of octaves.
+    ratio
+        Ratio of the sizes of successive octaves.
+    carbon
+        Reflectivity of the bare film.
+    """
+
+    seed: int = 0
+    largest_m: float = 40e-6
+    octaves: int = 6
+    ratio: float = 4.0
+    carbon: float = 0.06
+
+    @property
+    def supersampling(self) -> int:
+        """One: the tiles are filtered to the size of a pixel beforehand."""
+        return 1
+
+    def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
+        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        pixel_m = math.sqrt(abs(float(np.linalg.det(footprint_m))))
+        seen = np.full(x_m.shape, self.carbon, dtype=np.float32)
+        for octave in range(self.octaves):
+            texel_m = self.largest_m / (2.0 * _RADII_TEXELS[1]) / self.ratio**octave
+            cover, light = self._octave(octave, texel_m, pixel_m, x_m, y_m)
+            seen *= 1.0 - cover
+            seen += light
+        return seen
+
+    def _octave(
+        self, octave: int, texel_m: float, pixel_m: float, x_m: Array, y_m: Array
+    ) -> tuple[Image | np.float32, Image | np.float32]:
+        """What the particles of one octave cover, and their light (already times the cover)."""
+        pyramid, mean = _tile_pyramid(self.seed)
+        level = max(0, math.floor(math.log2(max(0.5 * pixel_m / texel_m, 1.0))))
+        if level >= len(pyramid):
+            return mean[0], mean[1]
+        tile = pyramid[level]
+        size = float(len(tile))
+        step = texel_m * 2.0**level
+        angle = _GOLDEN_ANGLE * (octave + 1)
+        shift = np.random.default_rng([self.seed, octave]).uniform(0.0, 1.0, 2)
+        c, s = math.cos(angle) / step, math.sin(angle) / step
+        u = _wrapped(c * x_m - s * y_m, shift[0], size)
+        v = _wrapped(s * x_m + c * y_m, shift[1], size)
+        seen: Image = np.asarray(
+            cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), dtype=np.float32
+        )
+        return seen[..., 0], seen[..., 1]
+
+
+def _wrapped(u: Array, shift: float, size: float) -> Image:
+    """Coordinates reduced to one tile while they still have all their digits."""
+    # Texel centres are at integers, so the border of the tile, where all levels agree, is at -0.5.
+    u += shift * size - 0.5
+    u -= size * np.floor(u / size)
+    return u.astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _tile_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
+    """Levels (n, n, 2) of cover and light, each half the size of the last, and their means (2,)."""
+    tile = _draw_tile(np.random.default_rng([seed, 1]))
+    levels = [tile]
+    while len(levels[-1]) > 8:
+        half = len(levels[-1]) // 2
+        levels.append(levels[-1].reshape(half, 2, half, 2, 2).mean(axis=(1, 3), dtype=np.float32))
+    # A pixel covers two to four texels of its level: this blur keeps what is finer than a pixel out
+    # of the samples.
+    filtered = [tile] + [_blur_periodic(level, 1.1) for level in levels[1:]]
+    for level in filtered:
+        level.setflags(write=False)
+    return tuple(filtered), tile.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
+
+
+def _blur_periodic(tile: Image, sigma: float) -> Image:
+    padded = np.pad(tile, ((4, 4), (4, 4), (0, 0)), mode="wrap")
+    blurred = cv2.GaussianBlur(padded, (9, 9), sigma)[4:-4, 4:-4]
+    return np.ascontiguousarray(blurred, dtype=np.float32)
+
+
+def _draw_tile(rng: np.random.Generator) -> Image:
+    """One periodic tile (n, n, 2): cover in 0..1, and light = cover times brightness."""
+    span = np.arange(-_MARGIN, _MARGIN + 1)
+    tile = np.zeros((_TILE, _TILE, 2), dtype=np.float32)
+    covered = 0.0
+    while covered < _COVERAGE * _TILE * _TILE:
+        # Small particles are more frequent: log-uniform radii.
+        radius = float(np.exp(rng.uniform(*np.log(_RADII_TEXELS))))
+        centre = rng.uniform(0.0, _TILE, 2)
+        brightness = rng.uniform(0.25, 0.95)
+        covered += math.pi * radius * radius
+        first = np.floor(centre).astype(np.intp)
+        window = np.ix_((first[0] + span) % _TILE, (first[1] + span) % _TILE)
+        offset = (first - centre)[:, None] + span
+        distance = np.hypot(offset[0][:, None], offset[1][None, :])
+        cover, light = _particle(distance, radius, brightness)
+        tile[window] *= 1.0 - cover[..., None]
+        tile[window] += np.stack([cover, light], axis=-1)
+    return tile
+
+
+def _particle(distance: Array, radius: float, brightness: float) -> tuple[Image, Image]:
+    """A ball as secondary electrons show it: brighter at its rim, its edge two texels wide."""
+    cover = np.clip((radius - distance) / 2.0 + 0.5, 0.0, 1.0)
+    rim = np.minimum(distance / radius, 1.0) ** 4
+    light = cover * brightness * (0.72 + 0.28 * rim)
+    return cover.astype(np.float32), light.astype(np.float32)

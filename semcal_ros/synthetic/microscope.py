@@ -1,0 +1,223 @@
+"""The virtual microscope: a camera for every magnification, with its scan timing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.camera import ScanCamera, as_points
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.synthetic.laws import Constant, Law
+
+__all__ = ["Residual", "VirtualMicroscope"]
+
+Array = NDArray[np.float64]
+
+_FIXED_POINT_STEPS = 60
+_FIXED_POINT_TOLERANCE_PX = 1e-10
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Displacements that the two distortion parameters of the camera model cannot describe.
+
+    They are added to the raw pixel as functions of the undistorted one. With ``q = (x_u - centre of
+    the image) / (width / 2)``, ``r2 = |q|^2`` and ``n = width / 2``:
+
+    Parameters
+    ----------
+    spiral
+        ``n spiral r2 (-q_y, q_x)``, dimensionless.
+    sine
+        Scan-coil non-linearity ``n sine sin(2 pi sine_cycles (q_x + 1) / 2)`` along x,
+        dimensionless.
+    sine_cycles
+        Number of periods of the sine over the image width.
+    settling
+        Deflection at the left border that decays along the scan line, ``n settling exp(-(q_x + 1) /
+        settling_length)`` along x, dimensionless.
+    settling_length
+        Decay length of the settling in half image widths.
+    """
+
+    spiral: float = 0.0
+    sine: float = 0.0
+    sine_cycles: float = 2.0
+    settling: float = 0.0
+    settling_length: float = 0.05
+
+    @property
+    def is_zero(self) -> bool:
+        """True when no point is displaced."""
+        return self.spiral == 0.0 and self.sine == 0.0 and self.settling == 0.0
+
+    def displacement_px(self, xy: Array, width: int, height: int) -> Array:
+        """Displacement (n, 2) in px at undistorted pixels (n, 2) of an image of that size."""
+        n = 0.5 * width
+        q = (xy - 0.5 * np.array([width - 1.0, height - 1.0])) / n
+        r2 = np.sum(q * q, axis=1)
+        shift: Array = self.spiral * r2[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
+        shift[:, 0] += self.sine * np.sin(math.pi * self.sine_cycles * (q[:, 0] + 1.0))
+        # Bounded far left of the field, where the exponential would have no inverse.
+        along = np.maximum(q[:, 0] + 1.0, -2.0 * self.settling_length)
+        shift[:, 0] += self.settling * np.exp(-along / self.settling_length)
+        shift *= n
+        return shift
+
+
+@dataclass(frozen=True)
+class VirtualMicroscope:
+    """A microscope whose camera parameters are continuous functions of the magnification.
+
+    Pixel-valued parameters refer to the native image size; :meth:`camera_at` converts them to
+    ``width`` x ``height``.
+
+    Parameters
+    ----------
+    name
+        Name of the preset.
+    display_width_m
+        Width of the display that magnifications refer to: the field is ``display_width_m / g``
+        wide.
+    scale_error
+        Law of the relative deviation of the true scale m from ``g width / display_width_m``.
+    aspect, skew, rho, xi_r, xi_t
+        Laws of the parameters of :class:`~semcal_ros.core.camera.ScanCamera`; rho in 1/m.
+    px, py, ex, ey
+        Laws of the principal point and of the distortion centre, in native pixels.
+    residual
+        What the camera model does not contain.
+    residual_growth
+        Law of a factor on the residual.
+    timing
+        Raster timing.
+    native_width, native_height
+        Image size that the pixel-valued laws refer to.
+    width, height
+        Size of the images taken; 0 means the native size.
+    """
+
+    name: str
+    display_width_m: float
+    scale_error: Law
+    aspect: Law
+    skew: Law
+    px: Law
+    py: Law
+    rho: Law
+    xi_r: Law
+    xi_t: Law
+    ex: Law
+    ey: Law
+    residual: Residual = field(default_factory=Residual)
+    residual_growth: Law = field(default_factory=lambda: Constant(1.0))
+    timing: ScanTiming = field(default_factory=lambda: ScanTiming(1.0 / 15.0, 8, 0.1))
+    native_width: int = 512
+    native_height: int = 512
+    width: int = 0
+    height: int = 0
+
+    def __post_init__(self) -> None:
+        if self.width == 0:
+            object.__setattr__(self, "width", self.native_width)
+        if self.height == 0:
+            object.__setattr__(self, "height", self.native_height)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) of the scanned field in px, without a data bar."""
+        return self.width, self.height
+
+    def with_image_size(self, width: int, height: int) -> VirtualMicroscope:
+        """The same microscope taking images of another size over the same field width."""
+        return replace(self, width=width, height=height)
+
+    def with_timing(self, timing: ScanTiming) -> VirtualMicroscope:
+        """The same microscope with another raster timing."""
+        return replace(self, timing=timing)
+
+    def nominal_pixel_size_m(self, magnification: float) -> float:
+        """Pixel size that the microscope itself would display, from the display width alone."""
+        return self.display_width_m / (_checked(magnification) * self.width)
+
+    def camera_at(self, magnification: float) -> ScanCamera:
+        """True camera at a magnification, without the residual.
+
+        Raises
+        ------
+        InvalidValueError
+            If the magnification is not a positive finite number.
+        """
+        g = _checked(magnification)
+        nominal = g * self.native_width / self.display_width_m
+        camera = ScanCamera(
+            magnification=g,
+            m=nominal * (1.0 + self.scale_error(g)),
+            aspect=self.aspect(g),
+            skew=self.skew(g),
+            px=self.px(g),
+            py=self.py(g),
+            rho=self.rho(g),
+            xi_r=self.xi_r(g),
+            xi_t=self.xi_t(g),
+            ex=self.ex(g),
+            ey=self.ey(g),
+            norm_px=0.5 * self.native_width,
+            width=self.native_width,
+            height=self.native_height,
+        )
+        return camera.resized(self.width, self.height)
+
+    # -- the camera together with the residual ----------------------------------------------------
+
+    def _residual_px(self, magnification: float, xy_ideal: Array) -> Array:
+        growth = self.residual_growth(magnification)
+        return growth * self.residual.displacement_px(xy_ideal, self.width, self.height)
+
+    def distort(self, magnification: float, xy_ideal: ArrayLike) -> Array:
+        """Raw pixels (n, 2) of undistorted pixels (n, 2), with the residual."""
+        xy = as_points(xy_ideal, 2)
+        raw = self.camera_at(magnification).distort(xy)
+        return raw if self.residual.is_zero else raw + self._residual_px(magnification, xy)
+
+    def project(self, magnification: float, xyz_m: ArrayLike) -> Array:
+        """Raw pixels (n, 2) of sem-frame points (n, 3) in m, with the residual."""
+        return self.distort(magnification, self.camera_at(magnification).project_ideal(xyz_m))
+
+    def undistort(self, magnification: float, xy_raw: ArrayLike) -> Array:
+        """Undistorted pixels (n, 2) of raw pixels (n, 2); NaN where there are none.
+
+        The residual is small and smooth, so a fixed-point iteration around the camera's own inverse
+        contracts.
+
+        Raises
+        ------
+        InvalidValueError
+            If the residual is so strong that the iteration does not settle.
+        """
+        raw = as_points(xy_raw, 2)
+        camera = self.camera_at(magnification)
+        xy = camera.undistort(raw)
+        if self.residual.is_zero:
+            return xy
+        for _ in range(_FIXED_POINT_STEPS):
+            better = camera.undistort(raw - self._residual_px(magnification, xy))
+            change = float(np.nanmax(np.abs(better - xy), initial=0.0))
+            xy = better
+            if change < _FIXED_POINT_TOLERANCE_PX:
+                return xy
+        raise InvalidValueError(
+            f"residual {self.residual}, whose inverse still moves by {change:.2g} px",
+            expected="a residual with derivatives well below 1",
+        )
+
+
+def _checked(magnification: float) -> float:
+    g = float(magnification)
+    if not (math.isfinite(g) and g > 0.0):
+        raise InvalidValueError(f"magnification {magnification}", expected="a positive number")
+    return g

@@ -1,0 +1,92 @@
+"""What a virtual recording shows, as plain values for a file beside it.
+
+Keys carry their unit; everything is SI or px. The dictionary holds::
+
+    schema              "semcal_ros/truth/1"
+    microscope          name of the preset
+    specimen            "grid", "gold" or "flat"
+    image_width_px, image_height_px, norm_px, display_width_m, databar_rows
+    scan                frame_time_s, averages, flyback_fraction
+    frames              list, in the order of the recording:
+        start_time_s        start of the first pass, after the start of the recording
+        magnification
+        rotation            (3, 3): X = rotation x + translation_m + drift
+        translation_m       (3,)
+        square_m            square size, or None without a grid
+        drift_m             (2,) at the centre of the acquisition; what lay at X is seen
+                            at X + drift
+        pixel_size_m        (x, y) true size of an undistorted pixel at the reference plane
+    parameters          list, one entry per magnification, ascending:
+        magnification, m_px_per_m, aspect, skew, principal_point_px (x, y), rho_per_m, xi_r, xi_t,
+        centre_px (x, y), residual_spiral, residual_sine, residual_settling
+    residual_sine_cycles, residual_settling_length   shape of the residual, see Residual
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from semcal_ros.synthetic.microscope import VirtualMicroscope
+from semcal_ros.synthetic.plans import RecordingPlan
+
+__all__ = ["TRUTH_SCHEMA", "parameters_of", "truth_of"]
+
+TRUTH_SCHEMA = "semcal_ros/truth/1"
+
+
+def parameters_of(microscope: VirtualMicroscope, magnification: float) -> dict[str, Any]:
+    """True camera parameters at a magnification, as listed above."""
+    camera = microscope.camera_at(magnification)
+    residual, growth = microscope.residual, microscope.residual_growth(magnification)
+    return {
+        "magnification": camera.magnification,
+        "m_px_per_m": camera.m,
+        "aspect": camera.aspect,
+        "skew": camera.skew,
+        "principal_point_px": [camera.px, camera.py],
+        "rho_per_m": camera.rho,
+        "xi_r": camera.xi_r,
+        "xi_t": camera.xi_t,
+        "centre_px": [camera.ex, camera.ey],
+        "residual_spiral": growth * residual.spiral,
+        "residual_sine": growth * residual.sine,
+        "residual_settling": growth * residual.settling,
+    }
+
+
+def truth_of(plan: RecordingPlan) -> dict[str, Any]:
+    """Truth of a recording as lists, numbers and strings, ready for JSON."""
+    microscope = plan.microscope
+    magnifications = sorted({frame.magnification for frame in plan.frames})
+    return {
+        "schema": TRUTH_SCHEMA,
+        "microscope": microscope.name,
+        "specimen": plan.kind,
+        "image_width_px": microscope.width,
+        "image_height_px": microscope.height,
+        "norm_px": 0.5 * microscope.width,
+        "display_width_m": microscope.display_width_m,
+        "databar_rows": plan.detector.databar_rows,
+        "scan": {
+            "frame_time_s": microscope.timing.frame_time_s,
+            "averages": microscope.timing.averages,
+            "flyback_fraction": microscope.timing.flyback_fraction,
+        },
+        "frames": [_frame(plan, index) for index in range(len(plan))],
+        "parameters": [parameters_of(microscope, g) for g in magnifications],
+        "residual_sine_cycles": microscope.residual.sine_cycles,
+        "residual_settling_length": microscope.residual.settling_length,
+    }
+
+
+def _frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
+    frame = plan.frames[index]
+    return {
+        "start_time_s": frame.start_time_s,
+        "magnification": frame.magnification,
+        "rotation": frame.pose.R.tolist(),
+        "translation_m": frame.pose.t_m.tolist(),
+        "square_m": frame.square_m,
+        "drift_m": plan.drift_at_centre_m(index).tolist(),
+        "pixel_size_m": list(plan.microscope.camera_at(frame.magnification).pixel_size_m),
+    }
