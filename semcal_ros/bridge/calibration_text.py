@@ -1,0 +1,42 @@
+"""A calibration file's text in a std_msgs/msg/String."""
+
+from __future__ import annotations
+
+from semcal_ros.bridge.fields import require_fields
+from semcal_ros.bridge.protocols import StringMessage
+from semcal_ros.core.errors import InvalidValueError, MessageError
+
+__all__ = ["MAX_TEXT_BYTES", "calibration_text_from_message", "fill_calibration_text"]
+
+MAX_TEXT_BYTES = 16 * 1024 * 1024
+"""Limit far above any calibration, so that a wrong topic cannot exhaust memory in the parser."""
+
+
+def calibration_text_from_message(message: StringMessage) -> str:
+    """Text of a calibration, not yet parsed.
+
+    Raises
+    ------
+    MessageError
+        The text is empty or longer than :data:`MAX_TEXT_BYTES`.
+    """
+    require_fields(message, ("data",), "std_msgs/msg/String")
+    text = message.data
+    size = len(text.encode("utf-8", errors="replace"))
+    if not text.strip() or size > MAX_TEXT_BYTES:
+        raise MessageError(
+            f"a calibration message with {size} bytes of text",
+            expected=f"the text of a calibration file, 1 to {MAX_TEXT_BYTES} bytes",
+            do="check which node publishes the calibration topic",
+        )
+    return text
+
+
+def fill_calibration_text(message: StringMessage, text: str) -> None:
+    """Set the text; raises :class:`InvalidValueError` where a receiver would refuse it."""
+    size = len(text.encode("utf-8"))
+    if not text.strip() or size > MAX_TEXT_BYTES:
+        raise InvalidValueError(
+            f"a calibration text of {size} bytes", expected=f"1 to {MAX_TEXT_BYTES} bytes"
+        )
+    message.data = text

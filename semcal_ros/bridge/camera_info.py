@@ -1,0 +1,51 @@
+"""sensor_msgs/msg/CameraInfo of rectified images (design section 9)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semcal_ros.bridge.fields import assign_floats
+from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.protocols import CameraInfoMessage, HeaderMessage
+from semcal_ros.core.camera import ScanCamera
+
+__all__ = ["fill_camera_info"]
+
+
+def fill_camera_info(
+    message: CameraInfoMessage,
+    camera: ScanCamera | None,
+    header: HeaderMessage,
+    width: int,
+    height: int,
+) -> None:
+    """Describe a rectified image as a pinhole camera.
+
+    Points are those of the optical frame, whose origin is the scan pivot: a sem-frame point (X, Y,
+    z) lies at ``Z = 1/rho + z``. Then ``K`` has ``f = m / rho``, ``P = [K | 0]``, ``R`` is the
+    identity and the five ``plumb_bob`` coefficients are zero.
+
+    Parameters
+    ----------
+    message
+        The message to fill.
+    camera
+        The camera of this image, in any size: it is resized to the image's. None means
+        uncalibrated; a parallel projection (``rho <= 0``) has no finite K either. Both leave K, R
+        and P zero, which sensor_msgs defines as "uncalibrated"; the affine-safe matrix of
+        :mod:`semcal_ros.bridge.projection` still describes a parallel projection.
+    header
+        Header of the image, copied verbatim.
+    width, height
+        Size of the rectified image, px.
+    """
+    copy_header(message.header, header)
+    message.width, message.height = int(width), int(height)
+    message.distortion_model = "plumb_bob"
+    k, r = np.zeros((3, 3)), np.zeros((3, 3))
+    if camera is not None and camera.rho > 0.0:
+        k, r = camera.resized(width, height).K, np.eye(3)
+    assign_floats(message, "d", np.zeros(5))
+    assign_floats(message, "k", k)
+    assign_floats(message, "r", r)
+    assign_floats(message, "p", np.hstack([k, np.zeros((3, 1))]))

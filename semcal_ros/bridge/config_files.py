@@ -1,0 +1,99 @@
+"""Where ``msg_configs`` files lie: in the source tree or under ``share`` of an installation."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from semcal_ros.core.errors import ConfigError
+
+__all__ = ["config_directories", "config_names", "find_config_file", "read_config_text"]
+
+_SUFFIXES = (".yaml", ".yml")
+_MAX_BYTES = 1024 * 1024
+
+
+def config_directories() -> tuple[Path, ...]:
+    """Existing folders with configurations, the most specific first.
+
+    The folder beside the package (a source tree), the one inside the package,
+    ``share/semcal_ros/msg_configs`` under each prefix of the ament index, and the same under the
+    Python environment's prefix.
+    """
+    return tuple(dict.fromkeys(place for place in _candidates() if place.is_dir()))
+
+
+def _candidates() -> Iterator[Path]:
+    package = Path(__file__).resolve().parents[1]
+    yield package.parent / "msg_configs"
+    yield package / "msg_configs"
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    for prefix in [*filter(None, prefixes), sys.prefix]:
+        yield Path(prefix) / "share" / "semcal_ros" / "msg_configs"
+
+
+def config_names() -> tuple[str, ...]:
+    """Bare names of all configurations that are found, sorted."""
+    names = {
+        path.stem
+        for place in config_directories()
+        for path in place.iterdir()
+        if path.suffix in _SUFFIXES and path.is_file()
+    }
+    return tuple(sorted(names))
+
+
+def find_config_file(name_or_path: str | Path) -> Path:
+    """Path of a configuration given by path or by bare name.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    text = str(name_or_path)
+    path = _existing_file(Path(text))
+    if path is None and text == Path(text).name:
+        path = _shipped_file(Path(text))
+    if path is not None:
+        return path
+    raise ConfigError(
+        f"no configuration {text!r}",
+        expected="the path of a YAML file or one of the names " + ", ".join(config_names()),
+        do="check the spelling or copy msg_configs/generic.yaml",
+    )
+
+
+def _shipped_file(name: Path) -> Path | None:
+    stem = name.stem if name.suffix in _SUFFIXES else name.name
+    candidates = (
+        _existing_file(place / f"{stem}{suffix}")
+        for place in config_directories()
+        for suffix in _SUFFIXES
+    )
+    return next(filter(None, candidates), None)
+
+
+def _existing_file(path: Path) -> Path | None:
+    try:
+        expanded = path.expanduser()
+        return expanded if expanded.is_file() else None
+    except (OSError, RuntimeError, ValueError):
+        # A name that is too long, an unreadable folder or an unknown home: no such file for us.
+        return None
+
+
+def read_config_text(path: Path) -> str:
+    """Text of a configuration file; raises :class:`ConfigError` where it cannot be read."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(
+                f"{path}: {path.stat().st_size} bytes",
+                expected=f"a text of at most {_MAX_BYTES} bytes",
+            )
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no UTF-8 text"
+        raise ConfigError(f"{path}: {reason}", expected="a readable YAML file") from error

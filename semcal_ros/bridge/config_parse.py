@@ -1,0 +1,124 @@
+"""YAML text to a mapping that satisfies the schema."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Hashable, Iterator
+from typing import Any, cast
+
+import jsonschema
+import yaml
+
+from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
+from semcal_ros.core.errors import ConfigError
+
+__all__ = ["parse_mapping"]
+
+_MAX_SEEN = 80
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loader that reads ``25e-6`` as a number, as YAML 1.2 does, and refuses repeated keys."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key_node, _ in node.value:
+            key = str(key_node.value)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+
+def parse_mapping(text: str, source: str) -> dict[str, Any]:
+    """Values of a configuration, checked against the schema.
+
+    Raises
+    ------
+    ConfigError
+        The text is no YAML or breaks the schema. The message names ``source``, the path of the key,
+        what was seen there and what was expected.
+    """
+    values = _load_yaml(text, source)
+    validator = jsonschema.Draft202012Validator(CONFIG_SCHEMA)
+    problems = sorted(validator.iter_errors(values), key=_problem_order)
+    if problems:
+        raise _config_error(problems[0], source)
+    for path, number in _numbers(values):
+        if not math.isfinite(number):
+            raise ConfigError(f"{source}: key {path} is {number}", expected="a finite number")
+    checked: dict[str, Any] = values
+    return checked
+
+
+def _load_yaml(text: str, source: str) -> Any:
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f" in line {mark.line + 1}" if mark is not None else ""
+        seen = f"{source}: {error.problem or 'no YAML'}{line}"
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        seen = f"{source}: {type(error).__name__} while reading YAML"
+    raise ConfigError(seen, expected="a YAML file", do="compare with msg_configs/generic.yaml")
+
+
+def _problem_order(error: jsonschema.ValidationError) -> tuple[int, str]:
+    # A misspelt key causes a missing one as well; name the misspelt one.
+    return (0 if error.validator == "additionalProperties" else 1, _key_path(error))
+
+
+def _key_path(error: jsonschema.ValidationError) -> str:
+    return _join(error.absolute_path)
+
+
+def _join(parts: Any) -> str:
+    path = ""
+    for part in parts:
+        path += f"[{part}]" if isinstance(part, int) else f".{part}"
+    return path.lstrip(".")
+
+
+def _config_error(error: jsonschema.ValidationError, source: str) -> ConfigError:
+    path = _key_path(error)
+    schema = cast("dict[str, Any]", error.schema)
+    do = "compare with msg_configs/generic.yaml"
+    if error.validator == "additionalProperties":
+        known = list(schema["properties"])
+        unknown = next(key for key in cast("dict[Any, Any]", error.instance) if key not in known)
+        full = f"{path}.{unknown}" if path else str(unknown)
+        return ConfigError(
+            f"{source}: unknown key {full}", expected="one of " + ", ".join(known), do=do
+        )
+    if error.validator == "required":
+        present = cast("dict[Any, Any]", error.instance)
+        missing = next(key for key in schema["required"] if key not in present)
+        full = f"{path}.{missing}" if path else missing
+        what = schema["properties"][missing]["description"]
+        return ConfigError(f"{source}: key {full} is missing", expected=what, do=do)
+    seen = repr(error.instance)
+    if len(seen) > _MAX_SEEN:
+        seen = seen[:_MAX_SEEN] + "..."
+    where = f"key {path}" if path else "the whole file"
+    return ConfigError(f"{source}: {where} is {seen}", expected=schema["description"], do=do)
+
+
+def _numbers(values: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from _numbers(value, f"{path}.{key}".lstrip("."))
+    elif isinstance(values, list):
+        for index, value in enumerate(values):
+            yield from _numbers(value, f"{path}[{index}]")
+    elif isinstance(values, float):
+        yield path, values

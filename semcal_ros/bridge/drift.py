@@ -1,0 +1,111 @@
+"""Drift and its velocity as geometry_msgs messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.bridge.fields import assign_floats
+from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.protocols import (
+    HeaderMessage,
+    PoseWithCovarianceStampedMessage,
+    TwistWithCovarianceStampedMessage,
+)
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["UNKNOWN_VARIANCE", "fill_drift", "fill_drift_velocity"]
+
+UNKNOWN_VARIANCE = 1e6
+"""Variance of what is not observed (height in m2, rotations in rad2): beyond anything physical."""
+
+_SYMMETRY_TOLERANCE = 1e-6
+
+
+def fill_drift(
+    message: PoseWithCovarianceStampedMessage,
+    drift_m: ArrayLike,
+    covariance: ArrayLike,
+    header: HeaderMessage,
+) -> None:
+    """Set the drift of the specimen in the sem frame.
+
+    Parameters
+    ----------
+    message
+        The message to fill; the orientation becomes the identity.
+    drift_m
+        (2,) displacement in m: what lay at X is seen at X + drift.
+    covariance
+        (4, 4) covariance of ``[x, y, vx, vy]`` as the tracker gives it, or its (2, 2) position
+        block, m2.
+    header
+        Header of the image, copied verbatim.
+
+    Raises
+    ------
+    InvalidValueError
+        A value is not finite, or the covariance is not a symmetric matrix of that size with
+        positive diagonal.
+    """
+    x, y = _pair(drift_m, "drift")
+    block = _block(covariance, 0)
+    copy_header(message.header, header)
+    pose = message.pose.pose
+    pose.position.x, pose.position.y, pose.position.z = x, y, 0.0
+    orientation = pose.orientation
+    orientation.x, orientation.y, orientation.z, orientation.w = 0.0, 0.0, 0.0, 1.0
+    assign_floats(message.pose, "covariance", _six_by_six(block))
+
+
+def fill_drift_velocity(
+    message: TwistWithCovarianceStampedMessage,
+    velocity_m_s: ArrayLike,
+    covariance: ArrayLike,
+    header: HeaderMessage,
+) -> None:
+    """Set the velocity of the drift in m/s.
+
+    As :func:`fill_drift`, with the velocity block of a (4, 4) covariance, or a (2, 2) one in m2/s2.
+    """
+    x, y = _pair(velocity_m_s, "drift velocity")
+    block = _block(covariance, 2)
+    copy_header(message.header, header)
+    twist = message.twist.twist
+    _set_vector(twist.linear, x, y)
+    _set_vector(twist.angular, 0.0, 0.0)
+    assign_floats(message.twist, "covariance", _six_by_six(block))
+
+
+def _set_vector(vector: Any, x: float, y: float) -> None:
+    vector.x, vector.y, vector.z = x, y, 0.0
+
+
+def _pair(values: ArrayLike, what: str) -> tuple[float, float]:
+    pair = np.asarray(values, dtype=np.float64)
+    if pair.shape != (2,) or not np.all(np.isfinite(pair)):
+        raise InvalidValueError(f"a {what} of {pair.tolist()}", expected="two finite numbers")
+    return float(pair[0]), float(pair[1])
+
+
+def _block(covariance: ArrayLike, first: int) -> NDArray[np.float64]:
+    matrix = np.asarray(covariance, dtype=np.float64)
+    if matrix.shape == (4, 4):
+        matrix = matrix[first : first + 2, first : first + 2]
+    if matrix.shape != (2, 2) or not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
+        raise InvalidValueError(
+            f"a covariance of shape {np.shape(covariance)} with block {matrix.tolist()}",
+            expected="a finite (4, 4) or (2, 2) matrix with a diagonal that is not negative",
+        )
+    scale = float(np.max(np.abs(matrix)))
+    if abs(matrix[0, 1] - matrix[1, 0]) > _SYMMETRY_TOLERANCE * scale:
+        raise InvalidValueError(f"a covariance {matrix.tolist()}", expected="a symmetric matrix")
+    return matrix
+
+
+def _six_by_six(block: NDArray[np.float64]) -> NDArray[np.float64]:
+    full = np.diag(np.full(6, UNKNOWN_VARIANCE))
+    full[:2, :2] = block
+    return full

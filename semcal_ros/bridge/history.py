@@ -1,0 +1,98 @@
+"""The value that was valid at a given stamp."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from typing import Generic, TypeVar
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["ZeroOrderHold"]
+
+T = TypeVar("T")
+
+_NS_PER_S = 1_000_000_000
+
+
+class ZeroOrderHold(Generic[T]):
+    """Bounded history of stamped values, each valid from its stamp until the next one.
+
+    Parameters
+    ----------
+    max_length
+        Number of values kept; the oldest are dropped.
+    jump_ns
+        A value that is older than the newest one by more than this means that the clock went back
+        (a bag that loops, a simulation that restarts): everything before is forgotten. Smaller
+        steps back are late arrivals and are sorted in.
+
+    Notes
+    -----
+    Not locked: insert and read from one thread, or from callbacks that exclude each other.
+
+    Examples
+    --------
+    >>> hold = ZeroOrderHold[float]()
+    >>> hold.insert(100, 500.0)
+    False
+    >>> hold.at(99) is None, hold.at(100), hold.at(10**12)
+    (True, 500.0, 500.0)
+    """
+
+    def __init__(self, max_length: int = 256, jump_ns: int = _NS_PER_S) -> None:
+        if max_length < 1:
+            raise InvalidValueError(f"a history of {max_length} values", expected="at least 1")
+        if jump_ns < 0:
+            raise InvalidValueError(f"a clock jump of {jump_ns} ns", expected="0 or more")
+        self._max_length = max_length
+        self._jump_ns = jump_ns
+        self._stamps: list[int] = []
+        self._values: list[T] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest value, or None."""
+        return self._stamps[-1] if self._stamps else None
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest value that is still known, or None."""
+        return self._stamps[0] if self._stamps else None
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps.clear()
+        self._values.clear()
+
+    def insert(self, stamp_ns: int, value: T) -> bool:
+        """Add a value; one with the same stamp is replaced.
+
+        Returns
+        -------
+        True if the clock went back and the history was cleared first.
+        """
+        cleared = bool(self._stamps) and stamp_ns < self._stamps[-1] - self._jump_ns
+        if cleared:
+            self.clear()
+        place = bisect_left(self._stamps, stamp_ns)
+        if place < len(self._stamps) and self._stamps[place] == stamp_ns:
+            self._values[place] = value
+            return cleared
+        self._stamps.insert(place, stamp_ns)
+        self._values.insert(place, value)
+        if len(self._stamps) > self._max_length:
+            del self._stamps[0], self._values[0]
+        return cleared
+
+    def at(self, stamp_ns: int) -> T | None:
+        """Value whose stamp is the latest one not after ``stamp_ns``, or None if there is none."""
+        place = bisect_right(self._stamps, stamp_ns)
+        return self._values[place - 1] if place else None
+
+    def stamp_at(self, stamp_ns: int) -> int | None:
+        """Stamp of the value that :meth:`at` returns, or None."""
+        place = bisect_right(self._stamps, stamp_ns)
+        return self._stamps[place - 1] if place else None

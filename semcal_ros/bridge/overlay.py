@@ -1,0 +1,47 @@
+"""A picture of what the corner search found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["corner_overlay"]
+
+_FOUND_BGR = (0, 220, 0)
+_REFUSED_BGR = (0, 0, 255)
+
+
+def corner_overlay(
+    image: NDArray[Any], corners_xy: ArrayLike, refused: str = ""
+) -> NDArray[np.uint8]:
+    """The image in grey with a circle around every corner.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey values of any depth; they are stretched to 8 bits between their 0.5 and 99.5 percentiles.
+    corners_xy
+        (n, 2) corners, px.
+    refused
+        Why the view is not used; written into the image, with a red frame.
+
+    Returns
+    -------
+    (h, w, 3) bgr8 image.
+    """
+    low, high = np.percentile(image, (0.5, 99.5))
+    scale = 255.0 / max(float(high - low), 1e-12)
+    grey = np.clip((image.astype(np.float32) - np.float32(low)) * np.float32(scale), 0, 255)
+    picture = np.ascontiguousarray(np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2))
+    height, width = picture.shape[:2]
+    radius = max(3, width // 160)
+    for x, y in np.asarray(corners_xy, dtype=np.float64).reshape(-1, 2):
+        cv2.circle(picture, (round(x), round(y)), radius, _FOUND_BGR, 1, cv2.LINE_AA)
+    if refused:
+        cv2.rectangle(picture, (0, 0), (width - 1, height - 1), _REFUSED_BGR, 3)
+        place = (8, height - 12)
+        cv2.putText(picture, refused, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _REFUSED_BGR, 1)
+    return picture

@@ -1,0 +1,142 @@
+"""Continuous parameters: names such as ``p@5250``, valid at any magnification in the range."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "PARAMETER_KINDS",
+    "CameraSource",
+    "ParameterRequest",
+    "is_continuous_parameter",
+    "parse_parameter_name",
+    "read_parameter",
+    "value_of",
+]
+
+PARAMETER_KINDS = ("p", "k", "d", "e", "p_affine", "pixel_size", "sigma")
+"""Projection, K, distortion, its centre, affine-safe projection, pixel size, predicted error."""
+
+_NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?([eE][+-]?[0-9]+)?")
+_MAX_SHOWN = 60
+
+
+class ParameterRequest(NamedTuple):
+    """A parsed name: which value, at which magnification."""
+
+    kind: str
+    magnification: float
+
+
+class CameraSource(Protocol):
+    """What a calibration offers."""
+
+    @property
+    def magnification_range(self) -> tuple[float, float]:
+        """Lowest and highest calibrated magnification."""
+
+    def at(self, magnification: float, /) -> ScanCamera:
+        """Camera at a magnification."""
+
+
+def is_continuous_parameter(name: str) -> bool:
+    """True for names that are meant as ``kind@magnification``, well-formed or not."""
+    return "@" in name
+
+
+def parse_parameter_name(name: str) -> ParameterRequest:
+    """Split ``"p@5250"`` into ``("p", 5250.0)``.
+
+    Raises
+    ------
+    InvalidValueError
+        The kind is unknown or the magnification is no positive finite decimal number.
+    """
+    kind, separator, number = name.partition("@")
+    if not separator or kind not in PARAMETER_KINDS:
+        raise InvalidValueError(
+            f"parameter name {name[:_MAX_SHOWN]!r}",
+            expected="one of " + ", ".join(f"{known}@<magnification>" for known in PARAMETER_KINDS),
+        )
+    magnification = float(number) if _NUMBER.fullmatch(number) else float("nan")
+    if not 0.0 < magnification < float("inf"):
+        raise InvalidValueError(
+            f"magnification {number[:_MAX_SHOWN]!r} in parameter {kind}@",
+            expected="a positive number such as 5250 or 2345.6",
+        )
+    return ParameterRequest(kind, magnification)
+
+
+def value_of(kind: str, camera: ScanCamera) -> list[float]:
+    """Value of one kind at the magnification of ``camera``.
+
+    Returns
+    -------
+    ``p``, ``p_affine``: 12 numbers, 3 x 4 row by row. ``k``: 9, row by row. ``d``: [xi_r, xi_t].
+    ``e``: [ex, ey] in px. ``pixel_size``: [x, y] in m. ``sigma``: length of the predicted 1-sigma
+    error in px at the image centre and at the corners (top left, top right, bottom left, bottom
+    right).
+
+    Raises
+    ------
+    InvalidValueError
+        The kind is unknown, or this camera has no such value (``p`` and ``k`` of a parallel
+        projection, ``sigma`` of a camera without covariance).
+    """
+    values: NDArray[np.float64]
+    if kind == "p":
+        values = camera.P.reshape(-1)
+    elif kind == "k":
+        values = camera.K.reshape(-1)
+    elif kind == "d":
+        values = np.array([camera.xi_r, camera.xi_t])
+    elif kind == "e":
+        values = np.array([camera.ex, camera.ey])
+    elif kind == "p_affine":
+        values = camera.P_affine.reshape(-1)
+    elif kind == "pixel_size":
+        values = np.array(camera.pixel_size_m)
+    elif kind == "sigma":
+        values = _sigma_px(camera)
+    else:
+        raise InvalidValueError(f"parameter kind {kind!r}", expected=", ".join(PARAMETER_KINDS))
+    return [float(value) for value in values]
+
+
+def _sigma_px(camera: ScanCamera) -> NDArray[np.float64]:
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    pixels = np.array(
+        [[0.5 * right, 0.5 * bottom], [0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
+    )
+    sigma = np.linalg.norm(camera.project_sigma(camera.sem_from_ideal(pixels)), axis=1)
+    if not np.all(np.isfinite(sigma)):
+        raise InvalidValueError(
+            "a distortion without an answer at an image corner", expected="4 xi_r r2 below 1"
+        )
+    return np.asarray(sigma, dtype=np.float64)
+
+
+def read_parameter(name: str, calibration: CameraSource) -> list[float]:
+    """Value of a continuous parameter.
+
+    Raises
+    ------
+    InvalidValueError
+        The name is malformed, the magnification is outside of the calibrated range, or the camera
+        has no such value.
+    """
+    kind, magnification = parse_parameter_name(name)
+    low, high = calibration.magnification_range
+    if not low <= magnification <= high:
+        raise InvalidValueError(
+            f"parameter {name}",
+            expected=f"a magnification within the calibrated range, {low:g} to {high:g}",
+        )
+    return value_of(kind, calibration.at(magnification))

@@ -1,0 +1,30 @@
+"""The bridge works where no ROS package is installed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+SCRIPT = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        ros = ("rclpy", "rosbags", "ament_index_python")
+        if top in ros or top.endswith(("_msgs", "_interfaces")):
+            raise ImportError("blocked " + name)
+        return None
+
+sys.meta_path.insert(0, Blocker())
+import semcal_ros.bridge as bridge
+assert all(hasattr(bridge, name) for name in bridge.__all__)
+assert bridge.load_config("generic").name == "generic"
+"""
+
+
+def test_imports_without_ros_and_without_rosbags() -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", SCRIPT], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
