@@ -1,0 +1,1 @@
+"""Recordings, vendor images and files on disk."""

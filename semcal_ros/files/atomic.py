@@ -1,0 +1,54 @@
+"""Write a file completely or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+
+__all__ = ["atomic_write_bytes", "atomic_write_text"]
+
+_NEW_FILE_MODE = 0o666
+
+
+def _mode_for(path: Path) -> int:
+    """Permission bits of the finished file: those of the file it replaces, else the usual ones."""
+    try:
+        return path.stat().st_mode & 0o7777
+    except FileNotFoundError:
+        mask = os.umask(0)
+        os.umask(mask)
+        return _NEW_FILE_MODE & ~mask
+
+
+def atomic_write_bytes(path: Path, data: bytes) -> None:
+    """Write ``data`` to ``path``: afterwards the file is either complete or what it was before.
+
+    The bytes go to a temporary file in the same folder, are flushed to the disk and then moved
+    over ``path`` in one step. Of a symbolic link the target is replaced, not the link.
+
+    Raises
+    ------
+    OSError
+        The folder is missing or not writable, or the disk is full; an existing file is untouched.
+    """
+    target = Path(os.path.realpath(path))
+    mode = _mode_for(target)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(name, mode)
+        os.replace(name, target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+def atomic_write_text(path: Path, text: str) -> None:
+    """Write ``text`` as UTF-8 with ``\\n`` line ends; see :func:`atomic_write_bytes`."""
+    atomic_write_bytes(path, text.encode("utf-8"))

@@ -1,0 +1,78 @@
+"""What the bag library and its backends raise on damaged or foreign files, as one error."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import apsw
+from rosbags.rosbag2 import ReaderError, WriterError
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
+from ruamel.yaml.error import YAMLError
+
+from semcal_ros.core.errors import BagError
+
+if sys.version_info >= (3, 14):
+    from compression.zstd import ZstdError
+else:
+    from backports.zstd import ZstdError
+
+__all__ = ["LIBRARY_ERRORS", "one_line", "reading", "unreadable"]
+
+# Damaged bytes surface from the parsers as many kinds of errors: lengths that overflow, unknown
+# keys, failed internal checks. The lz4 backend has no error class but RuntimeError. These are only
+# ever caught around calls of the library.
+LIBRARY_ERRORS: tuple[type[Exception], ...] = (
+    ReaderError,
+    WriterError,
+    SerdeError,
+    TypesysError,
+    YAMLError,
+    ZstdError,
+    apsw.Error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+    AssertionError,
+)
+
+_MAX_REASON = 200
+
+
+def one_line(error: BaseException) -> str:
+    """Short description of a library's error without line breaks, never empty."""
+    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
+
+
+def unreadable(path: Path, error: BaseException, what: str = "") -> BagError:
+    """The error for a recording that the library could not read."""
+    subject = f"{what} of {path}" if what else str(path)
+    return BagError(
+        f"cannot read {subject}: {one_line(error)}",
+        expected="an intact ROS 2 recording (mcap or sqlite3)",
+        do="if its recorder was interrupted, repair it with 'mcap recover' or 'ros2 bag reindex', "
+        "else copy it again",
+    )
+
+
+@contextmanager
+def reading(path: Path, what: str = "") -> Iterator[None]:
+    """Turn errors of the bag library inside of the block into one :class:`BagError`."""
+    try:
+        yield
+    except BagError:
+        raise
+    except LIBRARY_ERRORS as error:
+        raise unreadable(path, error, what) from error

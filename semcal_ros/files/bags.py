@@ -1,0 +1,356 @@
+"""Read and write ROS 2 recordings (rosbag2) without ROS.
+
+Both storage formats (mcap, sqlite3), compressed or not, as a folder with ``metadata.yaml`` or as a
+single file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinitionFormat,
+    QosDurability,
+)
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from semcal_ros.core.errors import BagError
+from semcal_ros.files.bag_errors import LIBRARY_ERRORS, one_line, reading, unreadable
+from semcal_ros.files.bag_writer import BagWriter
+from semcal_ros.files.messages import blank_message, jazzy_types
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = [
+    "BagMessage",
+    "BagReader",
+    "BagTopic",
+    "BagWriter",
+    "RawMessage",
+    "blank_message",
+    "is_bag",
+    "open_bag",
+]
+
+STORAGE_SUFFIXES = (".mcap", ".db3")
+_ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"
+_IDL_RULE = "=" * 80 + "\n"
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic of a recording.
+
+    Parameters
+    ----------
+    name
+        Absolute topic name as recorded, such as ``/sem/image_raw``.
+    type
+        Message type such as ``sensor_msgs/msg/Image``.
+    count
+        Number of messages that the recording declares.
+    latched
+        Whether the recorded publisher offered transient-local durability.
+    """
+
+    name: str
+    type: str
+    count: int
+    latched: bool = False
+
+
+class RawMessage(NamedTuple):
+    """One message as stored: CDR bytes, and when the recorder received it (ns since 1970)."""
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+
+
+class BagMessage(NamedTuple):
+    """One decoded message, and when the recorder received it (ns since 1970)."""
+
+    topic: str
+    log_time_ns: int
+    message: Any
+
+
+def is_bag(path: Path) -> bool:
+    """Whether ``path`` looks like a recording: a folder with bag files or a single storage file."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or bool(_storage_files(path))
+    return path.suffix in STORAGE_SUFFIXES
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix in STORAGE_SUFFIXES and p.is_file())
+
+
+def _locate(path: Path) -> Path:
+    """What to hand to the library for ``path``."""
+    if not path.exists():
+        raise BagError(f"{path} does not exist", expected=_ACCEPTED, do="check the path")
+    if not path.is_dir():
+        if path.suffix not in STORAGE_SUFFIXES:
+            raise BagError(
+                f"{path} is no ROS 2 recording by its name",
+                expected=_ACCEPTED,
+                do="convert a ROS 1 .bag with rosbags-convert; name the folder of a compressed one",
+            )
+        return _checked_name(path, [path])
+    files = _storage_files(path)
+    if (path / "metadata.yaml").exists():
+        return _checked_name(path, files)
+    if len(files) == 1:
+        return _checked_name(files[0], files)
+    raise BagError(
+        f"folder {path} has no metadata.yaml and {len(files)} .mcap or .db3 files",
+        expected=_ACCEPTED,
+        do="name the right folder, or make the missing file with 'ros2 bag reindex'",
+    )
+
+
+def _checked_name(path: Path, files: list[Path]) -> Path:
+    """``path``, unless the library would mistake it: it hands names of sqlite3 files on as URIs."""
+    odd = [character for character in "?#%" if character in str(path)]
+    if odd and any(file.suffix == ".db3" for file in files):
+        raise BagError(
+            f"the path {path} of a sqlite3 recording has the character {odd[0]}",
+            expected="a path without ? # %",
+            do="rename the folder or move the recording",
+        )
+    return path
+
+
+class BagReader:
+    """An open recording; use :func:`open_bag`, and close it or use it as a context manager.
+
+    Attributes
+    ----------
+    path
+        What was opened.
+    topics
+        Topics in the order of their names.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with reading(path):
+            self._reader = Reader(_locate(path))
+            self._reader.open()
+            self._connections = list(self._reader.connections)
+            self.topics: tuple[BagTopic, ...] = _topic_table(self._connections)
+            self._start_ns = int(self._reader.start_time)
+            self._end_ns = int(self._reader.end_time)
+            self.message_count = int(self._reader.message_count)
+        self._stores: dict[str, Typestore] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; calling it again does nothing."""
+        if self._reader.is_open:
+            with reading(self.path):
+                self._reader.close()
+
+    @property
+    def start_ns(self) -> int:
+        """Receive time of the first message in ns, 0 if there is none."""
+        return self._start_ns if self.message_count else 0
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last message."""
+        # The library counts one nanosecond past the last message.
+        return max(0, self._end_ns - self._start_ns - 1) * 1e-9 if self.message_count else 0.0
+
+    def raw_messages(
+        self,
+        topics: Iterable[str] | None = None,
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[RawMessage]:
+        """Messages in the order of their receive times, undecoded, read as they are asked for.
+
+        Parameters
+        ----------
+        topics
+            Names of topics to read; all without it.
+        start_ns, stop_ns
+            Half-open interval of receive times.
+
+        Raises
+        ------
+        BagError
+            The file is damaged, or declares messages of a topic and has none.
+        """
+        wanted = None if topics is None else set(topics)
+        chosen = [c for c in self._connections if wanted is None or c.topic in wanted]
+        if not chosen:
+            return
+        seen: dict[str, int] = {}
+        source = self._guarded(chosen, start_ns, stop_ns)
+        for connection, log_time_ns, data in source:
+            seen[connection.topic] = seen.get(connection.topic, 0) + 1
+            yield RawMessage(connection.topic, connection.msgtype, log_time_ns, data)
+        if start_ns is None and stop_ns is None:
+            self._check_delivered(chosen, seen)
+
+    def _guarded(
+        self, chosen: list[Connection], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        with reading(self.path):
+            source = iter(self._reader.messages(chosen, start_ns, stop_ns))
+        while True:
+            try:
+                item = next(source)
+            except StopIteration:
+                return
+            except LIBRARY_ERRORS as error:
+                raise unreadable(self.path, error) from error
+            yield item
+
+    def _check_delivered(self, chosen: list[Connection], seen: dict[str, int]) -> None:
+        for topic in _topic_table(chosen):
+            if topic.count and not seen.get(topic.name):
+                raise BagError(
+                    f"{self.path} declares {topic.count} messages on {topic.name} and holds none",
+                    expected="metadata.yaml that describes the files beside it",
+                    do="make it anew with 'ros2 bag reindex'",
+                )
+
+    def messages(
+        self,
+        topics: Iterable[str] | None = None,
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """Decoded messages; see :meth:`raw_messages` and :meth:`decode`."""
+        for raw in self.raw_messages(topics, start_ns=start_ns, stop_ns=stop_ns):
+            yield BagMessage(raw.topic, raw.log_time_ns, self.decode(raw))
+
+    def __iter__(self) -> Iterator[BagMessage]:
+        return self.messages()
+
+    def decode(self, raw: RawMessage) -> Any:
+        """Message with the fields of its ROS type as attributes; arrays are read-only NumPy arrays.
+
+        Raises
+        ------
+        BagError
+            The bytes do not fit the type, or it is neither known nor described in the recording.
+        """
+        store = self._store_for(raw)
+        try:
+            return store.deserialize_cdr(raw.data, raw.type)
+        except LIBRARY_ERRORS as error:
+            raise BagError(
+                f"a message on {raw.topic} in {self.path} cannot be decoded: {one_line(error)}",
+                expected=f"an intact {raw.type}",
+            ) from error
+
+    def _store_for(self, raw: RawMessage) -> Typestore:
+        if raw.type not in self._stores:
+            connection = next(
+                c for c in self._connections if c.topic == raw.topic and c.msgtype == raw.type
+            )
+            with reading(self.path, f"the definition of {raw.type}"):
+                self._stores[raw.type] = _store_of(connection, self.path)
+        return self._stores[raw.type]
+
+
+def _topic_table(connections: Iterable[Connection]) -> tuple[BagTopic, ...]:
+    counts: dict[tuple[str, str], int] = {}
+    latched: dict[tuple[str, str], bool] = {}
+    for connection in connections:
+        key = (connection.topic, connection.msgtype)
+        counts[key] = counts.get(key, 0) + int(connection.msgcount)
+        latched[key] = latched.get(key, False) or _is_latched(connection)
+    return tuple(BagTopic(*key, counts[key], latched[key]) for key in sorted(counts))
+
+
+def _is_latched(connection: Connection) -> bool:
+    if not isinstance(connection.ext, ConnectionExtRosbag2):
+        return False
+    profiles = connection.ext.offered_qos_profiles
+    return any(profile.durability == QosDurability.TRANSIENT_LOCAL for profile in profiles)
+
+
+def _store_of(connection: Connection, path: Path) -> Typestore:
+    """Types to decode a topic with: the recording's own where they differ from Jazzy's."""
+    encoding = getattr(connection.ext, "serialization_format", "cdr")
+    if encoding != "cdr":
+        raise BagError(
+            f"messages on {connection.topic} in {path} are {encoding!r}", expected="'cdr'"
+        )
+    jazzy = jazzy_types()
+    known = connection.msgtype in jazzy.fielddefs
+    if known and connection.digest and connection.digest == jazzy.hash_rihs01(connection.msgtype):
+        return jazzy
+    own = _own_types(connection)
+    if not own:
+        if known:
+            return jazzy
+        raise BagError(
+            f"message type {connection.msgtype} on {connection.topic} in {path}",
+            expected="a common ROS 2 type, or its definition inside the recording",
+            do="record with mcap, which stores definitions",
+        )
+    if all(name in jazzy.fielddefs and jazzy.fielddefs[name][1] == own[name][1] for name in own):
+        return jazzy
+    store = get_typestore(Stores.EMPTY)
+    store.register(own)
+    return store
+
+
+def _own_types(connection: Connection) -> dict[str, Any]:
+    text = connection.msgdef.data
+    if connection.msgdef.format == MessageDefinitionFormat.MSG:
+        return dict(get_types_from_msg(text, connection.msgtype))
+    if connection.msgdef.format == MessageDefinitionFormat.IDL:
+        types: dict[str, Any] = {}
+        parts = text.split(_IDL_RULE)[1:] if text.startswith(_IDL_RULE) else [text]
+        for part in parts:
+            types.update(
+                get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part)
+            )
+        return types
+    return {}
+
+
+def open_bag(path: str | Path) -> BagReader:
+    """Open a recording for reading.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 folder, or a single ``.mcap`` or ``.db3`` file. A folder without
+        ``metadata.yaml`` is accepted if it holds exactly one storage file.
+
+    Raises
+    ------
+    BagError
+        Missing, empty, truncated, or not a ROS 2 recording.
+    """
+    return BagReader(Path(path))

@@ -1,0 +1,203 @@
+"""Turn a folder of SEM TIFFs into a recording."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import fill_image
+from semcal_ros.core.errors import BagError, SemcalError, TiffError
+from semcal_ros.files.bag_writer import BagWriter, check_replaceable
+from semcal_ros.files.messages import blank_message
+from semcal_ros.files.tiff import SemImage
+from semcal_ros.files.tiff_folder import (
+    MIN_SPACING_NS,
+    Skipped,
+    TiffEntry,
+    TiffFolder,
+    scan_tiff_folder,
+)
+
+__all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_folder"]
+
+METADATA_TOPIC = "metadata"
+"""Topic with the settings of each image as JSON text (std_msgs/String)."""
+
+SIDECAR = "import.json"
+"""File in the recording's folder with the same settings, the notes and the skipped files."""
+
+_NUMBER_TYPES = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+_BEFORE_IMAGE_NS = MIN_SPACING_NS // 10
+
+
+@dataclass(frozen=True)
+class ImportSummary:
+    """What an import did.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    imported
+        Number of images.
+    display_width_m
+        The display width that all magnifications refer to.
+    skipped
+        Files that could not be used, with reasons.
+    notes
+        What a person should know about the values.
+    """
+
+    path: Path
+    imported: int
+    display_width_m: float
+    skipped: tuple[Skipped, ...]
+    notes: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The summary for a person, one fact a line."""
+        return [
+            f"{self.imported} images in {self.path}",
+            *(f"note: {note}" for note in self.notes),
+            *(f"skipped {skipped.name}: {skipped.reason}" for skipped in self.skipped),
+        ]
+
+
+def _topic(name: str) -> str:
+    return name if name.startswith("/") else f"/sem/{name}"
+
+
+def _check_config(config: MicroscopeConfig) -> None:
+    source = config.magnification
+    if source.type not in _NUMBER_TYPES or source.field != "data":
+        raise BagError(
+            f"configuration {config.name!r} has its {source.quantity} in {source.type}, "
+            f"field {source.field}",
+            expected="std_msgs/msg/Float64, field data, for an import",
+            do="import with --config generic",
+        )
+
+
+def _published_number(config: MicroscopeConfig, image: SemImage) -> float:
+    """The number from which a reader with this configuration gets the image's field width."""
+    source = config.magnification
+    if source.quantity == "magnification":
+        return image.magnification(source.display_width_m or config.display_width_m)
+    if source.quantity == "field_width":
+        return image.field_width_m / source.si_per_unit
+    columns = source.image_width_px or image.full_size_px[0]
+    return image.field_width_m / columns / source.si_per_unit
+
+
+def _text_message(text: str) -> Any:
+    message = blank_message("std_msgs/msg/String")
+    message.data = text
+    return message
+
+
+def _write_image(
+    writer: BagWriter, config: MicroscopeConfig, entry: TiffEntry, image: SemImage
+) -> dict[str, Any]:
+    number = blank_message(config.magnification.type)
+    number.data = _published_number(config, image)
+    # A player that keeps the recording's order then announces the magnification before its image.
+    before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
+    writer.write(_topic(config.magnification.topic), before_ns, number)
+    message = blank_message("sensor_msgs/msg/Image")
+    header = blank_message("std_msgs/msg/Header")
+    fill_header(header, entry.stamp_ns, config.frame_id)
+    fill_image(message, image.image, "mono8" if image.image.itemsize == 1 else "mono16", header)
+    writer.write(_topic(config.image.topic), entry.stamp_ns, message)
+    settings = {"stamp_ns": entry.stamp_ns, "published": number.data, **image.metadata()}
+    text = json.dumps(settings, sort_keys=True, allow_nan=False)
+    writer.write(_topic(METADATA_TOPIC), entry.stamp_ns, _text_message(text))
+    return settings
+
+
+def _write_all(
+    writer: BagWriter,
+    config: MicroscopeConfig,
+    folder: TiffFolder,
+    on_progress: Callable[[int], object] | None,
+) -> tuple[list[dict[str, Any]], list[Skipped]]:
+    written, skipped = [], []
+    for entry in folder.entries:
+        if on_progress is not None:
+            on_progress(1)
+        try:
+            image = entry.load()
+        except SemcalError as error:
+            skipped.append(Skipped(entry.path.name, str(error)))
+            continue
+        written.append(_write_image(writer, config, entry, image))
+    if not written:
+        raise TiffError(
+            f"none of {len(folder.entries)} images in {folder.path} can be decoded, "
+            f"the first: {skipped[0].reason}",
+            expected="at least one intact SEM TIFF",
+        )
+    return written, skipped
+
+
+def import_folder(
+    folder: str | Path,
+    out_bag: str | Path,
+    *,
+    config: MicroscopeConfig | None = None,
+    databar_rows: int | None = None,
+    overwrite: bool = False,
+    on_progress: Callable[[int], object] | None = None,
+) -> ImportSummary:
+    """Write a recording with the images of a folder, their magnification and all their settings.
+
+    Parameters
+    ----------
+    folder
+        Folder with SEM TIFFs (not searched below), or one such file. Sizes and makers may differ.
+    out_bag
+        Recording to make.
+    config
+        Topics, and the display width that all magnifications refer to; ``generic`` by default. Read
+        the recording with the same configuration: the field widths, and with them the pixel sizes,
+        are then exactly those of the files.
+    databar_rows
+        Rows to cut off at the bottom of every image, in place of what the files say; by default the
+        configuration's, if they are not 0.
+    overwrite
+        Replace an existing recording.
+    on_progress
+        Called with 1 for every image.
+
+    Raises
+    ------
+    TiffError
+        No file is usable.
+    BagError
+        The recording cannot be written, or exists.
+    """
+    used = load_config("generic") if config is None else config
+    _check_config(used)
+    check_replaceable(Path(os.path.abspath(out_bag)), overwrite)
+    source = scan_tiff_folder(
+        Path(folder),
+        display_width_m=used.display_width_m,
+        databar_rows=databar_rows if databar_rows is not None else used.image.databar_rows or None,
+    )
+    with BagWriter(out_bag, overwrite=overwrite) as writer:
+        written, damaged = _write_all(writer, used, source, on_progress)
+        skipped = (*source.skipped, *damaged)
+        report = {
+            "display_width_m": used.display_width_m,
+            "configuration": used.name,
+            "notes": list(source.notes),
+            "skipped": [{"file": s.name, "reason": s.reason} for s in skipped],
+            "images": written,
+        }
+        writer.write_text(SIDECAR, json.dumps(report, indent=2, allow_nan=False) + "\n")
+    return ImportSummary(writer.path, len(written), used.display_width_m, skipped, source.notes)

@@ -1,0 +1,337 @@
+"""Frames with their magnification, from a recording or from a folder of SEM TIFFs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message
+from semcal_ros.core.errors import BagError, MessageError, SemcalError
+from semcal_ros.files.bag_errors import reading
+from semcal_ros.files.bags import BagTopic, RawMessage, is_bag, open_bag
+from semcal_ros.files.magnifications import MagnificationTrack
+from semcal_ros.files.tiff import is_tiff
+from semcal_ros.files.tiff_folder import PLAIN_IMAGES, TiffFolder, scan_tiff_folder
+from semcal_ros.files.topics import find_topic
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["Frame", "Recording", "Rejected", "open_recording"]
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One usable image of a recording.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3) array without the databar.
+    stamp_ns
+        Header stamp as it is, in ns since 1970; the configuration says which moment it means.
+        The recorder's time if the stamp is not set.
+    log_time_ns
+        When the recorder received the image.
+    magnification
+        Of this frame, on the configuration's display width.
+    frame_id
+        Header's frame.
+    encoding
+        ROS name of the pixel format, such as ``mono8``.
+    """
+
+    image: NDArray[Any]
+    stamp_ns: int
+    log_time_ns: int
+    magnification: float
+    frame_id: str
+    encoding: str
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A message or file that was left out, and why."""
+
+    log_time_ns: int
+    reason: str
+
+
+class Recording:
+    """An open recording; use :func:`open_recording`, and close it or use it as a context manager.
+
+    Attributes
+    ----------
+    path
+        What was opened.
+    config
+        The microscope's configuration that says how to read it.
+    """
+
+    def __init__(self, path: Path, config: MicroscopeConfig) -> None:
+        self.path = path
+        self.config = config
+        self._notes: list[str] = []
+        self._pass_notes: list[str] = []
+        self._rejected: list[Rejected] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+
+    @property
+    def topics(self) -> tuple[BagTopic, ...]:
+        """Topics of the recording; none for a folder of TIFFs."""
+        return ()
+
+    @property
+    def frame_count(self) -> int:
+        """Number of images, bad ones included."""
+        raise NotImplementedError
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know; complete after :meth:`frames` was read to its end."""
+        return (*self._notes, *self._pass_notes)
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """Damaged or unknown images that the last reading of :meth:`frames` left out."""
+        return tuple(self._rejected)
+
+    def frames(self) -> Iterator[Frame]:
+        """Usable frames in the order of the recording, read as asked for; can be called again.
+
+        Raises
+        ------
+        BagError
+            No frame is usable (with the first reason), or the file is damaged.
+        """
+        self._rejected.clear()
+        self._pass_notes.clear()
+        count = 0
+        for frame in self._frames():
+            count += 1
+            yield frame
+        if self._rejected:
+            first = self._rejected[0].reason
+            self._pass_notes.append(
+                f"{len(self._rejected)} images were left out, the first: {first}"
+            )
+        if count == 0:
+            raise BagError(
+                f"none of {self.frame_count} images in {self.path} is usable: "
+                + (" / ".join(self._pass_notes) or "there are no images"),
+                expected="at least one image of a known encoding with a valid magnification",
+            )
+
+    def _frames(self) -> Iterator[Frame]:
+        raise NotImplementedError
+
+    def _cut(self, image: NDArray[Any], rows: int) -> NDArray[Any]:
+        if not 0 <= rows < image.shape[0]:
+            raise MessageError(
+                f"{rows} rows of databar in an image of {image.shape[0]} rows",
+                expected="fewer",
+                do="correct databar_rows in the msg_configs file",
+            )
+        return image[: image.shape[0] - rows]
+
+
+class _BagRecording(Recording):
+    """Images and magnifications of a rosbag2 recording."""
+
+    def __init__(self, path: Path, config: MicroscopeConfig) -> None:
+        super().__init__(path, config)
+        self._reader = open_bag(path)
+        try:
+            self._image_topic = self._find("image", config.image.topic, IMAGE_TYPE)
+            magnification_topic = self._find(
+                "magnification", config.magnification.topic, config.magnification.type
+            )
+            self._track = MagnificationTrack(self._reader, magnification_topic.name, config)
+        except BaseException:
+            self._reader.close()
+            raise
+        self._note_bad_magnifications(magnification_topic)
+
+    def _find(self, what: str, wanted: str, type_name: str) -> BagTopic:
+        topic, note = find_topic(
+            self.path, self._reader.topics, what=what, wanted=wanted, type_name=type_name
+        )
+        if note:
+            self._notes.append(note)
+        return topic
+
+    def _note_bad_magnifications(self, topic: BagTopic) -> None:
+        bad = self._track.bad
+        if self._track.usable == 0:
+            self._reader.close()
+            reason = f", the first: {bad[0]}" if bad else ""
+            raise BagError(
+                f"{topic.name} in {self.path} has {len(bad)} messages and no valid magnification"
+                f"{reason}",
+                expected="at least one message with a finite value above 0",
+                do="record the magnification topic together with the images",
+            )
+        if bad:
+            self._notes.append(
+                f"{len(bad)} messages on {topic.name} are ignored, the first: {bad[0]}"
+            )
+
+    def close(self) -> None:
+        self._reader.close()
+
+    @property
+    def topics(self) -> tuple[BagTopic, ...]:
+        return self._reader.topics
+
+    @property
+    def frame_count(self) -> int:
+        return self._image_topic.count
+
+    def _frames(self) -> Iterator[Frame]:
+        without, unstamped, images = 0, 0, 0
+        for raw in self._reader.raw_messages([self._image_topic.name]):
+            if raw.type != IMAGE_TYPE:
+                continue
+            images += 1
+            try:
+                frame, stamped = self._frame(raw)
+            except SemcalError as error:
+                self._rejected.append(Rejected(raw.log_time_ns, str(error)))
+                continue
+            unstamped += not stamped
+            if frame is None:
+                without += 1
+                continue
+            yield frame
+        if without:
+            self._pass_notes.append(f"{without} images have no valid magnification at their time")
+        if unstamped:
+            self._pass_notes.append(
+                f"{unstamped} images have no header stamp: the recorder's time is used"
+            )
+        if images < self.frame_count:
+            self._pass_notes.append(
+                f"the recording declares {self.frame_count} images and holds {images}"
+            )
+
+    def _frame(self, raw: RawMessage) -> tuple[Frame | None, bool]:
+        """The frame of a message (``None`` without magnification); whether it has a stamp."""
+        message = self._reader.decode(raw)
+        image = self._cut(image_from_message(message), self.config.image.databar_rows)
+        stamp_ns = stamp_ns_from_msg(message)
+        magnification = self._track.at(stamp_ns or raw.log_time_ns, raw.log_time_ns, image.shape[1])
+        if magnification is None:
+            return None, stamp_ns != 0
+        return (
+            Frame(
+                image=image,
+                stamp_ns=stamp_ns or raw.log_time_ns,
+                log_time_ns=raw.log_time_ns,
+                magnification=magnification,
+                frame_id=str(message.header.frame_id),
+                encoding=str(message.encoding),
+            ),
+            stamp_ns != 0,
+        )
+
+
+class _TiffRecording(Recording):
+    """Images of a folder of SEM TIFFs, with magnifications on one common display width."""
+
+    def __init__(self, path: Path, config: MicroscopeConfig, folder: TiffFolder) -> None:
+        super().__init__(path, config)
+        self._folder = folder
+        self._notes.extend(folder.notes)
+        self._notes.extend(f"{s.name} is skipped: {s.reason}" for s in folder.skipped)
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._folder.entries)
+
+    def _frames(self) -> Iterator[Frame]:
+        for entry in self._folder.entries:
+            try:
+                loaded = entry.load()
+            except SemcalError as error:
+                self._rejected.append(Rejected(entry.stamp_ns, str(error)))
+                continue
+            yield Frame(
+                image=loaded.image,
+                stamp_ns=entry.stamp_ns,
+                log_time_ns=entry.stamp_ns,
+                magnification=entry.magnification,
+                frame_id=self.config.frame_id,
+                encoding="mono8" if loaded.image.dtype.itemsize == 1 else "mono16",
+            )
+
+
+def open_recording(path: str | Path, config: MicroscopeConfig | None = None) -> Recording:
+    """Open a recording or a folder of SEM TIFFs for reading frames.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 folder, an ``.mcap`` or ``.db3`` file, a folder of SEM TIFFs or one TIFF.
+    config
+        How the microscope's topics are named and what they carry; ``generic`` by default. For
+        TIFFs, its display width is what magnifications refer to, and its databar rows, if not
+        0, are used in place of what the files say.
+
+    Raises
+    ------
+    BagError
+        Missing, damaged, of another kind, or without images or magnification.
+    TiffError
+        A folder of TIFFs of which none is usable.
+    """
+    path = Path(path)
+    used = load_config("generic") if config is None else config
+    with reading(path):
+        kind = _kind_of(path)
+    if kind == "tiff":
+        folder = scan_tiff_folder(
+            path,
+            display_width_m=used.display_width_m,
+            databar_rows=used.image.databar_rows or None,
+        )
+        return _TiffRecording(path, used, folder)
+    return _BagRecording(path, used)
+
+
+def _kind_of(path: Path) -> str:
+    """``tiff`` or ``bag``, which the reader of recordings then looks at closer."""
+    if not path.exists() or is_bag(path):
+        return "bag"
+    names = list(path.iterdir()) if path.is_dir() else [path]
+    if any(is_tiff(name) for name in names):
+        return "tiff"
+    images = [name.name for name in names if name.suffix.lower() in PLAIN_IMAGES]
+    if images:
+        raise BagError(
+            f"{path} has {len(images)} plain images such as {min(images)}",
+            expected="a rosbag2 folder, or SEM TIFFs whose metadata tell the pixel size",
+            do="use the microscope's original TIFF files",
+        )
+    return "bag"

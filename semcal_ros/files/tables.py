@@ -1,0 +1,52 @@
+"""Tables of numbers as CSV files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.atomic import atomic_write_text
+
+__all__ = ["DRIFT_COLUMNS", "write_csv"]
+
+DRIFT_COLUMNS = (
+    "stamp_ns",
+    "dx_m",
+    "dy_m",
+    "sigma_x_m",
+    "sigma_y_m",
+    "dx_px",
+    "dy_px",
+    "status",
+)
+"""Columns of ``drift.csv``."""
+
+
+def _cell(value: object) -> str:
+    """Text that reads back as the same value; a missing number is ``nan``."""
+    if value is None:
+        return "nan"
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table completely or not at all, with full precision.
+
+    Raises
+    ------
+    InvalidValueError
+        A row has another number of values than there are columns.
+    OSError
+        The file cannot be written; an existing one is untouched.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        if len(row) != len(columns):
+            raise InvalidValueError(f"a row of {len(row)} values", expected=f"{len(columns)}")
+        writer.writerow([_cell(value) for value in row])
+    atomic_write_text(path, text.getvalue())

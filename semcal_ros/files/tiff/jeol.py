@@ -1,0 +1,126 @@
+"""JEOL: a text file beside the image with lines such as ``$CM_MAG 50``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from semcal_ros.core.errors import TiffError
+from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.tiff.values import (
+    check_pixel_size,
+    first_date,
+    plain_number,
+    positive,
+    quantity,
+)
+
+__all__ = ["USUAL_DISPLAY_WIDTH_M", "jeol_pairs", "jeol_settings"]
+
+USUAL_DISPLAY_WIDTH_M = 0.128
+"""Width of the photograph (5 x 4 inch film) to which JEOL's magnification usually refers."""
+
+_MAX_SIDECAR_BYTES = 1_000_000
+
+
+def _decode(data: bytes) -> str:
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", errors="replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def jeol_pairs(data: bytes) -> dict[str, str]:
+    """Settings by name without their dollar signs; empty if this is no JEOL text."""
+    pairs: dict[str, str] = {}
+    for line in _decode(data[:_MAX_SIDECAR_BYTES]).splitlines():
+        if line.startswith("$"):
+            key, _, value = line.strip().partition(" ")
+            pairs.setdefault(key.lstrip("$"), value.strip())
+    return pairs if any(key.startswith(("CM_", "SM_")) for key in pairs) else {}
+
+
+def _scan_size(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> tuple[int, int]:
+    """Columns and rows of the scan, which the databar may follow in the file."""
+    for key in ("CM_FULL_SIZE", "CM_IMAGE_SIZE"):
+        numbers = [plain_number(word) for word in pairs.get(key, "").split()]
+        if len(numbers) == 2 and numbers[0] and numbers[1]:
+            columns, rows = int(numbers[0]), int(numbers[1])
+            if columns != size_px[0] or not 0 < rows <= size_px[1]:
+                raise TiffError(
+                    f"{path.name} is {size_px[0]} x {size_px[1]} pixels, "
+                    f"${key} says {columns} x {rows}",
+                    expected="the image as the microscope stored it",
+                    do="use the original file, not a resized or cropped copy",
+                )
+            return columns, rows
+    return size_px
+
+
+def _from_micron_bar(pairs: dict[str, str]) -> float | None:
+    bar_px = positive(plain_number(pairs.get("SM_MICRON_BAR", "")))
+    bar_m = positive(quantity(pairs.get("SM_MICRON_MARKER", ""), "m"))
+    return None if bar_px is None or bar_m is None else bar_m / bar_px
+
+
+def _pixel_size(
+    path: Path, pairs: dict[str, str], columns: int
+) -> tuple[float, bool, tuple[str, ...]]:
+    """Pixel size in m, whether it rests on an assumed display width, and notes."""
+    words = pairs.get("CM_FIELD_OF_VIEW", "").split()
+    field_m = positive(quantity(words[0], "m", default_unit="um")) if words else None
+    if field_m is not None:
+        return check_pixel_size(path, field_m / columns, "$CM_FIELD_OF_VIEW", words[0]), False, ()
+    shown = positive(plain_number(pairs.get("CM_MAG", "")))
+    from_bar = _from_micron_bar(pairs)
+    if shown is None:
+        if from_bar is None:
+            raise TiffError(
+                f"{path.name}: $CM_MAG in its text file is {pairs.get('CM_MAG', 'missing')[:40]}",
+                expected="$CM_FIELD_OF_VIEW, $CM_MAG or a micron bar",
+                do="export the image anew with its text file",
+            )
+        return check_pixel_size(path, from_bar, "$$SM_MICRON_BAR", from_bar), False, ()
+    assumed = USUAL_DISPLAY_WIDTH_M / shown / columns
+    bar_px = positive(plain_number(pairs.get("SM_MICRON_BAR", "")))
+    if from_bar is not None and bar_px is not None:
+        agrees = abs(from_bar / assumed - 1.0) <= 1.5 / bar_px
+        if not agrees:
+            note = f"pixel size from the micron bar of {bar_px:g} px, good to {100 / bar_px:.1g} %"
+            return check_pixel_size(path, from_bar, "$$SM_MICRON_BAR", from_bar), False, (note,)
+        note = f"display width {USUAL_DISPLAY_WIDTH_M} m assumed; the micron bar agrees with it"
+        return check_pixel_size(path, assumed, "$CM_MAG", shown), False, (note,)
+    note = f"display width {USUAL_DISPLAY_WIDTH_M} m assumed: the file gives no length"
+    return check_pixel_size(path, assumed, "$CM_MAG", shown), True, (note,)
+
+
+def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> VendorSettings:
+    """Settings from the text file.
+
+    Raises
+    ------
+    TiffError
+        There is neither a field of view, nor a magnification, nor a micron bar; or the sizes
+        contradict each other.
+    """
+    columns, rows = _scan_size(path, pairs, size_px)
+    pixel_m, assumed, notes = _pixel_size(path, pairs, columns)
+    distance_mm = plain_number(pairs.get("SM_WD", ""))
+    rotation = plain_number(pairs.get("SM_SCAN_ROTATION", ""))
+    stamp = f"{pairs.get('CM_DATE', '')} {pairs.get('CM_TIME', '')}"
+    return VendorSettings(
+        vendor="jeol",
+        pixel_size_m=pixel_m,
+        pixel_size_y_m=pixel_m,
+        displayed_magnification=positive(plain_number(pairs.get("CM_MAG", ""))),
+        databar_rows=size_px[1] - rows,
+        working_distance_m=None if distance_mm is None else distance_mm * 1e-3,
+        scan_rotation_rad=None if rotation is None else math.radians(rotation),
+        detector=pairs.get("CM_DETECTOR_NAME") or pairs.get("CM_DETECTOR", ""),
+        instrument=pairs.get("CM_INSTRUMENT", ""),
+        time=first_date([(stamp, "%Y/%m/%d %H:%M:%S"), (stamp, "%Y/%m/%d %I:%M:%S %p")]),
+        display_width_assumed=assumed,
+        notes=notes,
+    )

@@ -1,0 +1,89 @@
+"""Grey pixels of a TIFF page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import TiffError
+
+__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "grey_image", "page_size"]
+
+MAX_SIDE_PX = 65_536
+MAX_PIXELS = 2**29
+_LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+
+
+def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
+    """(width, height) of a page, checked before anything is allocated.
+
+    Raises
+    ------
+    TiffError
+        The page is empty or too large to be an SEM image.
+    """
+    width, height = int(page.imagewidth), int(page.imagelength)
+    if not (
+        0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and width * height <= MAX_PIXELS
+    ):
+        raise TiffError(
+            f"{path.name} declares {width} x {height} pixels",
+            expected=f"at most {MAX_SIDE_PX} a side and {MAX_PIXELS} in all",
+            do="check that the file is complete",
+        )
+    bits = page.bitspersample
+    if bits not in (8, 16) or page.imagedepth != 1:
+        raise TiffError(f"{path.name} has {bits} bits per sample", expected="8 or 16")
+    return width, height
+
+
+def _lookup(image: NDArray[Any], colormap: NDArray[Any]) -> NDArray[Any]:
+    """Grey values of a palette image; the usual grey ramp leaves the indices as they are."""
+    table = _LUMA @ np.asarray(colormap, dtype=np.float64) / 257.0
+    ramp = np.linspace(0.0, 255.0, table.size)
+    if image.dtype == np.uint8 and np.allclose(table, ramp, atol=1.0):
+        return image
+    return np.asarray(np.rint(table).astype(np.uint8)[image])
+
+
+def _to_grey(image: NDArray[Any], page: tifffile.TiffPage) -> NDArray[Any]:
+    if page.colormap is not None and image.ndim == 2:
+        return _lookup(image, page.colormap)
+    if image.ndim == 3:
+        mixed = image[..., :3].astype(np.float64) @ _LUMA
+        return np.asarray(np.rint(mixed).astype(image.dtype))
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        return np.asarray(np.iinfo(image.dtype).max - image)
+    return image
+
+
+def _decode_by_opencv(path: Path) -> NDArray[Any]:
+    """Grey image by OpenCV's TIFF decoder, which knows LZW without further packages."""
+    data = np.fromfile(path, dtype=np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if image is None:
+        raise ValueError("the compressed picture cannot be decoded")
+    return np.asarray(image)
+
+
+def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
+    """(h, w) uint8 or uint16 picture of a page whose size was checked.
+
+    Raises
+    ------
+    ValueError, OSError
+        The pixel data are truncated or damaged.
+    """
+    size = (int(page.imagelength), int(page.imagewidth))
+    if page.compression in (tifffile.COMPRESSION.NONE, tifffile.COMPRESSION.ADOBE_DEFLATE):
+        image = _to_grey(np.asarray(page.asarray()), page)
+    else:
+        image = _decode_by_opencv(path)
+    if image.shape != size or image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"decoded picture is {image.dtype} {image.shape}")
+    return np.ascontiguousarray(image)

@@ -1,0 +1,154 @@
+"""Read an SEM image of any known maker."""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import tifffile
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import TiffError
+from semcal_ros.files.tiff import tescan, thermo_fisher, zeiss
+from semcal_ros.files.tiff.jeol import jeol_pairs, jeol_settings
+from semcal_ros.files.tiff.pixels import grey_image, page_size
+from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
+
+__all__ = ["is_tiff", "read_sem_settings", "read_sem_tiff"]
+
+SUFFIXES = (".tif", ".tiff")
+# What the TIFF parser raises on damaged bytes; only ever caught around calls of it.
+_PARSER_ERRORS: tuple[type[Exception], ...] = (
+    tifffile.TiffFileError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+    OSError,
+    EOFError,
+    struct.error,
+    cv2.error,
+)
+
+
+def is_tiff(path: Path) -> bool:
+    """Whether the file's name is one of a TIFF."""
+    return path.suffix.lower() in SUFFIXES
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the TIFF parser from logging what is reported as an error here."""
+    logger = logging.getLogger("tifffile")
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
+    """The file beside ``path`` whose name is its stem and one of the endings, in either case."""
+    names = [path.stem + form for ending in endings for form in (ending, ending.upper())]
+    return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+
+
+def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> VendorSettings:
+    """Settings by whichever maker's metadata the file has."""
+    tags = page.tags
+    if zeiss.TAG in tags and isinstance(tags[zeiss.TAG].value, dict):
+        return zeiss.zeiss_settings(path, tags[zeiss.TAG].value)
+    for code in thermo_fisher.TAGS:
+        if code in tags and isinstance(tags[code].value, dict):
+            return thermo_fisher.thermo_fisher_settings(path, tags[code].value, size_px)
+    if tescan.TAG in tags:
+        value = tags[tescan.TAG].value
+        data = value if isinstance(value, bytes) else str(value).encode()
+        return tescan.tescan_settings(path, data, size_px)
+    return _sidecar_settings(path, size_px)
+
+
+def _sidecar_settings(path: Path, size_px: tuple[int, int]) -> VendorSettings:
+    text = _sidecar(path, (".txt",))
+    if text is not None:
+        pairs = jeol_pairs(text.read_bytes())
+        if pairs:
+            return jeol_settings(path, pairs, size_px)
+    header = _sidecar(path, (".hdr", f"-{path.suffix[1:]}.hdr"))
+    if header is not None:
+        return tescan.tescan_settings(path, header.read_bytes(), size_px)
+    raise TiffError(
+        f"{path.name} has no metadata of a known SEM",
+        expected="tag 34118 (Zeiss), 34680 or 34682 (Thermo Fisher), 50431 (TESCAN), "
+        "or a JEOL .txt beside it",
+        do="use the microscope's original file, not a converted copy",
+    )
+
+
+@contextmanager
+def _parsing(path: Path) -> Iterator[None]:
+    """Turn what the parser raises in the block into a :class:`TiffError`, and keep it quiet."""
+    try:
+        with _quiet():
+            yield
+    except TiffError:
+        raise
+    except _PARSER_ERRORS as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise TiffError(
+            f"{path} cannot be read: {reason}",
+            expected="an intact TIFF of an SEM",
+            do="copy it again from the microscope",
+        ) from error
+
+
+def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
+    page = file.pages.first
+    if not isinstance(page, tifffile.TiffPage):
+        raise TiffError(f"{path.name} holds no picture", expected="an SEM image")
+    return page
+
+
+def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
+    """Settings and stored (width, height), pixels undecoded; errors as :func:`read_sem_tiff`."""
+    path = Path(path)
+    with _parsing(path), tifffile.TiffFile(path) as file:
+        page = _first_page(file, path)
+        size_px = page_size(path, page)
+        return _settings(path, page, size_px), size_px
+
+
+def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemImage:
+    """Read an SEM image and its settings; tags or the text file beside it tell the maker.
+
+    Parameters
+    ----------
+    path
+        A TIFF file of Zeiss, Thermo Fisher (FEI), TESCAN or JEOL.
+    databar_rows
+        Rows to cut off at the bottom, in place of what the metadata say.
+
+    Raises
+    ------
+    TiffError
+        Missing, truncated or no TIFF; no known metadata; no usable pixel size; an absurd size.
+    """
+    path = Path(path)
+    with _parsing(path), tifffile.TiffFile(path) as file:
+        page = _first_page(file, path)
+        settings = _settings(path, page, page_size(path, page))
+        image: NDArray[Any] = grey_image(path, page)
+    rows = settings.databar_rows if databar_rows is None else databar_rows
+    height, width = image.shape
+    if not 0 <= rows < height:
+        raise TiffError(f"{rows} rows of databar in {path.name}", expected=f"0 to {height - 1}")
+    return SemImage(path, image[: height - rows], (width, height), rows, settings)

@@ -1,0 +1,172 @@
+"""One SEM image with the settings that its file declares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["SemImage", "VendorSettings"]
+
+
+@dataclass(frozen=True)
+class VendorSettings:
+    """What a maker's metadata say, in SI units; ``None`` where they say nothing.
+
+    Parameters
+    ----------
+    vendor
+        ``zeiss``, ``thermo_fisher``, ``tescan`` or ``jeol``.
+    pixel_size_m
+        Width of a pixel of the stored image on the specimen.
+    pixel_size_y_m
+        Height of such a pixel.
+    displayed_magnification
+        The magnification that the microscope showed, which depends on its display width.
+    databar_rows
+        Rows at the bottom of the file that are no part of the scan.
+    display_width_assumed
+        Whether the pixel size rests on the maker's usual display width, not on a value in the
+        file.
+    notes
+        What a person should know about these values.
+    """
+
+    vendor: str
+    pixel_size_m: float
+    pixel_size_y_m: float
+    displayed_magnification: float | None = None
+    databar_rows: int = 0
+    working_distance_m: float | None = None
+    scan_rotation_rad: float | None = None
+    dwell_s: float | None = None
+    frame_time_s: float | None = None
+    detector: str = ""
+    instrument: str = ""
+    time: datetime | None = None
+    display_width_assumed: bool = False
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SemImage:
+    """An SEM image without its databar, and its settings.
+
+    Parameters
+    ----------
+    path
+        The file.
+    image
+        (h, w) uint8 or uint16, grey.
+    full_size_px
+        (width, height) of the stored picture, databar included.
+    databar_rows
+        Rows that were cut off at the bottom.
+    settings
+        The maker's metadata.
+    """
+
+    path: Path
+    image: NDArray[Any]
+    full_size_px: tuple[int, int]
+    databar_rows: int
+    settings: VendorSettings = field(repr=False)
+
+    @property
+    def vendor(self) -> str:
+        """``zeiss``, ``thermo_fisher``, ``tescan`` or ``jeol``."""
+        return self.settings.vendor
+
+    @property
+    def pixel_size_m(self) -> float:
+        """Width of a pixel on the specimen."""
+        return self.settings.pixel_size_m
+
+    @property
+    def pixel_size_y_m(self) -> float:
+        """Height of a pixel on the specimen."""
+        return self.settings.pixel_size_y_m
+
+    @property
+    def field_width_m(self) -> float:
+        """Width of the scanned field."""
+        return self.settings.pixel_size_m * self.full_size_px[0]
+
+    @property
+    def displayed_magnification(self) -> float | None:
+        """Magnification that the microscope showed, if the file tells."""
+        return self.settings.displayed_magnification
+
+    @property
+    def display_width_m(self) -> float | None:
+        """Display width of the shown magnification: pixel size x columns x magnification."""
+        shown = self.settings.displayed_magnification
+        return None if shown is None else self.field_width_m * shown
+
+    @property
+    def working_distance_m(self) -> float | None:
+        """Working distance."""
+        return self.settings.working_distance_m
+
+    @property
+    def scan_rotation_rad(self) -> float | None:
+        """Scan rotation, in the maker's sense of rotation."""
+        return self.settings.scan_rotation_rad
+
+    @property
+    def dwell_s(self) -> float | None:
+        """Time on each pixel."""
+        return self.settings.dwell_s
+
+    @property
+    def frame_time_s(self) -> float | None:
+        """Time of one pass over the frame."""
+        return self.settings.frame_time_s
+
+    @property
+    def detector(self) -> str:
+        """Detector name, empty if unknown."""
+        return self.settings.detector
+
+    @property
+    def time(self) -> datetime | None:
+        """Local time of the recording, without a time zone."""
+        return self.settings.time
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know about these values."""
+        return self.settings.notes
+
+    def magnification(self, display_width_m: float) -> float:
+        """Magnification of this field of view on a display of the given width."""
+        return display_width_m / self.field_width_m
+
+    def metadata(self) -> dict[str, Any]:
+        """All settings as plain values for JSON (SI units)."""
+        s = self.settings
+        return {
+            "file": self.path.name,
+            "vendor": s.vendor,
+            "full_size_px": list(self.full_size_px),
+            "databar_rows": self.databar_rows,
+            "pixel_size_m": s.pixel_size_m,
+            "pixel_size_y_m": s.pixel_size_y_m,
+            "field_width_m": self.field_width_m,
+            "displayed_magnification": s.displayed_magnification,
+            "display_width_m": self.display_width_m,
+            "display_width_assumed": s.display_width_assumed,
+            "working_distance_m": s.working_distance_m,
+            "scan_rotation_rad": s.scan_rotation_rad,
+            "dwell_s": s.dwell_s,
+            "frame_time_s": s.frame_time_s,
+            "detector": s.detector,
+            "instrument": s.instrument,
+            "time": None if s.time is None else s.time.isoformat(),
+            "bits": int(8 * np.dtype(self.image.dtype).itemsize),
+            "notes": list(s.notes),
+        }

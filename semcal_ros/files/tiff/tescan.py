@@ -1,0 +1,95 @@
+"""TESCAN: tag 50431 with a thumbnail and ``key=value`` lines, or a ``.hdr`` file."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+from semcal_ros.core.errors import TiffError
+from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_number, positive
+
+__all__ = ["TAG", "tescan_pairs", "tescan_settings"]
+
+TAG = 50431
+_LENGTH_BYTES, _TYPE_BYTES = 4, 2
+_THUMBNAIL = 1
+
+
+def _text_records(data: bytes) -> list[str]:
+    """Texts of the tag: each record is its length (uint32), a type (uint16) and the contents."""
+    texts, position = [], 0
+    while position + _LENGTH_BYTES + _TYPE_BYTES <= len(data):
+        (length,) = struct.unpack_from("<I", data, position)
+        (kind,) = struct.unpack_from("<H", data, position + _LENGTH_BYTES)
+        start, stop = position + _LENGTH_BYTES + _TYPE_BYTES, position + _LENGTH_BYTES + length
+        if length < _TYPE_BYTES or stop > len(data):
+            break
+        if kind != _THUMBNAIL:
+            texts.append(data[start:stop].decode("utf-8", errors="replace"))
+        position = stop
+    return texts
+
+
+def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
+    """All ``key=value`` pairs of the tag's bytes or of a ``.hdr`` file's text.
+
+    Raises
+    ------
+    TiffError
+        There are none: the tag is damaged.
+    """
+    texts = _text_records(data) or [data.decode("utf-8", errors="replace")]
+    pairs: dict[str, str] = {}
+    for line in "\n".join(texts).replace("\x00", "\n").splitlines():
+        key, equals, value = line.partition("=")
+        if equals and key.strip().isidentifier():
+            pairs.setdefault(key.strip(), value.strip())
+    if "PixelSizeX" not in pairs:
+        raise TiffError(
+            f"{path.name}: tag 50431 holds {len(pairs)} settings and no PixelSizeX",
+            expected="the key=value lines of TESCAN",
+            do="export the image anew with its metadata",
+        )
+    return pairs
+
+
+def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> VendorSettings:
+    """Settings from the raw bytes of the tag (lengths in metres, angles in degrees).
+
+    Raises
+    ------
+    TiffError
+        The pixel size is missing or unusable, or the databar is higher than the image.
+    """
+    pairs = tescan_pairs(path, data)
+
+    def number(key: str) -> float | None:
+        return plain_number(pairs.get(key, ""))
+
+    pixel_m = check_pixel_size(path, number("PixelSizeX"), "PixelSizeX", pairs.get("PixelSizeX"))
+    pixel_y_m = number("PixelSizeY") or pixel_m
+    check_pixel_size(path, pixel_y_m, "PixelSizeY", pairs.get("PixelSizeY"))
+    strip = number("ImageStripSize") or 0.0
+    if not 0 <= strip < size_px[1]:
+        raise TiffError(
+            f"{path.name}: ImageStripSize is {strip:g} in an image of {size_px[1]} rows",
+            expected="fewer rows of databar than of the image",
+            do="use the original file, not a cropped copy",
+        )
+    rotation = number("ScanRotation")
+    stamp = f"{pairs.get('Date', '')} {pairs.get('Time', '')}"
+    return VendorSettings(
+        vendor="tescan",
+        pixel_size_m=pixel_m,
+        pixel_size_y_m=pixel_y_m,
+        displayed_magnification=positive(number("Magnification")),
+        databar_rows=int(strip),
+        working_distance_m=number("WD"),
+        scan_rotation_rad=None if rotation is None else math.radians(rotation),
+        dwell_s=positive(number("DwellTime")),
+        detector=pairs.get("Detector", ""),
+        instrument=pairs.get("Device", ""),
+        time=first_date([(stamp, "%Y-%m-%d %H:%M:%S")]),
+    )

@@ -1,0 +1,109 @@
+"""Numbers with units and dates, as metadata of microscopes write them."""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import datetime
+from pathlib import Path
+
+from semcal_ros.core.errors import TiffError
+
+__all__ = [
+    "PIXEL_SIZE_RANGE_M",
+    "check_pixel_size",
+    "first_date",
+    "plain_number",
+    "positive",
+    "quantity",
+]
+
+PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)
+_YEARS = (1971, 2037)
+
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
+_PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
+
+
+def _split(text: object) -> tuple[float, str] | None:
+    match = _NUMBER.match(str(text).replace("\x00", " "))
+    if match is None:
+        return None
+    value = float(match.group(1))
+    return (value, match.group(2)) if math.isfinite(value) else None
+
+
+def _unit_scale(unit: str, base: str) -> float | None:
+    """Factor to SI of a unit such as ``nm``; a micro sign in a lost encoding is odd."""
+    if not unit.endswith(base):
+        return None
+    prefix = unit[: len(unit) - len(base)].strip()
+    prefix = prefix.replace("\u00c2", "").replace("\u00ce\u00bc", "u")
+    if len(prefix) == 1 and ord(prefix) > 127:
+        prefix = "u"
+    return _PREFIX.get(prefix)
+
+
+def quantity(text: object, base: str, *, default_unit: str = "") -> float | None:
+    """Value in SI of a text such as ``593.3 nm``; ``None`` if it has no number or another unit.
+
+    Parameters
+    ----------
+    text
+        Number and unit.
+    base
+        Unit without prefix: ``m``, ``s``.
+    default_unit
+        Unit of a bare number; without it a bare number is not understood.
+    """
+    parts = _split(text)
+    if parts is None:
+        return None
+    value, unit = parts
+    scale = _unit_scale(unit or default_unit, base)
+    return None if scale is None else value * scale
+
+
+def plain_number(text: object) -> float | None:
+    """A bare finite number, ``None`` if the text is anything else."""
+    parts = _split(text)
+    return parts[0] if parts is not None and not parts[1] else None
+
+
+def positive(value: float | None) -> float | None:
+    """``value`` if it is a number above zero."""
+    return value if value is not None and math.isfinite(value) and value > 0 else None
+
+
+def check_pixel_size(path: Path, value: float | None, key: str, seen: object) -> float:
+    """The pixel size, if it is one that an SEM can have.
+
+    Raises
+    ------
+    TiffError
+        It is missing, no number, without a known unit, or absurd.
+    """
+    low, high = PIXEL_SIZE_RANGE_M
+    if value is None or not low <= value <= high:
+        shown = "nothing" if seen is None else repr(str(seen)[:60])
+        raise TiffError(
+            f"{path.name}: {key} is {shown}",
+            expected=f"a pixel size of {low * 1e9:g} nm to {high * 1e3:g} mm with its unit",
+            do="export the image anew with its metadata",
+        )
+    return value
+
+
+def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
+    """First credible date that one of the (text, format) pairs gives; ``None`` if none does.
+
+    Years that the 32-bit seconds of a ROS stamp cannot hold are not credible.
+    """
+    for text, pattern in candidates:
+        try:
+            found = datetime.strptime(" ".join(text.split()), pattern)
+        except ValueError:
+            continue
+        if _YEARS[0] <= found.year <= _YEARS[1]:
+            return found
+    return None

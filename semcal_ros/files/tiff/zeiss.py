@@ -1,0 +1,100 @@
+"""Zeiss SmartSEM: tag 34118 (CZ_SEM)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.tiff.values import (
+    check_pixel_size,
+    first_date,
+    plain_number,
+    positive,
+    quantity,
+)
+
+__all__ = ["TAG", "zeiss_settings"]
+
+TAG = 34118
+# The unnamed numbers at the head of the tag repeat some settings with more digits.
+_PIXEL_SIZE, _MAGNIFICATION, _WORKING_DISTANCE = 3, 4, 9
+_BAR_NOTE = (
+    "the file does not tell how many rows the databar covers; give databar_rows if it is burnt in"
+)
+
+
+def _text(tag: Mapping[str, Any], key: str) -> str | None:
+    """Value and unit of a named entry, which come as (name, value) or (name, value, unit)."""
+    entry = tag.get(key)
+    if not isinstance(entry, tuple) or len(entry) < 2:
+        return None
+    return " ".join(str(part) for part in entry[1:])
+
+
+def _head(tag: Mapping[str, Any], index: int) -> float | None:
+    numbers = tag.get("", ())
+    return plain_number(numbers[index]) if len(numbers) > index else None
+
+
+def _refined(rounded: float | None, exact: float | None, tolerance: float) -> float | None:
+    """The value with more digits, where it rounds to the named one."""
+    if rounded is None or exact is None:
+        return rounded
+    return exact if abs(exact - rounded) <= tolerance else rounded
+
+
+def _magnification(tag: Mapping[str, Any]) -> float | None:
+    text = (_text(tag, "ap_mag") or "").upper().removesuffix("X").strip()
+    shown = plain_number(text.removesuffix("K").strip())
+    if shown is None:
+        return None
+    value = shown * (1000.0 if text.endswith("K") else 1.0)
+    return positive(_refined(value, _head(tag, _MAGNIFICATION), 0.006 * value))
+
+
+def _pixel_size(path: Path, tag: Mapping[str, Any]) -> float:
+    """AP_IMAGE_PIXEL_SIZE is that of the stored image, AP_PIXEL_SIZE that of the screen."""
+    text = _text(tag, "ap_image_pixel_size")
+    value = positive(quantity(text, "m"))
+    if value is not None:
+        value = _refined(value, _head(tag, _PIXEL_SIZE), 1e-3 * value)
+    return check_pixel_size(path, value, "AP_IMAGE_PIXEL_SIZE in tag 34118 (CZ_SEM)", text)
+
+
+def _rotation(tag: Mapping[str, Any]) -> float | None:
+    if tag.get("dp_scan_rot", (None, None))[1] is False:
+        return 0.0
+    degrees = plain_number(str(_text(tag, "ap_scanrotation")).rstrip("\u00b0\u00c2 "))
+    return None if degrees is None else math.radians(degrees)
+
+
+def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
+    """Settings from the decoded tag.
+
+    Raises
+    ------
+    TiffError
+        The pixel size of the image is missing or cannot be used.
+    """
+    pixel_m = _pixel_size(path, tag)
+    distance = quantity(_text(tag, "ap_wd"), "m")
+    date, clock = _text(tag, "ap_date") or "", _text(tag, "ap_time") or ""
+    return VendorSettings(
+        vendor="zeiss",
+        pixel_size_m=pixel_m,
+        pixel_size_y_m=pixel_m,
+        displayed_magnification=_magnification(tag),
+        working_distance_m=_refined(distance, _head(tag, _WORKING_DISTANCE), 6e-5),
+        scan_rotation_rad=_rotation(tag),
+        dwell_s=positive(quantity(_text(tag, "dp_dwell_time"), "s")),
+        frame_time_s=positive(quantity(_text(tag, "ap_frame_time"), "s")),
+        detector=str(_text(tag, "dp_detector_channel") or ""),
+        instrument=str(_text(tag, "sv_serial_number") or ""),
+        time=first_date(
+            [(f"{date} {clock}", "%d %b %Y %H:%M:%S"), (f"{date} {clock}", "%d %B %Y %H:%M:%S")]
+        ),
+        notes=(_BAR_NOTE,),
+    )

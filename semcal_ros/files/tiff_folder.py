@@ -1,0 +1,175 @@
+"""A folder of SEM TIFFs as a sequence of frames in time with one magnification scale."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import timezone
+from pathlib import Path
+
+from semcal_ros.core.errors import SemcalError, TiffError
+from semcal_ros.files.tiff import SemImage, is_tiff, read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.sem_image import VendorSettings
+
+__all__ = [
+    "MIN_SPACING_NS",
+    "PLAIN_IMAGES",
+    "Skipped",
+    "TiffEntry",
+    "TiffFolder",
+    "scan_tiff_folder",
+]
+
+_SECOND_NS = 1_000_000_000
+_SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
+MIN_SPACING_NS = 1_000_000
+"""Least time between two images of a folder, whose files tell whole seconds."""
+
+PLAIN_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"}
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """Something that could not be used, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class TiffEntry:
+    """One readable file of a folder.
+
+    Parameters
+    ----------
+    path
+        The file.
+    stamp_ns
+        Time of the image in ns since 1970: the file's local time taken as UTC, or 1 s apart.
+    magnification
+        On the folder's common display width: field width = display width / magnification exactly.
+    """
+
+    path: Path
+    stamp_ns: int
+    magnification: float
+    databar_rows: int | None
+
+    def load(self) -> SemImage:
+        """The picture and its settings; raises :class:`TiffError` if the pixel data are damaged."""
+        return read_sem_tiff(self.path, databar_rows=self.databar_rows)
+
+
+@dataclass(frozen=True)
+class TiffFolder:
+    """Readable files in the order of their stamps.
+
+    Parameters
+    ----------
+    entries
+        At least one file.
+    display_width_m
+        The display width that all magnifications refer to.
+    skipped
+        Files that look like images and cannot be used.
+    notes
+        What a person should know: where stamps and display width come from.
+    """
+
+    path: Path
+    entries: tuple[TiffEntry, ...]
+    display_width_m: float
+    skipped: tuple[Skipped, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Found:
+    path: Path
+    settings: VendorSettings
+    size_px: tuple[int, int]
+
+    @property
+    def field_width_m(self) -> float:
+        return self.settings.pixel_size_m * self.size_px[0]
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that puts ``image_9`` before ``image_10``."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def _collect(files: list[Path]) -> tuple[list[_Found], list[Skipped]]:
+    found, skipped = [], []
+    for path in files:
+        if not is_tiff(path):
+            skipped.append(Skipped(path.name, "no TIFF, so it has no SEM metadata"))
+            continue
+        try:
+            found.append(_Found(path, *read_sem_settings(path)))
+        except SemcalError as error:
+            skipped.append(Skipped(path.name, str(error)))
+    return found, skipped
+
+
+def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
+    """Files in time order with strictly increasing stamps, and where these come from."""
+    if any(item.settings.time is None for item in found):
+        pairs = [(item, _SYNTHETIC_START_NS + k * _SECOND_NS) for k, item in enumerate(found)]
+        return pairs, "not all files tell their time: stamps are 1 s apart in the order of names"
+    timed = []
+    for item in found:
+        time = item.settings.time
+        if time is not None:
+            timed.append((item, round(time.replace(tzinfo=timezone.utc).timestamp()) * _SECOND_NS))
+    timed.sort(key=lambda pair: pair[1])
+    spread: list[tuple[_Found, int]] = []
+    for item, stamp_ns in timed:
+        # Files tell whole seconds; images of the same second keep their order of names.
+        earliest = spread[-1][1] + MIN_SPACING_NS if spread else stamp_ns
+        spread.append((item, max(stamp_ns, earliest)))
+    return spread, "stamps are the files' local times taken as UTC"
+
+
+def scan_tiff_folder(
+    path: Path, *, display_width_m: float, databar_rows: int | None = None
+) -> TiffFolder:
+    """Look at all images of a folder (or at a single file); only metadata are read.
+
+    Parameters
+    ----------
+    path
+        Folder with SEM TIFFs, not searched below, or one such file.
+    display_width_m
+        Display width that all magnifications shall refer to.
+    databar_rows
+        Rows to cut off at the bottom of every image, in place of what the metadata say.
+
+    Raises
+    ------
+    TiffError
+        No file is usable.
+    """
+    if not path.exists():
+        raise TiffError(f"{path} does not exist", expected="a folder with SEM TIFFs")
+    listed = sorted(path.iterdir(), key=_natural) if path.is_dir() else [path]
+    images = [p for p in listed if p.is_file() and (is_tiff(p) or p.suffix.lower() in PLAIN_IMAGES)]
+    found, skipped = _collect(images)
+    if not found:
+        first = f", the first ({skipped[0].name}): {skipped[0].reason}" if skipped else ""
+        raise TiffError(
+            f"{path} has {len(images)} image files and none is usable{first}",
+            expected="original SEM TIFFs of Zeiss, Thermo Fisher, TESCAN or JEOL",
+            do="name the folder with the microscope's own files",
+        )
+    width_note = f"magnifications refer to a display width of {display_width_m:g} m"
+    stamped, stamp_note = _stamps(found)
+    entries = tuple(
+        TiffEntry(item.path, stamp_ns, display_width_m / item.field_width_m, databar_rows)
+        for item, stamp_ns in stamped
+    )
+    own = dict.fromkeys(f"{i.path.name}: {note}" for i in found for note in i.settings.notes)
+    return TiffFolder(
+        path, entries, display_width_m, tuple(skipped), (width_note, stamp_note, *own)
+    )

@@ -1,0 +1,67 @@
+"""Find the topic that a configuration means among those of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from semcal_ros.core.errors import BagError
+from semcal_ros.files.bags import BagTopic
+
+__all__ = ["find_topic", "topic_matches"]
+
+_MAX_LISTED = 8
+
+
+def topic_matches(wanted: str, recorded: str) -> bool:
+    """Whether a recorded topic is the wanted one: relative names match by their last parts."""
+    if wanted.startswith("/"):
+        return recorded == wanted
+    return recorded == wanted or recorded.endswith("/" + wanted)
+
+
+def _listed(topics: Sequence[BagTopic]) -> str:
+    shown = [f"{t.name} ({t.type}, {t.count})" for t in topics[:_MAX_LISTED]]
+    more = len(topics) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "") if shown else "no topics"
+
+
+def find_topic(
+    path: Path, topics: Sequence[BagTopic], *, what: str, wanted: str, type_name: str
+) -> tuple[BagTopic, str]:
+    """The topic to read, and a note ("" if its name is the configured one).
+
+    Parameters
+    ----------
+    topics
+        All topics of the recording.
+    what
+        What it carries, for messages to people.
+    wanted, type_name
+        Name and message type from the configuration.
+
+    Raises
+    ------
+    BagError
+        There is none, there are several, or it has another type.
+    """
+    named = [t for t in topics if topic_matches(wanted, t.name)]
+    fitting = [t for t in named if t.type == type_name]
+    if len(fitting) == 1:
+        return fitting[0], ""
+    if named and not fitting:
+        raise BagError(
+            f"topic {named[0].name} in {path} has type {named[0].type}",
+            expected=f"{type_name} for the {what}",
+            do="set topic and type in the msg_configs file and name it with --config",
+        )
+    candidates = fitting or [t for t in topics if t.type == type_name and t.count > 0]
+    if len(candidates) == 1:
+        return candidates[0], f"{what} is read from {candidates[0].name}, there is no {wanted}"
+    seen = _listed(candidates) if candidates else _listed(topics)
+    problem = "more than one topic could be" if candidates else "no topic is"
+    raise BagError(
+        f"in {path} {problem} the {what}: it has {seen}",
+        expected=f"one topic {wanted} of type {type_name}",
+        do="name the topic in a msg_configs file and pass it with --config",
+    )

@@ -1,0 +1,382 @@
+"""SEM TIFFs of four makers: small files with the makers' tags, and hostile variants."""
+
+from __future__ import annotations
+
+import csv
+import math
+import struct
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from semcal_ros.core.errors import TiffError
+from semcal_ros.files.tiff import read_sem_settings, read_sem_tiff
+
+PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
+
+
+def zeiss_text(
+    pixel: str = "593.3 nm", mag: str = "188 X", head: tuple[str, str] = ("5.932882e-07", "188.19")
+) -> bytes:
+    """CZ_SEM tag: unnamed numbers, then keys in capitals, each followed by name = value unit."""
+    lines = ["0", "0", "0", *head, "6", "5.0e+03", "2.27", "2.0e-10", "5.243416e-03", "829"]
+    named = {
+        "AP_PIXEL_SIZE": "Pixel Size = 1.187 \u00b5m",
+        "AP_IMAGE_PIXEL_SIZE": f"Image Pixel Size = {pixel}",
+        "AP_MAG": f"Mag = {mag}",
+        "AP_WD": "WD = 5.2 mm",
+        "AP_SCANROTATION": "Scan Rotation = 30.0 \u00b0",
+        "DP_SCAN_ROT": "Scan Rot = On",
+        "DP_DWELL_TIME": "Dwell Time = 50 ns",
+        "AP_FRAME_TIME": "Cycle Time = 752.76 ms",
+        "DP_DETECTOR_CHANNEL": "Signal A = InLens",
+        "AP_DATE": "Date :11 Apr 2023",
+        "AP_TIME": "Time :8:40:47",
+    }
+    for key, value in named.items():
+        lines += [key, value]
+    return "\r\n".join(lines).encode("cp1252") + b"\x00"
+
+
+def fei_text(pixel: str = "2.69792e-07", rows: int = 16, columns: int = 32) -> bytes:
+    return "\r\n".join(
+        [
+            "[System]", "SystemType=Scios", "DisplayWidth=0.518",
+            "[Beam]", "Beam=IBeam", "Scan=IScan",
+            "[EBeam]", "WD=0.1", "ScanRotation=0",
+            "[IBeam]", "WD=0.00681643", "ScanRotation=0.5",
+            "[EScan]", "PixelWidth=1e-3", "PixelHeight=1e-3",
+            "[IScan]", "Dwell=1e-06", f"PixelWidth={pixel}", f"PixelHeight={pixel}",
+            "FrameTime=1.75685",
+            "[Image]", f"ResolutionX={columns}", f"ResolutionY={rows}", "MagCanvasRealWidth=0.138",
+            "[Detectors]", "Name=ETD",
+            "[PrivateFei]", "TimeOfCreation=10.11.2023 14:09:15", "DatabarHeight=0",
+        ]
+    ).encode("ascii") + b"\x00"  # fmt: skip
+
+
+def tescan_bytes(pixel: str = "2.5012e-6", strip: str = "4") -> bytes:
+    """Tag 50431: a thumbnail record that contains misleading text, then two text records."""
+
+    def record(kind: int, payload: bytes) -> bytes:
+        return struct.pack("<IH", len(payload) + 2, kind) + payload
+
+    main = (
+        f"Date=2016-05-16\r\nImageStripSize={strip}\r\nMagnification=108.08\r\nPixelSizeX={pixel}"
+    )
+    main += f"\r\nPixelSizeY={pixel}\r\nTime=16:03:27\r\n"
+    sem = "Detector=SE\r\nDwellTime=3.2000e-6\r\nScanRotation=90.0\r\nWD=13.250e-3\r\n"
+    return b"".join(
+        [
+            record(1, b"\x00\x00\xff\xd8\nPixelSizeX=1\n\xff\xd9"),
+            record(2, main.encode() + b"\x00"),
+            record(3, sem.encode() + b"\x00"),
+            record(0, b""),
+        ]
+    )
+
+
+def jeol_text(**changes: str) -> str:
+    values = {
+        "$CM_FORMAT": "JEOL-SEM",
+        "$CM_MAG": "50",
+        "$CM_FULL_SIZE": "32 20",
+        "$$SM_WD": "9.07",
+        "$$SM_SCAN_ROTATION": "0.00",
+        "$CM_DATE": "2025/11/20",
+        "$CM_TIME": "13:42:14",
+        "$CM_DETECTOR_NAME": "LED",
+    }
+    named = {("$$" if k.startswith("SM_") else "$") + k: v for k, v in changes.items()}
+    return "\r\n".join(f"{k} {v}" for k, v in {**values, **named}.items() if v != "-")
+
+
+def write_tagged(path: Path, code: int, data: bytes, pixels: np.ndarray = PIXELS) -> Path:
+    kind = 7 if code == 50431 else 2
+    tifffile.imwrite(path, pixels, extratags=[(code, kind, len(data), data, True)])
+    return path
+
+
+def write_jeol(path: Path, text: str, encoding: str = "utf-8") -> Path:
+    tifffile.imwrite(path, PIXELS)
+    path.with_suffix(".txt").write_bytes(text.encode(encoding))
+    return path
+
+
+def test_zeiss(tmp_path: Path) -> None:
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text()))
+    assert sem.vendor == "zeiss"
+    # The head of the tag has more digits than the named value and rounds to it.
+    assert sem.pixel_size_m == 5.932882e-07
+    assert sem.displayed_magnification == 188.19
+    assert sem.display_width_m == pytest.approx(5.932882e-07 * 32 * 188.19, rel=1e-12, abs=0)
+    assert sem.working_distance_m == pytest.approx(5.243416e-3, rel=1e-12, abs=0)
+    assert sem.scan_rotation_rad == pytest.approx(math.radians(30.0))
+    assert sem.dwell_s == pytest.approx(50e-9, rel=1e-12, abs=0)
+    assert sem.frame_time_s == pytest.approx(0.75276)
+    assert sem.detector == "InLens"
+    assert sem.time == datetime(2023, 4, 11, 8, 40, 47)
+    assert np.array_equal(sem.image, PIXELS)
+    assert any("databar" in note for note in sem.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected_m"),
+    [
+        ("593.3 nm", 593.3e-9),
+        ("1.187 \u00b5m", 1.187e-6),
+        ("850.0 pm", 850e-12),
+        ("0.001 mm", 1e-6),
+        ("2.5e-7 m", 2.5e-7),
+    ],
+)
+def test_zeiss_units(tmp_path: Path, text: str, expected_m: float) -> None:
+    # The head contradicts the named value here, so the named one counts.
+    data = zeiss_text(pixel=text, head=("4.0e-05", "7"))
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data))
+    assert sem.pixel_size_m == pytest.approx(expected_m, rel=1e-12, abs=0)
+
+
+def test_zeiss_magnification_in_thousands(tmp_path: Path) -> None:
+    data = zeiss_text(mag="5.00 K X", head=("5.932882e-07", "5.0012e+03"))
+    assert read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data)).displayed_magnification == (
+        5001.2
+    )
+
+
+def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path) -> None:
+    sem = read_sem_tiff(write_tagged(tmp_path / "f.tif", 34682, fei_text(rows=16)))
+    assert sem.vendor == "thermo_fisher"
+    assert sem.pixel_size_m == 2.69792e-07
+    assert sem.databar_rows == 4
+    assert np.array_equal(sem.image, PIXELS[:16])
+    assert sem.full_size_px == (32, 20)
+    assert sem.working_distance_m == 0.00681643
+    assert sem.scan_rotation_rad == 0.5
+    assert sem.display_width_m == pytest.approx(0.138, rel=1e-12, abs=0)
+    assert sem.frame_time_s == 1.75685
+    assert sem.time == datetime(2023, 11, 10, 14, 9, 15)
+    assert any("two magnifications" in note for note in sem.notes)
+    other = read_sem_tiff(write_tagged(tmp_path / "g.tif", 34680, fei_text(rows=16)))
+    assert other.pixel_size_m == sem.pixel_size_m
+
+
+def test_thermo_fisher_refuses_a_resized_copy(tmp_path: Path) -> None:
+    path = write_tagged(tmp_path / "f.tif", 34682, fei_text(columns=64))
+    with pytest.raises(TiffError, match="original file"):
+        read_sem_tiff(path)
+
+
+def test_tescan_in_sixteen_bits(tmp_path: Path) -> None:
+    wide = PIXELS.astype(np.uint16) * 257
+    sem = read_sem_tiff(write_tagged(tmp_path / "t.tif", 50431, tescan_bytes(), wide))
+    assert sem.vendor == "tescan"
+    assert sem.pixel_size_m == 2.5012e-6
+    assert sem.databar_rows == 4
+    assert sem.image.dtype == np.uint16
+    assert np.array_equal(sem.image, wide[:16])
+    assert sem.displayed_magnification == 108.08
+    assert sem.dwell_s == 3.2e-6
+    assert sem.scan_rotation_rad == pytest.approx(math.pi / 2)
+    assert sem.working_distance_m == 0.01325
+
+
+def test_tescan_header_file(tmp_path: Path) -> None:
+    path = tmp_path / "t.tif"
+    tifffile.imwrite(path, PIXELS)
+    text = "[MAIN]\nPixelSizeX=1e-9\nPixelSizeY=1e-9\nImageStripSize=0\n[SEM]\nWD=0.01\n"
+    (tmp_path / "t-tif.hdr").write_text(text)
+    assert read_sem_tiff(path).pixel_size_m == 1e-9
+
+
+def test_jeol_with_assumed_display_width(tmp_path: Path) -> None:
+    sem = read_sem_tiff(write_jeol(tmp_path / "j.tif", jeol_text()))
+    assert sem.vendor == "jeol"
+    assert sem.pixel_size_m == pytest.approx(0.128 / 50 / 32, rel=1e-12, abs=0)
+    assert sem.settings.display_width_assumed
+    assert any("assumed" in note for note in sem.notes)
+    assert sem.working_distance_m == pytest.approx(9.07e-3)
+    assert sem.time == datetime(2025, 11, 20, 13, 42, 14)
+    assert sem.detector == "LED"
+
+
+@pytest.mark.parametrize(
+    ("field", "encoding"),
+    [
+        ("64.0 40.0", "utf-8"),
+        ("64.0um 40.0um", "utf-8"),
+        ("64.0\u00b5m 40.0\u00b5m", "utf-8"),
+        ("64.0\u03bcm 40.0\u03bcm", "utf-8"),
+        ("64.0\u00b5m 40.0\u00b5m", "latin-1"),
+        ("64.0\u00b5m 40.0\u00b5m", "utf-16"),
+        ("0.064mm 0.040mm", "utf-8"),
+    ],
+)
+def test_jeol_field_of_view_in_every_spelling(tmp_path: Path, field: str, encoding: str) -> None:
+    text = jeol_text(CM_FIELD_OF_VIEW=field)
+    sem = read_sem_tiff(write_jeol(tmp_path / "j.tif", text, encoding))
+    assert sem.pixel_size_m == pytest.approx(2e-6, rel=1e-12, abs=0)
+    assert not sem.settings.display_width_assumed
+
+
+def test_jeol_micron_bar_confirms_or_replaces_the_assumption(tmp_path: Path) -> None:
+    agreeing = jeol_text(SM_MICRON_BAR="13", SM_MICRON_MARKER="1mm")
+    sem = read_sem_tiff(write_jeol(tmp_path / "a.tif", agreeing))
+    assert sem.pixel_size_m == pytest.approx(8e-5, rel=1e-12, abs=0)
+    assert not sem.settings.display_width_assumed
+    other = jeol_text(SM_MICRON_BAR="20", SM_MICRON_MARKER="1mm")
+    sem = read_sem_tiff(write_jeol(tmp_path / "b.tif", other))
+    assert sem.pixel_size_m == pytest.approx(5e-5, rel=1e-12, abs=0)
+
+
+def test_databar_of_jeol_and_override(tmp_path: Path) -> None:
+    path = write_jeol(tmp_path / "j.TIF", jeol_text(CM_FULL_SIZE="32 18"))
+    assert read_sem_tiff(path).image.shape == (18, 32)
+    assert read_sem_tiff(path, databar_rows=5).image.shape == (15, 32)
+    with pytest.raises(TiffError, match="20 rows of databar"):
+        read_sem_tiff(path, databar_rows=20)
+
+
+@pytest.mark.parametrize(
+    "bad", ["NaN nm", "-3 nm", "0 nm", "inf m", "1e400 nm", "5 furlong", "7", "9 m"]
+)
+def test_unusable_pixel_sizes_name_file_and_tag(tmp_path: Path, bad: str) -> None:
+    path = write_tagged(tmp_path / "bad.tif", 34118, zeiss_text(pixel=bad))
+    with pytest.raises(TiffError, match=r"bad\.tif: AP_IMAGE_PIXEL_SIZE"):
+        read_sem_tiff(path)
+
+
+@pytest.mark.parametrize("bad", ["nan", "-1e-7", "0", "1e300", "", "abc"])
+def test_unusable_pixel_sizes_of_the_others(tmp_path: Path, bad: str) -> None:
+    fei = write_tagged(tmp_path / "f.tif", 34682, fei_text(pixel=bad))
+    tescan = write_tagged(tmp_path / "t.tif", 50431, tescan_bytes(pixel=bad))
+    jeol = write_jeol(tmp_path / "j.tif", jeol_text(CM_MAG=bad or "-"))
+    for path in (fei, tescan, jeol):
+        with pytest.raises(TiffError) as caught:
+            read_sem_tiff(path)
+        assert path.name in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_databar_higher_than_the_image(tmp_path: Path) -> None:
+    for strip in ("20", "99999", "-1"):
+        path = write_tagged(tmp_path / "t.tif", 50431, tescan_bytes(strip=strip))
+        with pytest.raises(TiffError, match="ImageStripSize"):
+            read_sem_tiff(path)
+
+
+def test_no_metadata_no_tiff_and_missing_file(tmp_path: Path) -> None:
+    plain = tmp_path / "plain.tif"
+    tifffile.imwrite(plain, PIXELS)
+    with pytest.raises(TiffError, match=r"34118 \(Zeiss\)"):
+        read_sem_tiff(plain)
+    (tmp_path / "text.tif").write_text("hello")
+    (tmp_path / "empty.tif").write_bytes(b"")
+    for name in ("text.tif", "empty.tif", "missing.tif"):
+        with pytest.raises(TiffError, match=name):
+            read_sem_tiff(tmp_path / name)
+
+
+def test_absurd_size_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    path = write_tagged(tmp_path / "big.tif", 34118, zeiss_text())
+    data = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        for tag in (file.pages.first.tags["ImageWidth"], file.pages.first.tags["ImageLength"]):
+            width = struct.calcsize("<" + ("H" if tag.dtype == 3 else "I"))
+            data[tag.valueoffset : tag.valueoffset + width] = b"\xff" * width
+    path.write_bytes(data)
+    with pytest.raises(TiffError, match="declares"):
+        read_sem_tiff(path)
+
+
+@pytest.mark.parametrize("photometric", ["minisblack", "miniswhite", "rgb", "palette"])
+def test_pixels_become_grey(tmp_path: Path, photometric: str) -> None:
+    data = zeiss_text()
+    tags = [(34118, 2, len(data), data, True)]
+    path = tmp_path / "p.tif"
+    if photometric == "palette":
+        ramp = np.arange(256, dtype=np.uint16)[::-1] * 257
+        tifffile.imwrite(path, PIXELS, photometric=3, colormap=np.stack([ramp] * 3), extratags=tags)
+    elif photometric == "rgb":
+        tifffile.imwrite(path, np.stack([PIXELS] * 3, axis=-1), photometric=2, extratags=tags)
+    else:
+        tifffile.imwrite(path, PIXELS, photometric=photometric, extratags=tags)
+    inverted = photometric in ("miniswhite", "palette")
+    assert np.array_equal(read_sem_tiff(path).image, 255 - PIXELS if inverted else PIXELS)
+
+
+@pytest.fixture(scope="module")
+def templates(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    folder = tmp_path_factory.mktemp("tiffs")
+    return [
+        write_tagged(folder / "z.tif", 34118, zeiss_text()).read_bytes(),
+        write_tagged(folder / "f.tif", 34682, fei_text()).read_bytes(),
+        write_tagged(folder / "t.tif", 50431, tescan_bytes()).read_bytes(),
+    ]
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_damaged_files_never_raise_anything_but_tiff_errors(
+    tmp_path: Path, templates: list[bytes], data: st.DataObject
+) -> None:
+    blob = bytearray(data.draw(st.sampled_from(templates)))
+    for _ in range(data.draw(st.integers(1, 5))):
+        blob[data.draw(st.integers(0, len(blob) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "damaged.tif"
+    path.write_bytes(blob[: data.draw(st.integers(8, len(blob)))])
+    try:
+        sem = read_sem_tiff(path)
+    except TiffError as error:
+        assert "\n" not in str(error)
+    else:
+        assert sem.image.dtype in (np.uint8, np.uint16)
+        assert 1e-13 <= sem.pixel_size_m <= 1e-3
+
+
+def test_truncated_pixels(tmp_path: Path) -> None:
+    path = write_tagged(tmp_path / "z.tif", 34118, zeiss_text())
+    path.write_bytes(path.read_bytes()[:-100])
+    read_sem_settings(path)
+    with pytest.raises(TiffError, match="cannot be read"):
+        read_sem_tiff(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [
+        ("zeiss_example_sem.tif", 0),
+        ("tfs_example.tif", 68),
+        ("tescan_example_sem1.tif", 120),
+        ("jeol_example_sem.tif", 0),
+    ],
+)
+def test_real_files_agree_with_the_truth_table(reference_data: Path, name: str, rows: int) -> None:
+    folder = reference_data / "real_sem"
+    with (folder / "metadata_truth.csv").open(newline="") as stream:
+        truth = {row["file"]: row for row in csv.DictReader(stream)}[name]
+    sem = read_sem_tiff(folder / name)
+    # The table gives 4 to 6 digits.
+    pixel_nm = float(truth["pixel_size_nm"].split()[0])
+    assert sem.pixel_size_m * 1e9 == pytest.approx(pixel_nm, rel=2e-6, abs=0)
+    assert sem.image.shape == (int(truth["frame_h_px"].split()[0]), int(truth["frame_w_px"]))
+    assert sem.databar_rows == rows
+    assert sem.working_distance_m == pytest.approx(float(truth["WD_mm"]) * 1e-3, rel=1e-4)
+    assert sem.scan_rotation_rad == 0.0
+    if sem.vendor != "thermo_fisher":  # its shown magnification is only in the picture
+        assert sem.displayed_magnification == pytest.approx(
+            float(truth["displayed_mag"].split()[0]), rel=1e-5
+        )
+        width_mm = float(truth["W_display_mm_implied(px*N*mag)"].split()[0])
+        assert sem.display_width_m == pytest.approx(width_mm * 1e-3, rel=1e-5)
+    for key, value in (("dwell_us", sem.dwell_s), ("frame_time_s", sem.frame_time_s)):
+        if truth[key]:
+            scale = 1e-6 if key == "dwell_us" else 1.0
+            assert value == pytest.approx(float(truth[key]) * scale, rel=1e-3, abs=0)
