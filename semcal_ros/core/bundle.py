@@ -74,19 +74,6 @@ class Problem:
         """(N,) view index of every point."""
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
 
-    def subset(self, keep: NDArray[np.bool_]) -> Problem:
-        """The same problem with only the views where ``keep`` (V,) is true."""
-        points = keep[self.view_of_point]
-        return replace(
-            self,
-            board_m=self.board_m[points],
-            observed_px=self.observed_px[points],
-            weight=self.weight[points],
-            starts=np.concatenate([[0], np.cumsum(np.diff(self.starts)[keep])]).astype(np.intp),
-            group=self.group[keep],
-            unit_m=self.unit_m[keep],
-        )
-
 
 @dataclass(frozen=True)
 class State:
@@ -311,7 +298,7 @@ def refine(
     """
     cost = _cost(problem, state)
     if not np.isfinite(cost):
-        return _result(problem, state, cost, 0, "a point has no projection at the start")
+        return _no_result(problem, state)
     damping, growth, iterations, reason = 1e-5, 2.0, 0, ""
     while not reason and iterations < max_iterations:
         iterations += 1
@@ -360,8 +347,27 @@ def _result(
     )
 
 
+def _no_result(problem: Problem, state: State) -> BundleResult:
+    """What is known when some point has no projection at the start: nothing."""
+    groups, size = len(problem.designs), len(state.theta)
+    return BundleResult(
+        state=state,
+        residuals_px=residuals(problem, state),
+        huber_weight=np.zeros(len(problem.board_m)),
+        cost=float("inf"),
+        information=np.zeros((groups, 10, 10)),
+        gradient=np.zeros((groups, 10)),
+        covariance=np.full((size, size), np.inf),
+        height_variance_m2=np.full(len(problem.group), np.inf),
+        iterations=0,
+        converged=False,
+        reason="a point has no projection at the start",
+    )
+
+
 def _covariance(matrix: Array) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
     # pinv: a direction that neither data nor prior hold gets no spurious certainty from rounding.
     inverse = np.linalg.pinv(matrix * np.outer(scale, scale), rcond=1e-15, hermitian=True)
+    inverse = 0.5 * (inverse + inverse.T)
     return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)

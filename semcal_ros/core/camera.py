@@ -102,6 +102,30 @@ class ScanCamera:
                     f"camera with {name} = {getattr(self, name)}", expected="a positive number"
                 )
 
+    @classmethod
+    def nominal(
+        cls, magnification: float, width: int, height: int, display_width_m: float
+    ) -> ScanCamera:
+        """The camera that the display width alone predicts: parallel projection, no distortion, no covariance."""
+        cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
+        return cls(
+            magnification=magnification,
+            m=magnification * width / display_width_m,
+            aspect=1.0,
+            skew=0.0,
+            px=cx,
+            py=cy,
+            rho=0.0,
+            xi_r=0.0,
+            xi_t=0.0,
+            ex=cx,
+            ey=cy,
+            norm_px=0.5 * width,
+            width=width,
+            height=height,
+            in_range=False,
+        )
+
     @property
     def parameters(self) -> Array:
         """(10,) parameter vector in the order of ``PARAMETER_NAMES``."""

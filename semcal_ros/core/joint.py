@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
+_HEIGHT_UPDATES = 3
 # Tolerance of the adjustments on the way; only the last one has to be exact.
 _COARSE = 1e-6
 # The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
@@ -91,6 +92,10 @@ def fit_joint(setup: Setup) -> JointFit:
     functions = enriched(functions, sizes)
     problem = build_problem(setup, functions, setup.views, height)
     result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    for _ in range(_HEIGHT_UPDATES):
+        # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
+        problem = replace(problem, height_sigma_m=_height_sigma(result))
+        result = refine(problem, result.state, tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
 
     settled, rounds = count < 3, 0

@@ -24,8 +24,8 @@ __all__ = ["Summary", "select_functions"]
 Array = NDArray[np.float64]
 
 _MAX_SIZE = 8
-# Gain in half chi-squares that pays for one coefficient (Akaike's criterion asks for 1).
-_GAIN_PER_COEFFICIENT = 2.0
+# Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
+_GAIN_PER_COEFFICIENT = 1.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,118 @@
+"""``semcal calibrate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.common import config_option, configured, echo_table, progress, require_folder
+from semcal_ros.core.calibrate import METHODS, MethodOptions
+from semcal_ros.files.recordings import open_recording
+from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views
+
+__all__ = ["command"]
+
+
+@click.command("calibrate")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Calibration file.")
+@config_option
+@click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
+@click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
+@click.option("--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE.")
+@click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
+@click.option("--report", type=click.Path(path_type=Path), help="Also write an HTML report.")
+def command(
+    recording: Path,
+    output: Path,
+    config: str,
+    method: str,
+    pda_order: int,
+    legendre: int | None,
+    tau: float | None,
+    report: Path | None,
+) -> None:
+    """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files, of the chess grid.
+
+    \b
+    Example:
+      semcal calibrate recordings/grid -o cal.yaml --report report.html
+    """
+    for target in (output, report):
+        if target is not None:
+            require_folder(target)
+    microscope = configured(config)
+    with open_recording(recording, microscope) as opened:
+        with progress(opened.frame_count, "finding corners") as bar:
+            frames = (
+                (f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames())
+            )
+            found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
+        notes = opened.notes
+    with progress(None, "adjusting"):
+        done = calibrate_found(
+            found,
+            rejected,
+            display_width_m=microscope.display_width_m,
+            squares_m=microscope.squares_m,
+            method=method,
+            options=MethodOptions(pda_order, legendre, tau),
+        )
+    done.calibration.save(output)
+    _tell(done, notes)
+    click.echo(f"calibration: {output}")
+    if report is not None:
+        _write_report(done, report)
+        click.echo(f"report: {report}")
+
+
+def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
+    statistics = done.calibration.statistics
+    rejected = done.collected.rejected
+    total = statistics["views"] + len(rejected)
+    echo_table(
+        ["magnification", "views", "RMS px", "held-out RMS px"],
+        [
+            [
+                f"{row['magnification']:g}",
+                str(row["views"]),
+                f"{row['rms_px']:.4f}",
+                "-"
+                if row["held_out_rms_px"] is None
+                else f"{row['held_out_rms_px']:.4f}{'*' if row['held_out_extrapolated'] else ' '}",
+            ]
+            for row in statistics["by_magnification"]
+        ],
+    )
+    if statistics["held_out_rms_px"] is not None:
+        click.echo("held out: calibrated without that magnification; * is extrapolated")
+    click.echo(
+        f"{statistics['views']} of {total} views, {statistics['corners']} corners, "
+        f"method {done.calibration.method}: RMS {statistics['rms_px']:.4f} px"
+        + (
+            f", held out {statistics['held_out_rms_px']:.4f} px"
+            if statistics["held_out_rms_px"] is not None
+            else ""
+        )
+    )
+    for view in rejected[:10]:
+        click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
+    if len(rejected) > 10:
+        click.echo(f"rejected: {len(rejected) - 10} more, see the report", err=True)
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+    for warning in done.result.warnings:
+        click.echo(f"warning: {warning}", err=True)
+
+
+def _write_report(done: RecordingCalibration, path: Path) -> None:
+    from semcal_ros.report import calibration_report
+
+    calibration_report(
+        done.result,
+        path,
+        detections=[v.detection for v in done.collected.found],
+        images=[v.image for v in done.collected.found],
+        rejected=[(v.name, v.magnification, v.reason) for v in done.collected.rejected],
+    )

@@ -1,0 +1,80 @@
+"""What several commands share: options, progress, tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "config_option",
+    "configured",
+    "echo_json",
+    "echo_table",
+    "overwrite_option",
+    "progress",
+    "require_folder",
+]
+
+config_option = click.option(
+    "--config",
+    default="generic",
+    show_default=True,
+    metavar="NAME_OR_FILE",
+    help="msg_configs of the microscope: topics, units, display width, scan timing.",
+)
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."
+)
+
+
+def configured(name: str) -> MicroscopeConfig:
+    """The configuration that the ``--config`` option names."""
+    return load_config(name)
+
+
+def progress(total: int | None, label: str) -> tqdm[Any]:
+    """A progress bar on stderr, shown on terminals for work that lasts over a second."""
+    return tqdm(total=total, desc=label, unit="frame", disable=None, delay=1, leave=False)
+
+
+def echo_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table with right-aligned columns."""
+    table = [list(headers), *[list(r) for r in rows]]
+    widths = [max(len(row[i]) for row in table) for i in range(len(headers))]
+    for row in table:
+        click.echo("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)))
+
+
+def echo_json(value: Any) -> None:
+    """Print plain data as JSON; infinite values become null."""
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, dict):
+            return {str(k): plain(v) for k, v in item.items()}
+        if isinstance(item, (list, tuple)):
+            return [plain(v) for v in item]
+        if isinstance(item, float) and item - item != 0.0:
+            return None
+        return item
+
+    click.echo(json.dumps(plain(value), indent=2))
+
+
+def require_folder(path: Path) -> None:
+    """Refuse an output whose folder does not exist, before any work is done for it."""
+    if not path.absolute().parent.is_dir():
+        raise InvalidValueError(
+            f"{path}: there is no folder {path.absolute().parent}",
+            expected="an existing folder",
+            do="make it first",
+        )
+    if path.is_dir():
+        raise InvalidValueError(f"{path} is a folder", expected="the name of a file")

@@ -1,0 +1,82 @@
+"""``semcal evaluate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.cli.common import config_option, configured, echo_json, echo_table, progress
+from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.files.recordings import open_recording
+from semcal_ros.pipeline import collect_views, find_views
+
+__all__ = ["command"]
+
+
+@click.command("evaluate")
+@click.argument("calibration", type=click.Path(path_type=Path))
+@click.argument("recording", type=click.Path(path_type=Path))
+@config_option
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+def command(calibration: Path, recording: Path, config: str, as_json: bool) -> None:
+    """Reprojection RMS of CALIBRATION on a grid RECORDING that it was not made from.
+
+    Poses are fitted to each view; the camera is not.
+
+    \b
+    Example:
+      semcal evaluate cal.yaml recordings/other_grid
+    """
+    model = Calibration.load(calibration)
+    microscope = configured(config)
+    with open_recording(recording, microscope) as opened:
+        with progress(opened.frame_count, "finding corners") as bar:
+            frames = (
+                (f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames())
+            )
+            found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
+    collected = collect_views(
+        found,
+        rejected,
+        display_width_m=microscope.display_width_m,
+        squares_m=microscope.squares_m,
+    )
+    height = model.statistics.get("priors", {}).get("height_sigma_m", 1e-4)
+    fit = fit_poses(
+        collected.views,
+        lambda g: model.at(g).resized(*collected.image_size),
+        height_sigma_m=float(height),
+    )
+    by_magnification = rms_by_magnification(fit)
+    low, high = model.magnification_range
+    if as_json:
+        echo_json(
+            {
+                "rms_px": fit.rms_px(),
+                "views": len(collected.views),
+                "rejected": len(collected.rejected),
+                "by_magnification": [
+                    {"magnification": g, "rms_px": rms, "in_range": low <= g <= high}
+                    for g, rms in by_magnification.items()
+                ],
+            }
+        )
+        return
+    echo_table(
+        ["magnification", "views", "RMS px", ""],
+        [
+            [
+                f"{g:g}",
+                str(int((fit.magnifications == g).sum())),
+                f"{rms:.4f}",
+                "" if low <= g <= high else "out of range",
+            ]
+            for g, rms in by_magnification.items()
+        ],
+    )
+    click.echo(
+        f"{len(collected.views)} of {len(collected.views) + len(collected.rejected)} views, "
+        f"RMS {fit.rms_px():.4f} px"
+    )

@@ -1,0 +1,80 @@
+"""Entry point of the ``semcal`` command: its subcommands, and how errors reach the user."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import click
+
+import semcal_ros
+from semcal_ros.core.errors import SemcalError
+
+__all__ = ["main"]
+
+# Modules are imported when their command is used, so that `semcal --help` does not wait for plotting or bags.
+_COMMANDS = {
+    "at": "camera at a magnification: K, P, distortion, nm per pixel",
+    "calibrate": "calibrate from a recording of the chess grid",
+    "drift": "specimen drift of a recording, as a table",
+    "evaluate": "reprojection error of a calibration on a recording",
+    "import": "make a bag from a folder of SEM TIFF files",
+    "info": "what a recording contains",
+    "play": "replay a recording as ROS topics",
+    "rectify": "drift-free, undistorted copy of a recording",
+    "simulate": "record the virtual SEM to a bag, with its truth",
+}
+
+
+class _Group(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module = import_module(f"semcal_ros.cli.{cmd_name}_command")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(_COMMANDS.items()))
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(semcal_ros.__version__, prog_name="semcal")
+def _semcal() -> None:
+    """Calibrate scanning electron microscopes, and correct what they record.
+
+    \b
+    Example:
+      semcal simulate grid --plan grid
+      semcal calibrate grid -o cal.yaml --report report.html
+      semcal at cal.yaml 5250
+    """
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command; returns its exit status (0, or 2 for bad input)."""
+    try:
+        _semcal(args=args, prog_name="semcal", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except SemcalError as error:
+        return _refuse(str(error))
+    except BrokenPipeError:
+        return 0  # the reader of our output has seen enough
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename else ""
+        return _refuse(f"{name}{error.strerror or error}")
+    except (KeyboardInterrupt, click.Abort):
+        return 130
+    return 0
+
+
+def _refuse(reason: str) -> int:
+    click.echo(f"semcal: {reason}", err=True)
+    return 2

@@ -1,0 +1,46 @@
+"""``semcal play``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from semcal_ros.core.errors import SemcalError
+
+__all__ = ["command"]
+
+
+@click.command("play")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--rate", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True)
+@click.option("--loop", is_flag=True, help="Start again at the end.")
+@click.option("--paused", is_flag=True, help="Wait for a call of ~/pause.")
+@click.option("--no-clock", is_flag=True, help="Do not publish /clock.")
+def command(recording: Path, rate: float, loop: bool, paused: bool, no_clock: bool) -> None:
+    """Replay RECORDING as ROS topics, as `ros2 run semcal_ros bag_player` does.
+
+    \b
+    Example:
+      semcal play recordings/zoom --rate 2
+    """
+    try:
+        from semcal_ros.nodes.bag_player import main as play
+    except ImportError as error:
+        raise SemcalError(
+            f"ROS 2 cannot be imported ({error})",
+            expected="rclpy",
+            do="source a ROS 2 workspace or run `make setup`",
+        ) from error
+    parameters = {
+        "bag": str(recording.absolute()),
+        "rate": f"{rate}",
+        "loop": str(loop).lower(),
+        "start_paused": str(paused).lower(),
+        "clock": str(not no_clock).lower(),
+    }
+    arguments = ["--ros-args"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={value}"]
+    sys.exit(play(arguments) or 0)

@@ -1,0 +1,291 @@
+"""From a recording to a calibration: read frames, find corners, assign squares, adjust."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.calibrate import CalibrationResult, MethodOptions, calibrate_views
+from semcal_ros.core.corners import LatticeDetection, find_lattice
+from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.model import checked_magnification
+from semcal_ros.core.views import GridView, SquareAssignment, views_from_detections
+from semcal_ros.files.recordings import open_recording
+
+__all__ = [
+    "CollectedViews",
+    "FoundView",
+    "RecordingCalibration",
+    "RejectedView",
+    "calibrate",
+    "calibrate_found",
+    "calibrate_recording",
+    "collect_views",
+    "find_views",
+]
+
+Progress = Callable[[int], None]
+
+# A display width that is wrong by more than this factor is worth a warning.
+_SCALE_WARNING = 1.25
+
+
+@dataclass(frozen=True)
+class FoundView:
+    """One image with its corners."""
+
+    name: str
+    magnification: float
+    image: NDArray[Any]
+    detection: LatticeDetection
+
+
+@dataclass(frozen=True)
+class RejectedView:
+    """One image that was not used, and why."""
+
+    name: str
+    magnification: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class CollectedViews:
+    """Accepted views in metres, with what they come from.
+
+    ``found[i]`` belongs to ``views[i]``.
+    """
+
+    views: tuple[GridView, ...]
+    found: tuple[FoundView, ...]
+    rejected: tuple[RejectedView, ...]
+    assignment: SquareAssignment
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class RecordingCalibration:
+    """A calibration with everything that a report shows."""
+
+    calibration: Calibration
+    result: CalibrationResult
+    collected: CollectedViews
+
+
+def _detect(item: tuple[str, NDArray[Any], float]) -> FoundView:
+    name, image, magnification = item
+    return FoundView(name, magnification, image, find_lattice(to_gray(image)))
+
+
+def _in_batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
+    iterator = iter(items)
+    while batch := list(islice(iterator, size)):
+        yield batch
+
+
+def find_views(
+    frames: Iterable[tuple[str, NDArray[Any], float]], *, on_progress: Progress | None = None
+) -> tuple[list[FoundView], list[RejectedView]]:
+    """Find the grid in (name, image, magnification) frames, on all cores.
+
+    Frames are taken from the iterable a few at a time, so a long recording is never in memory as a whole.
+    """
+    found: list[FoundView] = []
+    rejected: list[RejectedView] = []
+    workers = os.cpu_count() or 1
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # the frames are the parallel work; threads inside OpenCV would only compete
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            for batch in _in_batches(frames, 4 * workers):
+                for view in pool.map(_detect, batch):
+                    if view.detection.accepted:
+                        found.append(view)
+                    else:
+                        rejected.append(
+                            RejectedView(view.name, view.magnification, view.detection.reason)
+                        )
+                    if on_progress is not None:
+                        on_progress(1)
+    finally:
+        cv2.setNumThreads(threads)
+    return found, rejected
+
+
+def collect_views(
+    found: Sequence[FoundView],
+    rejected: Sequence[RejectedView],
+    *,
+    display_width_m: float,
+    squares_m: Sequence[float],
+) -> CollectedViews:
+    """Views of one image size, with their square sizes assigned.
+
+    Raises
+    ------
+    CalibrationError
+        If no view is left; the message gives the commonest reason.
+    """
+    if not found:
+        reasons = Counter(r.reason for r in rejected).most_common(1)
+        raise CalibrationError(
+            f"no usable view among {len(rejected)} images"
+            + (f" (mostly: {reasons[0][0]})" if reasons else ""),
+            expected="images of a chess grid",
+            do="check focus, contrast, and that the grid fills the image",
+        )
+    sizes = Counter(v.detection.image_size for v in found)
+    image_size = sizes.most_common(1)[0][0]
+    same = [v for v in found if v.detection.image_size == image_size]
+    other = [
+        RejectedView(
+            v.name,
+            v.magnification,
+            f"image size {v.detection.image_size} is not the {image_size} of most images",
+        )
+        for v in found
+        if v.detection.image_size != image_size
+    ]
+    views, assignment = views_from_detections(
+        [v.detection for v in same],
+        [v.magnification for v in same],
+        display_width_m=display_width_m,
+        squares_m=squares_m,
+        names=[v.name for v in same],
+    )
+    return CollectedViews(views, tuple(same), (*rejected, *other), assignment, image_size)
+
+
+def calibrate_found(
+    found: Sequence[FoundView],
+    rejected: Sequence[RejectedView],
+    *,
+    display_width_m: float,
+    squares_m: Sequence[float],
+    method: str = "joint",
+    options: MethodOptions | None = None,
+) -> RecordingCalibration:
+    """Calibrate from images whose corners have been found."""
+    collected = collect_views(
+        found, rejected, display_width_m=display_width_m, squares_m=squares_m
+    )
+    result = calibrate_views(
+        collected.views,
+        image_size=collected.image_size,
+        display_width_m=display_width_m,
+        method=method,
+        options=options,
+    )
+    factor = collected.assignment.scale_factor
+    warnings = list(result.warnings)
+    if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
+        warnings.append(
+            f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "
+            "predicts: check display_width_m and squares_m in msg_configs"
+        )
+    statistics = {
+        **result.model.statistics,
+        "rejected_views": len(collected.rejected),
+        "squares_m": sorted({float(s) for s in collected.assignment.square_m}),
+        "scale_over_nominal": factor,
+        "warnings": warnings,
+    }
+    model = replace(result.model, statistics=statistics)
+    result = replace(result, model=model, warnings=tuple(warnings))
+    return RecordingCalibration(Calibration.from_model(model), result, collected)
+
+
+def calibrate_recording(
+    path: Path,
+    config: MicroscopeConfig,
+    *,
+    method: str = "joint",
+    options: MethodOptions | None = None,
+    on_progress: Progress | None = None,
+) -> RecordingCalibration:
+    """Calibrate from a recording: a bag, or a folder of SEM TIFF files.
+
+    Raises
+    ------
+    BagError, TiffError
+        If the recording cannot be read.
+    CalibrationError
+        If its images do not allow a calibration.
+    """
+    with open_recording(path, config) as recording:
+        frames = ((f"frame {i}", f.image, f.magnification) for i, f in enumerate(recording.frames()))
+        found, rejected = find_views(frames, on_progress=on_progress)
+    return calibrate_found(
+        found,
+        rejected,
+        display_width_m=config.display_width_m,
+        squares_m=config.squares_m,
+        method=method,
+        options=options,
+    )
+
+
+def calibrate(
+    source: str | os.PathLike[str] | Iterable[tuple[NDArray[Any], float]],
+    *,
+    config: MicroscopeConfig | str | os.PathLike[str] | None = None,
+    display_width_m: float | None = None,
+    squares_m: Sequence[float] | None = None,
+    method: str = "joint",
+    options: MethodOptions | None = None,
+) -> Calibration:
+    """Calibrate a microscope from a recording or from images in memory.
+
+    Parameters
+    ----------
+    source
+        A bag, a folder of SEM TIFF files, or an iterable of (image, magnification) pairs.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    display_width_m, squares_m
+        Replace the values of ``config``.
+    method
+        ``"joint"``, ``"pda"`` or ``"discrete"``.
+
+    Examples
+    --------
+    ::
+
+        from semcal_ros import calibrate
+        cal = calibrate("recordings/grid", config="jsm820")
+        cal.save("jsm820.yaml")
+    """
+    chosen = config if isinstance(config, MicroscopeConfig) else load_config(config or "generic")
+    if display_width_m is not None:
+        chosen = replace(chosen, display_width_m=float(display_width_m))
+    if squares_m is not None:
+        chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
+    if isinstance(source, (str, os.PathLike)):
+        done = calibrate_recording(Path(source), chosen, method=method, options=options)
+        return done.calibration
+    frames = (
+        (f"image {i}", np.asarray(image), checked_magnification(g))
+        for i, (image, g) in enumerate(source)
+    )
+    found, rejected = find_views(frames)
+    return calibrate_found(
+        found,
+        rejected,
+        display_width_m=chosen.display_width_m,
+        squares_m=chosen.squares_m,
+        method=method,
+        options=options,
+    ).calibration

@@ -1,0 +1,80 @@
+"""Continuous functions of the magnification."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.functions import ContinuousFunction
+
+RANGE = (100.0, 10000.0)
+
+
+def test_chebyshev_log_known_answer():
+    # T0 + 2 T1 + 3 T2 at the middle of log g (u = 0): 1 + 0 - 3
+    function = ContinuousFunction("chebyshev_log", np.array([1.0, 2.0, 3.0]), RANGE)
+    assert function(1000.0) == pytest.approx(-2.0)
+    assert function(100.0) == pytest.approx(1 - 2 + 3)
+    assert function(10000.0) == pytest.approx(6.0)
+
+
+def test_chebyshev_and_legendre_run_in_g():
+    middle = 0.5 * (RANGE[0] + RANGE[1])
+    coefficients = np.array([0.0, 0.0, 1.0])
+    assert ContinuousFunction("chebyshev", coefficients, RANGE)(middle) == pytest.approx(-1.0)
+    assert ContinuousFunction("legendre", coefficients, RANGE)(middle) == pytest.approx(-0.5)
+
+
+def test_linear_log_interpolates_its_knots():
+    knots = np.array([100.0, 1000.0, 10000.0])
+    function = ContinuousFunction("linear_log", np.array([1.0, 3.0, 2.0]), RANGE, knots)
+    assert [function(g) for g in knots] == pytest.approx([1.0, 3.0, 2.0])
+    assert function(np.sqrt(1e5)) == pytest.approx(2.0)
+
+
+def test_ode_solves_the_harmonic_oscillator():
+    # x'' = -w^2 x with x(0) = 1, x'(0) = 0 on the unit interval is cos(w u)
+    w = 3.0
+    function = ContinuousFunction("ode", np.array([1.0, 0.0]), RANGE, np.array([w * w, 0.0]))
+    for u in (0.0, 0.3, 1.0):
+        assert function(100.0 + u * 9900.0) == pytest.approx(np.cos(w * u), abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["chebyshev_log", "chebyshev", "legendre", "linear_log", "ode"])
+@given(factor=st.floats(1.01, 5.0))
+def test_out_of_range_follows_the_tangent_in_log_g(kind, factor):
+    coefficients = np.array([1.0, 0.5, -0.2])
+    shape = {"linear_log": np.array([100.0, 2000.0, 10000.0]), "ode": np.array([0.1, 0.2, 0.3])}
+    function = ContinuousFunction(kind, coefficients, RANGE, shape.get(kind, np.empty(0)))
+    for edge, sign in ((RANGE[0], -1), (RANGE[1], 1)):
+        outside = edge * factor**sign
+        slope = (function(edge) - function(edge * 1.001 ** (-sign))) / (sign * np.log(1.001))
+        expected = function(edge) + slope * np.log(outside / edge)
+        # The tangent comes from a one-sided difference of another width: equal to first order.
+        assert function(outside) == pytest.approx(expected, abs=2e-2 * np.log(factor) + 1e-9)
+
+
+def test_single_magnification_is_a_constant():
+    function = ContinuousFunction("chebyshev_log", np.array([7.0]), (500.0, 500.0))
+    assert function(100.0) == function(500.0) == function(9000.0) == 7.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "coefficients", "g_range", "shape"),
+    [
+        ("spline", [1.0], RANGE, []),
+        ("chebyshev", [], RANGE, []),
+        ("chebyshev", [np.nan], RANGE, []),
+        ("chebyshev", [1.0], (0.0, 10.0), []),
+        ("chebyshev", [1.0], (10.0, 1.0), []),
+        ("linear_log", [1.0, 2.0], RANGE, [100.0]),
+        ("linear_log", [1.0, 2.0], RANGE, [1000.0, 100.0]),
+        ("ode", [1.0, 2.0], RANGE, [1.0]),
+    ],
+)
+def test_meaningless_functions_are_refused(kind, coefficients, g_range, shape):
+    with pytest.raises(InvalidValueError):
+        ContinuousFunction(kind, np.array(coefficients), g_range, np.array(shape))

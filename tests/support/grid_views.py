@@ -1,0 +1,80 @@
+"""Views of a chess grid with known truth, without images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.poses import rotations_from_vectors
+from semcal_ros.core.views import GridView
+
+__all__ = ["grid_view", "grid_views"]
+
+Array = NDArray[np.float64]
+
+
+def grid_view(
+    camera: ScanCamera,
+    rotation: Array,
+    translation_m: Array,
+    *,
+    square_px: float = 40.0,
+    noise_px: float = 0.0,
+    rng: np.random.Generator | None = None,
+    name: str = "",
+) -> GridView:
+    """All lattice corners that fall into the image, with Gaussian noise on their pixels."""
+    square_m = square_px / camera.m
+    i, j = np.meshgrid(np.arange(-40, 41), np.arange(-40, 41))
+    board = np.column_stack([i.ravel(), j.ravel()]) * square_m
+    points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T + translation_m
+    xy = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        seen = np.all((xy > 5) & (xy < np.array([camera.width, camera.height]) - 6), axis=1)
+    xy = xy[seen]
+    if noise_px > 0.0:
+        assert rng is not None
+        xy = xy + rng.normal(scale=noise_px, size=xy.shape)
+    sigma = np.full(len(xy), noise_px if noise_px > 0.0 else 0.01)
+    return GridView(camera.magnification, board[seen], xy, sigma, name)
+
+
+def grid_views(
+    camera_at: Callable[[float], ScanCamera],
+    magnifications: Sequence[float],
+    *,
+    views: int = 4,
+    noise_px: float = 0.0,
+    height_sigma_m: float = 40e-6,
+    square_px: float = 40.0,
+    seed: int = 0,
+) -> list[GridView]:
+    """``views`` random poses per magnification, the first untilted, tilts up to 40 degrees."""
+    rng = np.random.default_rng(seed)
+    # A generator of its own: the poses of a seed are the same with and without noise.
+    noise_rng = np.random.default_rng(seed + 1_000_000)
+    out = []
+    for g in magnifications:
+        camera = camera_at(g)
+        for k in range(views):
+            tilt = 0.0 if k == 0 else rng.uniform(np.radians(15), np.radians(40))
+            axis = rng.uniform(0, 2 * np.pi)
+            turn = rotations_from_vectors(np.array([[0.0, 0.0, rng.uniform(-0.6, 0.6)]]))[0]
+            lean = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
+            centre = rng.uniform(-0.5, 0.5, size=2) * square_px / camera.m
+            translation = np.array([*centre, 0.0 if k == 0 else rng.normal() * height_sigma_m])
+            out.append(
+                grid_view(
+                    camera,
+                    lean @ turn,
+                    translation,
+                    square_px=square_px,
+                    noise_px=noise_px,
+                    rng=noise_rng,
+                    name=f"{g:g}/{k}",
+                )
+            )
+    return out
