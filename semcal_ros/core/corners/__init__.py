@@ -1,0 +1,7 @@
+"""Automatic corners of an endless chess board."""
+
+from __future__ import annotations
+
+from semcal_ros.core.corners.detection import LatticeDetection, find_lattice
+
+__all__ = ["LatticeDetection", "find_lattice"]

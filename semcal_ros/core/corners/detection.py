@@ -1,0 +1,162 @@
+"""The corner finder: saddle candidates, lattice growing, sub-pixel fit, rejection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.corners.lattice import Lattice, grow_best_lattice
+from semcal_ros.core.corners.local_map import fit_local_maps
+from semcal_ros.core.corners.refinement import RefinedCorners, refine_lattice
+from semcal_ros.core.corners.saddle import find_saddles
+from semcal_ros.core.corners.screening import prepare_image, screen_image
+
+__all__ = ["LatticeDetection", "find_lattice"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SCALES_PX = (2.5, 1.5, 4.2, 7.0)
+MINIMUM_CORNERS = 12
+# A lattice that fills this part of the image is not going to be beaten at another scale.
+FILLED = 0.6
+
+
+def _no_covariance() -> Array:
+    return np.zeros((0, 2, 2))
+
+
+@dataclass(frozen=True)
+class LatticeDetection:
+    """Corners of a chess board found in one image.
+
+    Attributes
+    ----------
+    accepted
+        Whether the view can be used.
+    reason
+        Why it cannot be used; "" when accepted.
+    ij
+        (n, 2) lattice indices. The origin is arbitrary; the image of the axes is right-handed
+        (positive determinant with x right and y down).
+    xy
+        (n, 2) positions, px.
+    sigma_px
+        (n,) 1-sigma per axis, px: the root of half the trace of the covariance.
+    spacing_px
+        Larger singular value of the local map from lattice to image at the image centre, px per
+        square: the spacing without foreshortening by a tilt.
+    image_size
+        (width, height) without the databar, px.
+    covariance_px2
+        (n, 2, 2) covariance of each position, px^2.
+    blur_px
+        Median standard deviation of the blur of the edges, px; NaN when nothing was fitted.
+    rejected
+        Number of fitted lattice positions that were not good enough.
+    """
+
+    accepted: bool
+    reason: str
+    ij: Indices
+    xy: Array
+    sigma_px: Array
+    spacing_px: float
+    image_size: tuple[int, int]
+    covariance_px2: Array = field(default_factory=_no_covariance)
+    blur_px: float = float("nan")
+    rejected: int = 0
+
+
+def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection:
+    """Find the corners of a chess board seen in part or as a whole, at any rotation and tilt.
+
+    Candidates are maxima of minus the determinant of the Hessian at several scales; a lattice is
+    grown from them with local prediction, checked by the alternating sign of the contrast; every
+    corner in view is then fitted by a model of two crossing blurred edges (see
+    :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey values, 8 or 16 bit integers or floats.
+    databar_rows
+        Rows at the bottom that do not belong to the picture.
+
+    Returns
+    -------
+    LatticeDetection
+        With ``accepted`` False and a reason if the image is blank, saturated, or does not show a
+        lattice.
+
+    Raises
+    ------
+    InvalidValueError
+        If ``image`` is not a single-channel image of at least 32 x 32 px.
+    """
+    grey = prepare_image(image, databar_rows)
+    size = (grey.shape[1], grey.shape[0])
+    scaled, reason = screen_image(grey)
+    if reason:
+        return _refused(reason, size)
+    best: RefinedCorners | None = None
+    for scale in SCALES_PX:
+        lattice = grow_best_lattice(find_saddles(scaled, scale), size)
+        if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
+            continue
+        refined = refine_lattice(scaled, lattice)
+        if refined is None:
+            continue
+        if best is None or len(refined.ij) * refined.quality > len(best.ij) * best.quality:
+            best = refined
+        if _filled(lattice, size) > FILLED and best.quality > 0.8:
+            break
+    if best is None:
+        return _refused("no chess lattice: no regular pattern of saddle points", size)
+    if best.quality < 0.5:
+        return _refused(
+            f"no chess lattice: only {round(100 * best.quality)} % of the expected corners"
+            " look like corners",
+            size,
+        )
+    if len(best.ij) < MINIMUM_CORNERS:
+        return _refused(
+            f"too few corners: {len(best.ij)} found, at least {MINIMUM_CORNERS} needed", size
+        )
+    return _accepted(best, size)
+
+
+def _filled(lattice: Lattice, size: tuple[int, int]) -> float:
+    """Part of the image that the cells of a lattice cover."""
+    area = float(np.abs(np.linalg.det(lattice.axes)).sum())
+    return area / (size[0] * size[1])
+
+
+def _refused(reason: str, size: tuple[int, int]) -> LatticeDetection:
+    return LatticeDetection(
+        False, reason, np.zeros((0, 2), np.int64), np.zeros((0, 2)), np.zeros(0), float("nan"), size
+    )
+
+
+def _accepted(corners: RefinedCorners, size: tuple[int, int]) -> LatticeDetection:
+    centre = np.array([(size[0] - 1) / 2.0, (size[1] - 1) / 2.0])
+    nearest = int(np.argmin(np.linalg.norm(corners.xy - centre, axis=1)))
+    maps = fit_local_maps(
+        corners.ij[nearest : nearest + 1], corners.ij, corners.xy, leave_out_self=False
+    )
+    spacing = float(np.linalg.svd(maps.axes[0], compute_uv=False)[0])
+    trace = np.trace(corners.covariance, axis1=1, axis2=2)
+    return LatticeDetection(
+        True,
+        "",
+        corners.ij,
+        corners.xy,
+        np.sqrt(trace / 2.0),
+        spacing,
+        size,
+        corners.covariance,
+        corners.blur_px,
+        corners.rejected,
+    )

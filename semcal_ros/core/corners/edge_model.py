@@ -1,0 +1,167 @@
+"""Grey values around a chess corner: two blurred, curved edges that cross.
+
+    I(x) = b0 + b . x + (a0 + a . x) S(d1) S(d2)
+    S(d) = sum_k (-1)^k erf((d - k h) / (sqrt(2) w)),  k = -1, 0, 1
+
+with ``d1`` and ``d2`` the distances from the edges along i and j, ``h`` the distance of the next
+parallel edge and ``w`` the blur. The edges bend as the local lattice map says, but for a small
+correction that large squares can determine; a plane and a gradient of the contrast take shading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.window import PixelWindows
+
+__all__ = ["LINEAR", "NONLINEAR", "EdgeGeometry", "evaluate"]
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+# x, y, direction of the edge along i and of that along j, log blur, extra sagitta of the two edges
+# over half a square; then b0, bx, by, a0, ax, ay.
+NONLINEAR = 7
+LINEAR = 6
+
+
+@dataclass(frozen=True)
+class EdgeGeometry:
+    """What the lattice says about each corner and the fit does not change.
+
+    Attributes
+    ----------
+    spacing_1, spacing_2
+        (n,) distance to the next edge parallel to the edge along i, along j.
+    curvature_1, curvature_2
+        (n,) signed curvature of the edges, 1/px.
+    length
+        (n,) typical arm length, px, which makes the derivatives alike in size.
+    """
+
+    spacing_1: Array
+    spacing_2: Array
+    curvature_1: Array
+    curvature_2: Array
+    length: Array
+
+    @classmethod
+    def from_map(cls, axes: Array, bend: Array) -> EdgeGeometry:
+        """From first and second derivatives of the local lattice map, both (n, 2, 2)."""
+        norm = np.linalg.norm(axes, axis=2)
+        cell = np.linalg.det(axes)
+        tangent = axes / norm[:, :, None]
+        normal_1 = np.stack([-tangent[:, 0, 1], tangent[:, 0, 0]], axis=1)
+        normal_2 = np.stack([tangent[:, 1, 1], -tangent[:, 1, 0]], axis=1)
+        return cls(
+            cell / norm[:, 0],
+            cell / norm[:, 1],
+            np.einsum("nc,nc->n", normal_1, bend[:, 0]) / norm[:, 0] ** 2,
+            np.einsum("nc,nc->n", normal_2, bend[:, 1]) / norm[:, 1] ** 2,
+            0.25 * norm.sum(axis=1),
+        )
+
+
+# erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
+# 7.1.26, error below 1.5e-7, single precision's own. It shares the exponential with the derivative.
+ERF_P = np.float32(0.3275911)
+ERF_C = tuple(
+    np.float32(c) for c in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
+)
+# Closer parallel edges than this, in blur widths, reach into the window half a square away.
+NEIGHBOUR_BLURS = 8.0
+
+
+def _erf_and_bell(z: Single) -> tuple[Single, Single]:
+    """erf(z / sqrt 2) and exp(-z^2 / 2)."""
+    bell = np.exp(np.float32(-0.5) * z * z)
+    t = np.float32(1.0) / (np.float32(1.0) + (ERF_P * np.float32(np.sqrt(0.5))) * np.abs(z))
+    tail = t * ERF_C[4]
+    for coefficient in ERF_C[3::-1]:
+        tail += coefficient
+        tail *= t
+    tail *= bell
+    return np.copysign(np.float32(1.0) - tail, z), bell
+
+
+def _profile(distance: Single, spacing: Single, blur: Single) -> tuple[Single, Single, Single]:
+    """S, dS/dd and dS/dlog(w)."""
+    scale = np.float32(np.sqrt(2.0 / np.pi)) / blur
+    value, slope = _erf_and_bell(distance / blur)
+    slope *= scale
+    by_blur = -distance * slope
+    if float((spacing / blur).min()) < NEIGHBOUR_BLURS:
+        for side in (spacing, -spacing):
+            other = distance - side
+            step, bell = _erf_and_bell(other / blur)
+            bell *= scale
+            value -= step
+            slope -= bell
+            by_blur += other * bell
+    return value, slope, by_blur
+
+
+def evaluate(
+    windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, linear: Array | None
+) -> tuple[Single, Single]:
+    """Derivatives of the model at the pixels, and the model.
+
+    Returns
+    -------
+    jacobian
+        (n, 13, p) derivatives; with ``linear`` None only the (n, 6, p) linear ones.
+    model
+        (n, p) grey values; zeros where ``linear`` is None.
+    """
+
+    def column(values: Array) -> Single:
+        return np.asarray(values, dtype=np.float32)[:, None]
+
+    px, py, angle_1, angle_2, log_blur, sag_1, sag_2 = nonlinear.T
+    blur = column(np.exp(log_blur))
+    x, y = windows.x - column(px), windows.y - column(py)
+    cos_1, sin_1 = column(np.cos(angle_1)), column(np.sin(angle_1))
+    cos_2, sin_2 = column(np.cos(angle_2)), column(np.sin(angle_2))
+    per_sag = 2.0 / geometry.length**2
+    bend_1 = column(geometry.curvature_1 + sag_1 * per_sag)
+    bend_2 = column(geometry.curvature_2 + sag_2 * per_sag)
+    along_1, off_1 = cos_1 * x + sin_1 * y, cos_1 * y - sin_1 * x
+    along_2, off_2 = cos_2 * x + sin_2 * y, sin_2 * x - cos_2 * y
+    half = np.float32(0.5)
+    edge_1, slope_1, blur_1 = _profile(
+        off_1 - half * bend_1 * along_1 * along_1, column(geometry.spacing_1), blur
+    )
+    edge_2, slope_2, blur_2 = _profile(
+        off_2 - half * bend_2 * along_2 * along_2, column(geometry.spacing_2), blur
+    )
+    length = column(geometry.length)
+    u, v = windows.x / length, windows.y / length
+    product = edge_1 * edge_2
+    n, pixels = windows.x.shape
+    free = NONLINEAR if linear is not None else 0
+    jacobian = np.empty((n, free + LINEAR, pixels), dtype=np.float32)
+    jacobian[:, free] = 1.0
+    jacobian[:, free + 1], jacobian[:, free + 2] = u, v
+    jacobian[:, free + 3] = product
+    np.multiply(u, product, out=jacobian[:, free + 4])
+    np.multiply(v, product, out=jacobian[:, free + 5])
+    if linear is None:
+        return jacobian, np.zeros_like(windows.x)
+    b0, bx, by, a0, ax, ay = (column(c) for c in linear.T)
+    contrast = a0 + ax * u + ay * v
+    model = b0 + bx * u + by * v + contrast * product
+    by_1, by_2 = contrast * slope_1 * edge_2, contrast * slope_2 * edge_1
+    pull_1, pull_2 = bend_1 * along_1, bend_2 * along_2
+    one = np.float32(1.0)
+    jacobian[:, 0] = by_1 * (sin_1 + pull_1 * cos_1) + by_2 * (pull_2 * cos_2 - sin_2)
+    jacobian[:, 1] = by_1 * (pull_1 * sin_1 - cos_1) + by_2 * (cos_2 + pull_2 * sin_2)
+    jacobian[:, 2] = -by_1 * along_1 * (one + bend_1 * off_1)
+    jacobian[:, 3] = by_2 * along_2 * (one + bend_2 * off_2)
+    jacobian[:, 4] = contrast * (blur_1 * edge_2 + blur_2 * edge_1)
+    arm = one / (length * length)
+    jacobian[:, 5] = -by_1 * (along_1 * along_1 * arm)
+    jacobian[:, 6] = -by_2 * (along_2 * along_2 * arm)
+    return jacobian, model

@@ -1,0 +1,95 @@
+"""Saddle points of a smoothed image: the candidates for chess-board corners at one scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["SaddlePoints", "find_saddles"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# Below this part of the response of the strong saddles a maximum is taken for noise. The response
+# is quadratic in the contrast, so corners with a third of the contrast of the strong ones still
+# count.
+RELATIVE_THRESHOLD = 0.1
+STRONG_RANK = 12
+MAX_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class SaddlePoints:
+    """Saddle points, strongest first.
+
+    Attributes
+    ----------
+    xy
+        (n, 2) positions, px, good to a few tenths.
+    hessian
+        (n, 2, 2) Hessian of the smoothed image at the points.
+    response
+        (n,) minus the determinant of the Hessian, normalised by the scale.
+    """
+
+    xy: Array
+    hessian: Array
+    response: Array
+
+
+def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
+    """Local maxima of ``-det(Hessian)`` of the image smoothed by a Gaussian.
+
+    Parameters
+    ----------
+    image
+        (h, w) float32.
+    scale_px
+        Standard deviation of the Gaussian, px; a quarter of the spacing of the corners is a good
+        choice.
+    """
+    smooth = cv2.GaussianBlur(image, (0, 0), scale_px, borderType=cv2.BORDER_REFLECT_101)
+    kernel_2 = np.array([1.0, -2.0, 1.0], dtype=np.float32)
+    kernel_1 = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+    kernel_0 = np.ones(1, dtype=np.float32)
+
+    def derive(kernel_x: Image, kernel_y: Image) -> NDArray[np.float32]:
+        return cv2.sepFilter2D(
+            smooth, cv2.CV_32F, kernel_x, kernel_y, borderType=cv2.BORDER_REPLICATE
+        ).astype(np.float32, copy=False)
+
+    xx, yy, xy = derive(kernel_2, kernel_0), derive(kernel_0, kernel_2), derive(kernel_1, kernel_1)
+    response = (xy * xy - xx * yy) * np.float32(scale_px**4)
+    rows, columns = _strong_maxima(response, scale_px)
+    hessian = np.empty((len(rows), 2, 2))
+    hessian[:, 0, 0] = xx[rows, columns]
+    hessian[:, 1, 1] = yy[rows, columns]
+    hessian[:, 0, 1] = hessian[:, 1, 0] = xy[rows, columns]
+    gradient = np.stack(
+        [derive(kernel_1, kernel_0)[rows, columns], derive(kernel_0, kernel_1)[rows, columns]],
+        axis=1,
+    ).astype(np.float64)
+    # One Newton step to where the gradient vanishes; it is small at a true saddle.
+    step = -np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0] if len(rows) else gradient
+    step *= np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12))
+    points = np.stack([columns, rows], axis=1) + step
+    return SaddlePoints(points, hessian, response[rows, columns].astype(np.float64))
+
+
+def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    radius = max(1, round(1.2 * scale_px))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    peaks = (response >= cv2.dilate(response, kernel)) & (response > 0)
+    # The frame's own rim has no second derivative.
+    peaks[[0, -1], :] = False
+    peaks[:, [0, -1]] = False
+    rows, columns = np.nonzero(peaks)
+    strength = response[rows, columns]
+    order = np.argsort(-strength, kind="stable")
+    if len(order):
+        strong = strength[order[min(STRONG_RANK, len(order)) - 1]]
+        order = order[strength[order] > RELATIVE_THRESHOLD * strong][:MAX_POINTS]
+    return rows[order].astype(np.int64), columns[order].astype(np.int64)

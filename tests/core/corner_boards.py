@@ -1,0 +1,143 @@
+"""Chess boards of exactly known geometry, rendered by supersampling, for the tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Board:
+    """An endless (or bounded) board seen by a tilted, distorted camera.
+
+    ``square_px`` is the spacing without foreshortening; ``distortion`` is the radial coefficient at
+    half the width; ``electrons`` is the mean dose of a bright pixel (0: no noise); ``blur_px`` the
+    Gaussian blur besides the pixel's area.
+    """
+
+    square_px: float
+    tilt_deg: float = 0.0
+    axis_deg: float = 0.0
+    turn_deg: float = 0.0
+    offset: tuple[float, float] = (0.3, 0.2)
+    distortion: float = 0.0
+    perspective: float = 0.0
+    blur_px: float = 0.7
+    electrons: float = 0.0
+    shading: float = 0.0
+    inverted: bool = False
+    dark: float = 0.25
+    width: int = 512
+    height: int = 512
+    bounds: tuple[int, int, int, int] | None = None
+
+    @property
+    def homography(self) -> Array:
+        """Board (units of a square) to ideal pixels relative to the centre."""
+        tilt, axis, turn = np.deg2rad([self.tilt_deg, self.axis_deg, self.turn_deg])
+
+        def rotation(angle: float) -> Array:
+            return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+        squeeze = rotation(axis) @ np.diag([1.0, np.cos(tilt)]) @ rotation(-axis)
+        matrix = np.eye(3)
+        matrix[:2, :2] = self.square_px * squeeze @ rotation(turn)
+        matrix[:2, 2] = self.square_px * np.array(self.offset)
+        depth = np.array([-np.sin(axis), np.cos(axis)]) @ rotation(turn)
+        matrix[2, :2] = self.perspective * self.square_px * np.sin(tilt) * depth / self.width
+        return matrix
+
+    @property
+    def centre(self) -> Array:
+        return np.array([(self.width - 1) / 2.0, (self.height - 1) / 2.0])
+
+    def image_from_board(self, uv: Array) -> Array:
+        """(n, 2) pixels of board points (n, 2)."""
+        h = np.column_stack([uv, np.ones(len(uv))]) @ self.homography.T
+        q = h[:, :2] / h[:, 2:]
+        scale = self.distortion / (self.width / 2.0) ** 2
+        r2 = (q * q).sum(axis=1, keepdims=True)
+        q = q * 2.0 / (1.0 + np.sqrt(np.maximum(1.0 - 4.0 * scale * r2, 1e-6)))
+        return q + self.centre
+
+    def board_from_image(self, xy: Array) -> Array:
+        """(n, 2) board points of pixels (n, 2); the division model's exact inverse."""
+        q = xy - self.centre
+        scale = self.distortion / (self.width / 2.0) ** 2
+        q = q / (1.0 + scale * (q * q).sum(axis=1, keepdims=True))
+        h = np.column_stack([q, np.ones(len(q))]) @ np.linalg.inv(self.homography).T
+        return h[:, :2] / h[:, 2:]
+
+    def corners(self, margin: float = 6.0) -> tuple[NDArray[np.int64], Array]:
+        """Indices and pixels of the corners at least ``margin`` px inside of the image."""
+        frame = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
+        corner_uv = self.board_from_image(frame.astype(np.float64))
+        low, high = np.floor(corner_uv.min(axis=0)) - 2, np.ceil(corner_uv.max(axis=0)) + 2
+        if self.bounds is not None:
+            low = np.maximum(low, [self.bounds[0] + 1, self.bounds[1] + 1])
+            high = np.minimum(high, [self.bounds[2] - 1, self.bounds[3] - 1])
+        i, j = np.meshgrid(
+            np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1), indexing="ij"
+        )
+        ij = np.column_stack([i.ravel(), j.ravel()])
+        xy = self.image_from_board(ij)
+        size = np.array([self.width, self.height])
+        back = np.abs(self.board_from_image(xy) - ij).max(axis=1) < 1e-6
+        inside = np.all((xy >= margin) & (xy <= size - 1 - margin), axis=1) & back
+        return ij[inside].astype(np.int64), xy[inside]
+
+    def _bright(self, xy: Array) -> Array:
+        """(n,) 1 where the board is bright at pixel positions (n, 2), else 0."""
+        uv = self.board_from_image(xy)
+        bright = (np.floor(uv).sum(axis=1) % 2 == 0) != self.inverted
+        if self.bounds is not None:
+            a, b, c, d = self.bounds
+            bright |= ~((uv[:, 0] > a) & (uv[:, 0] < c) & (uv[:, 1] > b) & (uv[:, 1] < d))
+        return bright.astype(np.float64)
+
+    def clean(self, samples: int = 8) -> Array:
+        """(h, w) noise-free picture with values between ``dark`` and 1, before shading.
+
+        Pixels that an edge may cross are averaged over ``samples`` x ``samples`` points.
+        """
+        margin = 8
+        x = np.arange(-margin, self.width + margin, dtype=np.float64)
+        y = np.arange(-margin, self.height + margin, dtype=np.float64)
+        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        uv = self.board_from_image(grid).reshape(len(y), len(x), 2)
+        step_y, step_x = np.gradient(uv, axis=(0, 1))
+        reach = 0.6 * (np.abs(step_x) + np.abs(step_y))
+        crossed = np.any(np.abs(uv - np.round(uv)) < reach, axis=2).ravel()
+        total = self._bright(grid)
+        # Slightly off the centre, so that no sample lies exactly on an edge in a symmetric
+        # position.
+        steps = (np.arange(samples) + 0.4837) / samples - 0.5
+        fine = np.zeros(int(crossed.sum()))
+        for dx in steps:
+            for dy in steps:
+                fine += self._bright(grid[crossed] + [dx, dy])
+        total[crossed] = fine / samples**2
+        picture = total.reshape(len(y), len(x))
+        if self.blur_px > 0:
+            picture = cv2.GaussianBlur(picture, (0, 0), self.blur_px)
+        return self.dark + (1.0 - self.dark) * picture[margin:-margin, margin:-margin]
+
+    def render(
+        self, rng: np.random.Generator, dtype: type = np.uint8, samples: int = 8
+    ) -> NDArray[np.generic]:
+        """(h, w) picture with shading and shot noise, quantised."""
+        picture = self.clean(samples)
+        y, x = np.mgrid[0.0 : self.height, 0.0 : self.width]
+        ramp = 1.0 + self.shading * ((x / self.width - 0.5) + 0.7 * (y / self.height - 0.5) ** 2)
+        picture = picture * ramp
+        if self.electrons > 0:
+            picture = rng.poisson(picture * self.electrons) / self.electrons
+        full = {np.uint8: 255, np.uint16: 65535}.get(dtype)
+        if full is None:
+            return picture.astype(dtype)
+        return np.clip(np.round(picture * 0.55 * full), 0, full).astype(dtype)
