@@ -110,9 +110,5 @@ def _write_report(done: RecordingCalibration, path: Path) -> None:
     from semcal_ros.report import calibration_report
 
     calibration_report(
-        done.result,
-        path,
-        detections=[v.detection for v in done.collected.found],
-        images=[v.image for v in done.collected.found],
-        rejected=[(v.name, v.magnification, v.reason) for v in done.collected.rejected],
+        done.result, path, detections=done.collected.found, rejected=done.collected.rejected
     )

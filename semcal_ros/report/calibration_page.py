@@ -1,0 +1,152 @@
+"""The report of a calibration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.model import CalibrationModel
+from semcal_ros.report.curve_figures import (
+    parameter_pictures,
+    pixel_size_pictures,
+    rms_picture,
+    sigma_picture,
+)
+from semcal_ros.report.examples import (
+    ExampleView,
+    UnusedView,
+    best_per_magnification,
+    overlay_of,
+)
+from semcal_ros.report.field_figures import (
+    coverage_picture,
+    distortion_picture,
+    mean_residual_picture,
+    pose_picture,
+    residual_picture,
+)
+from semcal_ros.report.findings import findings
+from semcal_ros.report.numbers import (
+    PAPER_RMS_PX,
+    facts,
+    format_length,
+    format_px,
+    held_out_px,
+    magnification_rows,
+    plain,
+)
+from semcal_ros.report.page import render, write_page
+from semcal_ros.report.pictures import captioned_pictures
+
+__all__ = ["calibration_report"]
+
+_MAX_OVERLAYS = 24
+
+
+def calibration_report(
+    result: CalibrationResult,
+    path: str | os.PathLike[str],
+    *,
+    detections: Sequence[ExampleView] = (),
+    rejected: Sequence[UnusedView] = (),
+    images: Sequence[tuple[str, NDArray[Any]]] = (),
+    title: str = "SEM calibration",
+) -> Path:
+    """Write one self-contained HTML file about a calibration.
+
+    Parameters
+    ----------
+    result
+        The calibration with its views and residuals.
+    path
+        The file to write.
+    detections
+        Images with their corners; the one with most corners is shown for each magnification.
+    rejected
+        Images that were not used, with the reason.
+    images
+        More pictures as (caption, image), shown at the end.
+    title
+        Heading of the page.
+
+    Returns
+    -------
+    Path
+        ``path``.
+
+    Raises
+    ------
+    InvalidValueError
+        If an image has an unsupported shape, or the file cannot be written.
+    """
+    model = result.model
+    extra = captioned_pictures(images)
+    shown = _spread(best_per_magnification(detections), _MAX_OVERLAYS)
+    values = {
+        "title": plain(title),
+        "summary": _summary(result, len(rejected)),
+        "warnings": findings(result),
+        "overlays": [overlay_of(view) for view in shown],
+        "coverage": [coverage_picture(result), pose_picture(result)],
+        "residuals": [mean_residual_picture(result), residual_picture(result)],
+        "errors": [rms_picture(result), sigma_picture(model)],
+        "pixel_size": pixel_size_pictures(model),
+        "distortion": [distortion_picture(camera) for camera in _low_middle_high(model)],
+        "parameters": parameter_pictures(model),
+        "rejected": [(plain(r.name), f"{r.magnification:g}×", plain(r.reason)) for r in rejected],
+        "rows": magnification_rows(result),
+        "facts": facts(result),
+        "images": extra,
+    }
+    return write_page(path, render("calibration.html.j2", values))
+
+
+def _spread(views: list[ExampleView], count: int) -> list[ExampleView]:
+    """At most ``count`` of the views, evenly chosen, with the first and the last."""
+    if len(views) <= count:
+        return views
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
+
+
+def _low_middle_high(model: CalibrationModel) -> list[ScanCamera]:
+    low, high = model.magnification_range
+    if low == high:
+        return [model.at(low)]
+    return [model.at(g) for g in (low, float(np.sqrt(low * high)), high)]
+
+
+def _summary(result: CalibrationResult, rejected: int) -> list[tuple[str, str, str]]:
+    """The key figures as (name, value, remark)."""
+    model = result.model
+    low, high = model.magnification_range
+    held_out = held_out_px(result)
+    size = [model.at(g).pixel_size_m[0] for g in (low, high)]
+    corners = sum(len(v.image_xy) for v in result.views)
+    paper = f"paper: {PAPER_RMS_PX[0]:g} to {PAPER_RMS_PX[1]:g} px"
+    span = f"{low:g}× to {high:g}×" if high > low else f"{low:g}×"
+    pixel = (
+        f"{format_length(size[0])} to {format_length(size[1])}"
+        if high > low
+        else format_length(size[0])
+    )
+    return [
+        (
+            "Held-out error",
+            format_px(held_out),
+            f"RMS, inner magnifications; {paper}"
+            if held_out is not None
+            else "needs 3 magnifications",
+        ),
+        ("Error of all views", format_px(result.fit.rms_px()), f"RMS; {paper}"),
+        ("Magnification", span, f"{len(model.magnifications)} calibrated, continuous in between"),
+        ("Pixel size", pixel, "along x"),
+        ("Views", f"{len(result.views)} used", f"{rejected} rejected"),
+        ("Corners", f"{corners}", f"{corners / len(result.views):.0f} per view"),
+    ]

@@ -1,0 +1,136 @@
+"""The report of a correction: errors before and after, with pictures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import NullFormatter, ScalarFormatter
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.report.encode import Picture, picture_of_figure
+from semcal_ros.report.numbers import format_px, plain
+from semcal_ros.report.page import render, write_page
+from semcal_ros.report.pictures import captioned_pictures
+from semcal_ros.report.style import INK, OURS, REFERENCE, legend, new_figure, tidy
+
+__all__ = ["DemoRow", "correction_report"]
+
+
+@dataclass(frozen=True)
+class DemoRow:
+    """One stage of the correction.
+
+    Attributes
+    ----------
+    label
+        Such as "with drift correction".
+    rms_px
+        RMS error measured here, px.
+    paper_px
+        What the paper reports for this stage, px: a number, a (low, high) pair, or None.
+    """
+
+    label: str
+    rms_px: float
+    paper_px: float | tuple[float, float] | None = None
+
+    @property
+    def paper_range_px(self) -> tuple[float, float] | None:
+        """``paper_px`` as a pair, or None."""
+        if self.paper_px is None:
+            return None
+        if isinstance(self.paper_px, tuple):
+            return self.paper_px
+        return (self.paper_px, self.paper_px)
+
+    @property
+    def paper_text(self) -> str:
+        """``paper_px`` for a reader."""
+        pair = self.paper_range_px
+        if pair is None:
+            return "–"
+        return f"{pair[0]:g} px" if pair[0] == pair[1] else f"{pair[0]:g} to {pair[1]:g} px"
+
+
+def correction_report(
+    rows: Sequence[DemoRow],
+    images: Sequence[tuple[str, NDArray[Any]]],
+    path: str | os.PathLike[str],
+    *,
+    title: str = "Correction of an SEM stream",
+    notes: Sequence[str] = (),
+) -> Path:
+    """Write one self-contained HTML file with the errors of each stage and pictures.
+
+    Parameters
+    ----------
+    rows
+        The stages, worst first.
+    images
+        (caption, image) pairs in the order in which they are shown, such as before and after.
+    path
+        The file to write.
+    title
+        Heading of the page.
+    notes
+        Sentences below the table.
+
+    Raises
+    ------
+    InvalidValueError
+        If there are no rows, an image has an unsupported shape, or the file cannot be written.
+    """
+    if not rows:
+        raise InvalidValueError("a correction report without rows", expected="at least one DemoRow")
+    values = {
+        "title": plain(title),
+        "rows": [(plain(row.label), format_px(row.rms_px), row.paper_text) for row in rows],
+        "chart": [_bars(rows)],
+        "notes": [plain(note) for note in notes],
+        "images": captioned_pictures(images),
+    }
+    return write_page(path, render("correction.html.j2", values))
+
+
+def _bars(rows: Sequence[DemoRow]) -> Picture:
+    """Measured error of each stage as a bar on a logarithmic axis, the paper's as marks."""
+    figure = new_figure(4.2, 1.2 + 0.55 * len(rows))
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="RMS error (px, logarithmic)", ylabel="")
+    axes.set_xscale("log")
+    measured = np.array([row.rms_px for row in rows], dtype=np.float64)
+    known = np.isfinite(measured) & (measured > 0.0)
+    papers = [row.paper_range_px for row in rows]
+    everything = [*measured[known], *(x for pair in papers if pair for x in pair)]
+    low = 0.4 * min(everything, default=0.1)
+    high = 2.5 * max(everything, default=10.0)
+    places = np.arange(len(rows))
+    axes.barh(places[known], measured[known] - low, left=low, height=0.5, color=OURS, label="here")
+    for place, pair in zip(places, papers, strict=True):
+        if pair is not None:
+            label = "paper" if pair is next(p for p in papers if p) else None
+            axes.plot(
+                pair, [place, place], "D-", color=REFERENCE, markersize=6, linewidth=3, label=label
+            )
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    # The labels come from outside and may hold anything: in the picture the stages only have
+    # numbers.
+    axes.set_yticks(places, [f"{k + 1}" for k in places], color=INK)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    legend(axes, loc="best")
+    stages = "; ".join(
+        f"{row.label}: {format_px(row.rms_px)}, paper {row.paper_text}" for row in rows
+    )
+    return picture_of_figure(
+        figure,
+        plain(f"RMS error of each stage. {stages}."),
+        "The numbers at the left are those of the table's rows.",
+    )

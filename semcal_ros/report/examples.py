@@ -1,0 +1,121 @@
+"""Example images with the found corners drawn on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.report.encode import as_bytes_image, data_uri, jpeg_of, shrunk
+from semcal_ros.report.numbers import plain
+
+__all__ = ["ExampleView", "Overlay", "UnusedView", "best_per_magnification", "overlay_of"]
+
+Array = NDArray[np.float64]
+
+_OVERLAY_WIDTH = 320
+# Half the size of a cross: this part of the spacing of the corners, within limits, in px of the
+# thumbnail.
+_MARK_OF_SPACING = 0.2
+_MARK_LIMITS_PX = (0.8, 4.0)
+_JPEG_QUALITY = 70
+
+
+class ExampleView(Protocol):
+    """What the report needs of an image in which the grid was found."""
+
+    @property
+    def name(self) -> str:
+        """Name for the reader."""
+
+    @property
+    def magnification(self) -> float:
+        """Magnification of the image."""
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """The image, (height, width) or (height, width, 3)."""
+
+    @property
+    def detection(self) -> LatticeDetection:
+        """The corners in it."""
+
+
+class UnusedView(Protocol):
+    """What the report needs of an image that was not used."""
+
+    @property
+    def name(self) -> str:
+        """Name for the reader."""
+
+    @property
+    def magnification(self) -> float:
+        """Magnification of the image."""
+
+    @property
+    def reason(self) -> str:
+        """Why it was not used."""
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """An image with marks at the corners, for inline SVG.
+
+    Attributes
+    ----------
+    src
+        Data URI of the image.
+    width, height
+        Size of the embedded image, px; the marks are in its coordinates with (0, 0) at the top left
+        edge.
+    marks
+        SVG path of all crosses.
+    alt, caption
+        Texts.
+    """
+
+    src: str
+    width: int
+    height: int
+    marks: str
+    alt: str
+    caption: str
+
+
+def best_per_magnification(views: Sequence[ExampleView]) -> list[ExampleView]:
+    """For each magnification, ascending, the accepted view with most corners."""
+    best: dict[float, ExampleView] = {}
+    for view in views:
+        if not view.detection.accepted:
+            continue
+        known = best.get(view.magnification)
+        if known is None or len(view.detection.xy) > len(known.detection.xy):
+            best[view.magnification] = view
+    return [best[g] for g in sorted(best)]
+
+
+def _marks(xy: Array, spacing: float) -> str:
+    k = float(np.clip(_MARK_OF_SPACING * np.nan_to_num(spacing), *_MARK_LIMITS_PX))
+    return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
+
+
+def overlay_of(view: ExampleView) -> Overlay:
+    """The view shrunk to a thumbnail, with a cross at each corner."""
+    small, factor = shrunk(as_bytes_image(view.image), _OVERLAY_WIDTH)
+    # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
+    xy = (np.asarray(view.detection.xy, dtype=np.float64) + 0.5) * factor
+    count = len(xy)
+    sigma = view.detection.sigma_px
+    precision = f", median 1-sigma {np.median(sigma):.3f} px" if len(sigma) else ""
+    return Overlay(
+        src=data_uri("jpeg", jpeg_of(small, _JPEG_QUALITY)),
+        width=small.shape[1],
+        height=small.shape[0],
+        marks=_marks(xy, view.detection.spacing_px * factor),
+        alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
+        caption=plain(f"{view.magnification:g}×: {count} corners{precision} ({view.name})"),
+    )

@@ -1,0 +1,162 @@
+"""Numbers and sentences of a report, in the units that a person reads."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.evaluate import rms_by_magnification
+
+__all__ = [
+    "PAPER_RMS_PX",
+    "MagnificationRow",
+    "facts",
+    "format_length",
+    "format_px",
+    "held_out_px",
+    "magnification_rows",
+    "plain",
+]
+
+# Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: abstract and section 4.2.
+PAPER_RMS_PX = (0.9, 1.45)
+
+_METHODS = {
+    "joint": "joint: one adjustment of all images at all magnifications",
+    "discrete": "discrete: each magnification on its own, linear in between",
+    "pda": "pda: the paper's differential equations through the separate results",
+}
+
+
+def plain(text: object) -> str:
+    """Text without what a page or UTF-8 cannot carry: control characters and lone surrogates."""
+    kept = (
+        c if c.isspace() or unicodedata.category(c) not in ("Cc", "Cs") else "�" for c in str(text)
+    )
+    return "".join(kept)
+
+
+def format_length(length_m: float, sigma_m: float | None = None) -> str:
+    """A length in nm or um, with two digits of its 1-sigma if there is one."""
+    unit, factor = ("µm", 1e6) if abs(length_m) >= 1e-6 else ("nm", 1e9)
+    value = factor * length_m
+    if sigma_m is None or not (np.isfinite(sigma_m) and sigma_m > 0.0):
+        return f"{value:#.4g}".rstrip(".") + f" {unit}"
+    sigma = factor * sigma_m
+    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+
+def format_px(value: float | None) -> str:
+    """An error in px; a dash where there is none."""
+    if value is None or np.isnan(value):
+        return "–"
+    if np.isinf(value):
+        return "no answer"
+    return f"{value:.3f} px"
+
+
+@dataclass(frozen=True)
+class MagnificationRow:
+    """One line of the table of magnifications, ready to read."""
+
+    magnification: str
+    views: int
+    corners: int
+    rms: str
+    held_out: str
+    extrapolated: bool
+    pixel_x: str
+    pixel_y: str
+    field: str
+
+
+def magnification_rows(result: CalibrationResult) -> list[MagnificationRow]:
+    """Views, errors and pixel size at each calibrated magnification."""
+    model = result.model
+    rms = rms_by_magnification(result.fit)
+    rows = []
+    for g, value in rms.items():
+        own = [v for v in result.views if v.magnification == g]
+        camera = model.at(g)
+        x, y = camera.pixel_size_m
+        sigma = (None, None) if camera.covariance is None else camera.pixel_size_sigma_m
+        rows.append(
+            MagnificationRow(
+                magnification=f"{g:g}×",
+                views=len(own),
+                corners=sum(len(v.image_xy) for v in own),
+                rms=format_px(value),
+                held_out=format_px(result.held_out_rms_px.get(g)),
+                extrapolated=g in model.magnification_range,
+                pixel_x=format_length(x, sigma[0]),
+                pixel_y=format_length(y, sigma[1]),
+                field=" × ".join(
+                    format_length(size * count)
+                    for size, count in zip((x, y), model.image_size, strict=True)
+                ),
+            )
+        )
+    return rows
+
+
+def held_out_px(result: CalibrationResult) -> float | None:
+    """RMS of the held-out errors of all but the two outermost magnifications, px, or None."""
+    inner = [
+        result.held_out_rms_px[g]
+        for g in result.model.magnifications[1:-1]
+        if g in result.held_out_rms_px
+    ]
+    return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
+
+
+def facts(result: CalibrationResult) -> list[tuple[str, str]]:
+    """How the calibration was computed, as (name, value) pairs."""
+    model = result.model
+    statistics = model.statistics
+    width, height = model.image_size
+    pairs = [
+        ("Method", _METHODS.get(model.method, model.method)),
+        ("Image size", f"{width} × {height} px"),
+        ("Display width of the magnification", f"{1e3 * model.display_width_m:g} mm"),
+        ("Poses of the report's residuals", "settled" if result.fit.converged else "not settled"),
+    ]
+    fit = statistics.get("fit", {})
+    if isinstance(fit, Mapping):
+        pairs += _fit_facts(fit)
+    if statistics.get("gauge"):
+        pairs.append(("Convention", plain(statistics["gauge"])))
+    priors = statistics.get("priors", {})
+    if isinstance(priors, Mapping) and priors:
+        pairs.append(
+            (
+                "Priors (1/m, m and plain numbers)",
+                ", ".join(f"{k} = {_short(v)}" for k, v in priors.items()),
+            )
+        )
+    return [(name, plain(value)) for name, value in pairs]
+
+
+def _fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
+    pairs = []
+    if "reason" in fit:
+        pairs.append(("Adjustment", f"{fit['reason']} ({fit.get('iterations', '?')} iterations)"))
+    elif "converged" in fit:
+        pairs.append(("Adjustment", "converged" if fit["converged"] else "not converged"))
+    if "variance_factor" in fit:
+        root = float(np.sqrt(max(float(fit["variance_factor"]), 0.0)))
+        pairs.append(("Residuals over the predicted noise of the corners", f"{root:.3f}"))
+    coefficients = fit.get("coefficients", {})
+    if isinstance(coefficients, Mapping) and coefficients:
+        sizes = ", ".join(f"{name} {kind_size[-1]}" for name, kind_size in coefficients.items())
+        pairs.append(("Coefficients of each continuous function", sizes))
+    return pairs
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
