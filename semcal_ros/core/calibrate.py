@@ -34,6 +34,8 @@ Functions = Mapping[str, ContinuousFunction]
 
 METHODS = ("joint", "pda", "discrete")
 _MIN_CORNERS = 8
+# Variance factor beyond which the misfit is the model's and not a matter of the corners' sigmas.
+_MISFIT = 9.0
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,11 @@ def _fit_joint(setup: Setup) -> _Fitted:
     warnings = []
     if not fit.result.converged:
         warnings.append(f"the adjustment did not converge: {fit.result.reason}")
+    if factor > _MISFIT:
+        warnings.append(
+            f"residuals are {np.sqrt(factor):.1f} times what the uncertainty of the corners explains: the functions "
+            "do not follow the microscope everywhere; record more magnifications"
+        )
     if not fit.settled:
         warnings.append("the choice of the number of coefficients did not settle")
     details = {

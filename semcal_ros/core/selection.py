@@ -3,7 +3,7 @@
 An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), which is all that a candidate
 set of functions has to be fitted to. A candidate is judged by leave-one-magnification-out cross-validation on these
 summaries: fitted to all magnifications but one, how much worse does it explain that one's images? The two outermost
-magnifications are never left out, since the calibration does not claim to hold beyond them.
+magnifications are never left out, since the calibration does not claim to hold beyond them; there the fit itself counts.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class _Candidates:
         return self.rows[key]
 
     def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
-        """Sum over the inner magnifications of the cost of predicting each from the others."""
+        """Cost of predicting each inner magnification from the others, and of fitting the outermost ones."""
         key = tuple(sizes[name] for name in FUNCTION_NAMES)
         if key not in self.scores:
             self.scores[key] = self._score(sizes)
@@ -97,12 +97,15 @@ class _Candidates:
         matrix = matrices.sum(axis=0) + np.diag(precision)
         right = rights.sum(axis=0) + precision * mean
         scale = 1.0 / np.sqrt(np.diag(matrix))
-        left_out = (matrix - matrices[1:-1]) * np.outer(scale, scale)
-        solution = np.linalg.solve(left_out, ((right - rights[1:-1]) * scale)[:, :, None])[:, :, 0]
-        cameras = np.einsum("mpk,mk->mp", designs[1:-1], solution * scale)
-        # Relative to each magnification's own optimum, for accuracy of the difference.
-        quadratic = np.einsum("mp,mpq,mq->m", cameras, self.summary.information[1:-1], cameras)
-        linear = np.einsum("mp,mp->m", cameras, self.summary.right[1:-1])
+        # The inner magnifications are predicted from the others, the two outermost ones from all.
+        inner = np.ones((len(matrices), 1, 1))
+        inner[[0, -1]] = 0.0
+        left_out = (matrix - inner * matrices) * np.outer(scale, scale)
+        remaining = (right - inner[:, 0] * rights) * scale
+        solution = np.linalg.solve(left_out, remaining[:, :, None])[:, :, 0]
+        cameras = np.einsum("mpk,mk->mp", designs, solution * scale)
+        quadratic = np.einsum("mp,mpq,mq->m", cameras, self.summary.information, cameras)
+        linear = np.einsum("mp,mp->m", cameras, self.summary.right)
         return float(np.sum(0.5 * quadratic - linear))
 
 
