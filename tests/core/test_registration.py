@@ -40,8 +40,10 @@ def test_sign_and_axes_of_the_shift() -> None:
     np.testing.assert_allclose(result.shift_px, [7.0, -3.0], atol=0.06)
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, -0.5), (3.3, -7.8), (-60.2, 41.7), (64.0,
-0.4)]) def test_shift_up_to_a_third_of_the_field(shift: tuple[float, float]) -> None:
+@pytest.mark.parametrize(
+    "shift", [(0.0, 0.0), (0.5, -0.5), (3.3, -7.8), (-60.2, 41.7), (64.0, 0.4)]
+)
+def test_shift_up_to_a_third_of_the_field(shift: tuple[float, float]) -> None:
     result = register(*_pair(shift, 4.0))
     assert result.accepted, result.reason
     # Five of the stated deviations, and these must be small.

@@ -1,0 +1,115 @@
+"""Settings and results of the live drift tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectify import RasterDrift
+from semcal_ros.core.registration import RegistrationSettings
+
+__all__ = ["DriftSettings", "DriftUpdate"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DriftSettings:
+    """How drift is tracked.
+
+    Attributes
+    ----------
+    registration
+        Limits of a single registration.
+    rekey_overlap
+        The keyframe is replaced when less than this fraction of the picture still overlaps with it.
+    max_jump
+        A shift between frames beyond this fraction of the field is taken for a move of the stage,
+        not for drift.
+    first_step_px
+        Expected drift (1-sigma) between the first two frames, px.
+    max_ratio
+        Largest change of magnification across which the keyframe is carried by resampling.
+    lost_after
+        Number of consecutive frames that cannot be matched after which tracking starts anew at the
+        predicted drift.
+    acceleration_psd
+        Process noise, m^2/s^3 (px^2/s^3 without a camera); None adapts it to the stream.
+    interpolation
+        Of the rectification before registration.
+    """
+
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    rekey_overlap: float = 0.6
+    max_jump: float = 0.25
+    first_step_px: float = 3.0
+    max_ratio: float = 2.5
+    lost_after: int = 8
+    acceleration_psd: float | None = None
+    interpolation: str = "cubic"
+
+    def __post_init__(self) -> None:
+        checks = (
+            ("rekey_overlap", 0.0 < self.rekey_overlap < 1.0, "a fraction between 0 and 1"),
+            ("max_jump", 0.0 < self.max_jump <= 1.0, "a fraction between 0 and 1"),
+            ("first_step_px", self.first_step_px > 0.0, "a positive number of px"),
+            ("max_ratio", self.max_ratio >= 1.0, "at least 1"),
+            ("lost_after", self.lost_after >= 2, "at least 2 frames"),
+            ("acceleration_psd", (self.acceleration_psd or 0.0) >= 0.0, "a number >= 0 or None"),
+        )
+        for name, good, expected in checks:
+            if not good:
+                raise InvalidValueError(f"{name} = {getattr(self, name)}", expected=expected)
+
+
+@dataclass(frozen=True)
+class DriftUpdate:
+    """Drift at one frame.
+
+    Attributes
+    ----------
+    time_s
+        Centre of the frame's acquisition.
+    drift_m, velocity_m_s
+        (2,) drift since the first frame in the sem frame, and its rate. In px and px/s of the raw
+        image where ``calibrated`` is false.
+    covariance
+        (4, 4) of ``[x, y, vx, vy]`` in those units.
+    status
+        ``"keyframe"``, ``"tracked"`` or ``"coasting: <reason>"``.
+    accepted, reason
+        Whether the drift rests on this frame's own picture; why not.
+    residual
+        RMS grey levels that the shift does not explain; NaN where nothing was registered.
+    drift_px
+        (2,) drift in ideal pixels of this frame.
+    overlap
+        Fraction of the picture that was compared with the keyframe.
+    calibrated
+        False where no camera was given.
+    """
+
+    time_s: float
+    drift_m: Array
+    velocity_m_s: Array
+    covariance: Array
+    status: str
+    accepted: bool
+    reason: str
+    residual: float
+    drift_px: Array
+    overlap: float
+    calibrated: bool
+
+    @property
+    def units(self) -> str:
+        """``"m"`` or ``"px"``: unit of drift, velocity (per s) and covariance."""
+        return "m" if self.calibrated else "px"
+
+    @property
+    def raster(self) -> RasterDrift:
+        """The drift during this frame, as :class:`~semcal_ros.core.rectify.Rectifier` wants it."""
+        return RasterDrift(self.drift_m, self.velocity_m_s)
