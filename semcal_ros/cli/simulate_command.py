@@ -25,6 +25,7 @@ from semcal_ros.synthetic import (
     drift_plan,
     drift_preset,
     preset,
+    steps_plan,
     truth_of,
     zoom_plan,
 )
@@ -39,15 +40,15 @@ _FRAME_ID = "sem_optical"
 
 @click.command("simulate")
 @click.argument("output", type=click.Path(path_type=Path))
-@click.option("--plan", type=click.Choice(["grid", "drift", "zoom"]), default="grid", show_default=True,
-              help="Chess grid at many poses, one place under drift, or a magnification sweep.")
+@click.option("--plan", type=click.Choice(["grid", "drift", "steps", "zoom"]), default="grid", show_default=True,
+              help="Chess grid at many poses; one place under drift; steps or a sweep of the magnification.")
 @click.option("--preset", "name", type=click.Choice(sorted(PRESETS)), default="jsm820", show_default=True)
-@click.option("--specimen", type=click.Choice(SPECIMEN_KINDS), help="drift and zoom: what is seen.")
+@click.option("--specimen", type=click.Choice(SPECIMEN_KINDS), help="All but grid: what is seen.")
 @click.option("--drift", "drift_name", type=click.Choice(sorted(DRIFTS)), help="Drift of the specimen.")
 @click.option("--magnification", "magnifications", type=float, multiple=True,
-              help="grid: repeat for each; drift: one; zoom: first and last.")
+              help="grid, steps: repeat for each; drift: one; zoom: first and last.")
 @click.option("--views", type=click.IntRange(1), default=5, show_default=True, help="grid: poses each.")
-@click.option("--frames", type=click.IntRange(1), help="drift and zoom: number of frames.")
+@click.option("--frames", type=click.IntRange(1), help="drift, zoom: number of frames; steps: of each step.")
 @click.option("--size", type=click.IntRange(32, 8192), default=512, show_default=True, help="Width and height.")
 @click.option("--bits", type=click.Choice(["8", "16"]), default="8", show_default=True)
 @click.option("--electrons", type=click.FloatRange(0), help="Per pixel; 0 for no shot noise.")
@@ -124,6 +125,15 @@ def _planned(
             frames=frames or 48,
             kind=specimen or "gold",
             drift=drift_preset(drift_name or "settling"),
+            detector=detector,
+            seed=seed,
+        )
+    elif plan == "steps":
+        made = steps_plan(
+            microscope,
+            magnifications=magnifications or (500.0, 2000.0, 8000.0),
+            frames=frames or 12,
+            kind=specimen or "grid",
             detector=detector,
             seed=seed,
         )

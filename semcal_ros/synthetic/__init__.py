@@ -20,6 +20,7 @@ from semcal_ros.synthetic.plans import (
     calibration_plan,
     drift_plan,
     specimen_for,
+    steps_plan,
     zoom_plan,
 )
 from semcal_ros.synthetic.pose import Pose, random_poses
@@ -65,6 +66,7 @@ __all__ = [
     "render_reflectivity",
     "specimen_for",
     "square_for",
+    "steps_plan",
     "truth_of",
     "zoom_plan",
 ]

@@ -26,6 +26,7 @@ __all__ = [
     "calibration_plan",
     "drift_plan",
     "specimen_for",
+    "steps_plan",
     "zoom_plan",
 ]
 
@@ -197,6 +198,29 @@ def zoom_plan(
     sweep = np.geomspace(first_magnification, last_magnification, frames).round(1)
     tilted = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
     return _fixed_pose(microscope, sweep.tolist(), kind, interval_s, drift, tilted, detector, seed)
+
+
+def steps_plan(
+    microscope: VirtualMicroscope,
+    *,
+    magnifications: Sequence[float] = (500.0, 2000.0, 8000.0),
+    frames: int = 12,
+    kind: str = "grid",
+    drift: DriftFunction = DRIFTS["fast"],
+    pose: Pose | None = None,
+    detector: Detector | None = None,
+    seed: int = 0,
+) -> RecordingPlan:
+    """``frames`` at each of several magnifications without a pause, each on the grid region that suits it."""
+    _require_positive("frames", frames)
+    plane = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
+    period_s = microscope.timing.acquisition_time_s
+    planned: list[PlannedFrame] = []
+    for g in magnifications:
+        _, square_m = specimen_for(kind, microscope.nominal_pixel_size_m(g), microscope.width)
+        for _ in range(frames):
+            planned.append(PlannedFrame(period_s * len(planned), float(g), plane, square_m))
+    return RecordingPlan(microscope, kind, tuple(planned), drift, detector or Detector(), seed)
 
 
 def _fixed_pose(

@@ -1,0 +1,137 @@
+"""Start the suite's nodes as processes of their own, replay a recording to them, collect what they publish."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from ament_index_python.packages import get_package_prefix
+from rcl_interfaces.srv import GetParameters
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64MultiArray
+
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message
+
+NODES = ("parameter_server", "drift_compensator", "stream_corrector")
+IMAGES = ("image_raw", "image_stabilized", "image_rect")
+TIMEOUT_S = 60.0
+
+
+@dataclass
+class Received:
+    """Messages by topic; images by header stamp in ns."""
+
+    images: dict[str, dict[int, np.ndarray]] = field(default_factory=lambda: {t: {} for t in IMAGES})
+    camera_infos: dict[int, CameraInfo] = field(default_factory=dict)
+    projections: list[Float64MultiArray] = field(default_factory=list)
+
+    def counts(self) -> dict[str, int]:
+        """Number of messages per topic."""
+        return {
+            **{topic: len(images) for topic, images in self.images.items()},
+            "camera_info": len(self.camera_infos),
+            "projection": len(self.projections),
+        }
+
+
+class LiveSuite:
+    """Context manager around the node processes and this process's own subscriber."""
+
+    def __init__(self, logs: Path, *, config: str, calibration: Path) -> None:
+        # A domain of its own, so that the demo neither hears nor disturbs anybody else's robots.
+        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        self._executables = Path(get_package_prefix("semcal_ros")) / "lib" / "semcal_ros"
+        self._logs = logs
+        self._parameters = {"config": config, "calibration": str(calibration.absolute())}
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> LiveSuite:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        for name in NODES:
+            parameters = dict(self._parameters)
+            if name == "drift_compensator":
+                del parameters["calibration"]
+            self._start(name, parameters)
+        rclpy.init()
+        self._node = rclpy.create_node("demo", namespace="/sem")
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for process in self._processes:
+            process.send_signal(signal.SIGINT)
+        for process in self._processes:
+            process.wait(TIMEOUT_S)
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def _start(self, name: str, parameters: dict[str, str]) -> None:
+        command = [str(self._executables / name), "--ros-args", "-r", "__ns:=/sem"]
+        for key, value in parameters.items():
+            command += ["-p", f"{key}:={value}"]
+        with open(self._logs / f"{name}.log", "wb") as log:
+            self._processes.append(subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT))
+
+    def replay(self, bag: Path, *, frames: int, rate: float) -> Received:
+        """Replay a recording; returns what arrived once every frame has come through, or time is up."""
+        received = Received()
+        self._subscribe(received)
+        self._start(
+            "bag_player",
+            {
+                "bag": str(bag.absolute()),
+                "rate": str(rate),
+                # drift_compensator, stream_corrector and this process
+                "wait_for_subscribers": "3",
+            },
+        )
+        self._spin_until(
+            lambda: min(received.counts()[t] for t in (*IMAGES, "camera_info")) >= frames
+        )
+        return received
+
+    def _subscribe(self, received: Received) -> None:
+        reliable = QoSProfile(depth=50)
+
+        def keep(topic: str) -> Callable[[Image], None]:
+            def store(message: Image) -> None:
+                received.images[topic][stamp_ns_from_msg(message)] = image_from_message(message).copy()
+
+            return store
+
+        def keep_info(message: CameraInfo) -> None:
+            received.camera_infos[stamp_ns_from_msg(message)] = message
+
+        for topic in IMAGES:
+            self._node.create_subscription(Image, topic, keep(topic), reliable)
+        self._node.create_subscription(CameraInfo, "camera_info", keep_info, reliable)
+        self._node.create_subscription(
+            Float64MultiArray, "projection", received.projections.append, reliable
+        )
+
+    def _spin_until(self, done: Callable[[], Any]) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not done():
+            if time.monotonic() > deadline:
+                print(f"  gave up after {TIMEOUT_S:g} s: not every frame came through")
+                return
+            rclpy.spin_once(self._node, timeout_sec=0.1)
+
+    def parameter(self, name: str) -> list[float]:
+        """Value of a continuous parameter of the parameter server."""
+        client = self._node.create_client(GetParameters, "parameter_server/get_parameters")
+        if not client.wait_for_service(timeout_sec=TIMEOUT_S):
+            raise RuntimeError("the parameter server does not answer")
+        future = client.call_async(GetParameters.Request(names=[name]))
+        rclpy.spin_until_future_complete(self._node, future, timeout_sec=TIMEOUT_S)
+        return list(future.result().values[0].double_array_value)
