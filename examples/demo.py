@@ -51,7 +51,9 @@ def calibrate() -> Path:
     """Steps 1 and 2."""
     magnifications = [x for g in CALIBRATED for x in ("--magnification", g)]
     semcal("simulate", OUTPUT / "grid", "--plan", "grid", "--views", 4, *magnifications)
-    semcal("calibrate", OUTPUT / "grid", "-o", OUTPUT / "cal.yaml", "--report", OUTPUT / "report.html")
+    semcal(
+        "calibrate", OUTPUT / "grid", "-o", OUTPUT / "cal.yaml", "--report", OUTPUT / "report.html"
+    )
     semcal("at", OUTPUT / "cal.yaml", 5250)
     return OUTPUT / "cal.yaml"
 
@@ -59,7 +61,17 @@ def calibrate() -> Path:
 def replay(calibration: Path) -> Received:
     """Step 3: the nodes on a replay, as processes of their own."""
     magnifications = [x for g in REPLAYED for x in ("--magnification", g)]
-    semcal("simulate", OUTPUT / "replay", "--plan", "steps", "--frames", FRAMES, "--drift", "fast", *magnifications)
+    semcal(
+        "simulate",
+        OUTPUT / "replay",
+        "--plan",
+        "steps",
+        "--frames",
+        FRAMES,
+        "--drift",
+        "fast",
+        *magnifications,
+    )
     print("\nNodes on the replay:", flush=True)
     with LiveSuite(OUTPUT / "logs", config="virtual_sem", calibration=calibration) as suite:
         received = suite.replay(OUTPUT / "replay", frames=FRAMES * len(REPLAYED), rate=2.0)
@@ -70,7 +82,9 @@ def replay(calibration: Path) -> Received:
     return received
 
 
-def reprojection_rms(images: dict[int, np.ndarray], reference: int, view: GridView, cal: Calibration) -> float:
+def reprojection_rms(
+    images: dict[int, np.ndarray], reference: int, view: GridView, cal: Calibration
+) -> float:
     """RMS px between the corners of ``images`` and where the grid of the reference frame is.
 
     The pose of the grid is fitted once, to the corrected reference frame under the ideal (undistorted) camera, so what
@@ -79,7 +93,9 @@ def reprojection_rms(images: dict[int, np.ndarray], reference: int, view: GridVi
     camera = replace(cal.at(view.magnification), xi_r=0.0, xi_t=0.0)
     fit = fit_poses([view], lambda g: camera)
     rotation, translation = fit.rotations[0], fit.translations_m[0]
-    h = camera.P_affine @ np.vstack([np.column_stack([rotation[:, :2], translation]), [0.0, 0.0, 1.0]])
+    h = camera.P_affine @ np.vstack(
+        [np.column_stack([rotation[:, :2], translation]), [0.0, 0.0, 1.0]]
+    )
     square = np.median(np.diff(np.unique(view.board_xy_m[:, 0].round(12))))
     errors = []
     for image in images.values():
@@ -119,17 +135,24 @@ def main() -> int:
     cal = Calibration.load(calibration)
     rms = measure(received, cal)
 
-    print("\nRMS reprojection error in px, grid corners in the live images, magnifications never calibrated:")
+    print(
+        "\nRMS reprojection error in px, grid corners in the live images, magnifications never calibrated:"
+    )
     print(f"{'':40}" + "".join(f"{g:>8}x" for g in REPLAYED) + "      all   paper")
     rows = []
     for topic, (label, paper) in STAGES.items():
         total = float(np.sqrt(np.mean(np.square(rms[topic]))))
         rows.append(DemoRow(label, total, paper))
         printed = f"{paper:g}" if isinstance(paper, float) else "-".join(f"{p:g}" for p in paper)
-        print(f"{label:40}" + "".join(f"{v:9.3f}" for v in rms[topic]) + f"{total:9.3f}   {printed}")
+        print(
+            f"{label:40}" + "".join(f"{v:9.3f}" for v in rms[topic]) + f"{total:9.3f}   {printed}"
+        )
 
     last = max(received.images["image_rect"])
-    pictures = [(f"{label}: last frame", received.images[topic][last]) for topic, (label, _) in STAGES.items()]
+    pictures = [
+        (f"{label}: last frame", received.images[topic][last])
+        for topic, (label, _) in STAGES.items()
+    ]
     for topic in STAGES:
         cv2.imwrite(str(OUTPUT / f"{topic}.png"), received.images[topic][last])
     correction_report(
@@ -142,7 +165,9 @@ def main() -> int:
             "The grid's pose is fitted once per magnification, to the first corrected frame.",
         ],
     )
-    print(f"\nLook at {OUTPUT}/report.html and {OUTPUT}/correction.html ({time.monotonic() - started:.0f} s)")
+    print(
+        f"\nLook at {OUTPUT}/report.html and {OUTPUT}/correction.html ({time.monotonic() - started:.0f} s)"
+    )
     return 0
 
 

@@ -31,7 +31,9 @@ TIMEOUT_S = 60.0
 class Received:
     """Messages by topic; images by header stamp in ns."""
 
-    images: dict[str, dict[int, np.ndarray]] = field(default_factory=lambda: {t: {} for t in IMAGES})
+    images: dict[str, dict[int, np.ndarray]] = field(
+        default_factory=lambda: {t: {} for t in IMAGES}
+    )
     camera_infos: dict[int, CameraInfo] = field(default_factory=dict)
     projections: list[Float64MultiArray] = field(default_factory=list)
 
@@ -105,7 +107,9 @@ class LiveSuite:
 
         def keep(topic: str) -> Callable[[Image], None]:
             def store(message: Image) -> None:
-                received.images[topic][stamp_ns_from_msg(message)] = image_from_message(message).copy()
+                received.images[topic][stamp_ns_from_msg(message)] = image_from_message(
+                    message
+                ).copy()
 
             return store
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
 _MAX_TEXT = 64 * 1024 * 1024
-_HEADER = "# Calibration of a scanning electron microscope. SI units; one function of the magnification per parameter.\n"
+_HEADER = "# Calibration of a scanning electron microscope as functions of the magnification. SI units.\n"
 
 # libyaml where it was built in: 20 times faster on the covariance.
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -94,7 +94,9 @@ class Calibration(CalibrationModel):
         _check_schema(data, source)
         try:
             return cls(
-                functions={name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES},
+                functions={
+                    name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES
+                },
                 covariance=_covariance_from(data["covariance"]),
                 image_width=data["image_width_px"],
                 image_height=data["image_height_px"],
@@ -125,7 +127,9 @@ class Calibration(CalibrationModel):
                 "upper_rows": [row[i:].tolist() for i, row in enumerate(self.covariance)],
             },
         }
-        body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
+        body: str = yaml.dump(
+            data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None
+        )
         return _HEADER + body
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -152,7 +156,7 @@ def _parsed(text: str, source: str) -> Any:
             f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
         )
     try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 - _Loader is a safe loader
+        return yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark is not None else ""
@@ -172,7 +176,9 @@ def _check_kind(data: Any, source: str) -> None:
         )
     version = data.get("version")
     if version != FILE_VERSION or isinstance(version, bool):
-        newer = isinstance(version, int) and not isinstance(version, bool) and version > FILE_VERSION
+        newer = (
+            isinstance(version, int) and not isinstance(version, bool) and version > FILE_VERSION
+        )
         raise CalibrationFileError(
             f"{source}: file version {version!r}",
             expected=f"version {FILE_VERSION}",
@@ -229,7 +235,9 @@ def _covariance_from(data: Mapping[str, Any]) -> Array:
         upper[i, i:] = row
     matrix = upper + np.triu(upper, 1).T
     if not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
-        raise InvalidValueError("a covariance that is none", expected="finite numbers, variances >= 0")
+        raise InvalidValueError(
+            "a covariance that is none", expected="finite numbers, variances >= 0"
+        )
     return matrix
 
 

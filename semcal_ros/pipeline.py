@@ -107,7 +107,9 @@ def find_views(
     rejected: list[RejectedView] = []
     workers = os.cpu_count() or 1
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # the frames are the parallel work; threads inside OpenCV would only compete
+    cv2.setNumThreads(
+        1
+    )  # the frames are the parallel work; threads inside OpenCV would only compete
     try:
         with ThreadPoolExecutor(workers) as pool:
             for batch in _in_batches(frames, 4 * workers):
@@ -179,9 +181,7 @@ def calibrate_found(
     options: MethodOptions | None = None,
 ) -> RecordingCalibration:
     """Calibrate from images whose corners have been found."""
-    collected = collect_views(
-        found, rejected, display_width_m=display_width_m, squares_m=squares_m
-    )
+    collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
     result = calibrate_views(
         collected.views,
         image_size=collected.image_size,
@@ -226,7 +226,9 @@ def calibrate_recording(
         If its images do not allow a calibration.
     """
     with open_recording(path, config) as recording:
-        frames = ((f"frame {i}", f.image, f.magnification) for i, f in enumerate(recording.frames()))
+        frames = (
+            (f"frame {i}", f.image, f.magnification) for i, f in enumerate(recording.frames())
+        )
         found, rejected = find_views(frames, on_progress=on_progress)
     return calibrate_found(
         found,

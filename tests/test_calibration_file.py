@@ -16,7 +16,9 @@ from semcal_ros.synthetic import preset
 @pytest.fixture(scope="module", params=["joint", "discrete", "pda"])
 def calibration(request):
     microscope = preset("jsm820")
-    views = grid_views(microscope.camera_at, [500.0, 1000.0, 2000.0, 4000.0], views=3, noise_px=0.05)
+    views = grid_views(
+        microscope.camera_at, [500.0, 1000.0, 2000.0, 4000.0], views=3, noise_px=0.05
+    )
     result = calibrate_views(
         views, image_size=(512, 512), display_width_m=0.12, method=request.param
     )
@@ -71,7 +73,9 @@ def test_wrong_files_are_refused_in_one_line(calibration, edit, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "{", "a: [1, 2", "- 1", "!!python/object:os.system x", "\x00", "7"])
+@pytest.mark.parametrize(
+    "text", ["", "{", "a: [1, 2", "- 1", "!!python/object:os.system x", "\x00", "7"]
+)
 def test_foreign_text_is_refused(text):
     with pytest.raises(CalibrationFileError):
         Calibration.loads(text)

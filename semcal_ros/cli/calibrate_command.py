@@ -16,11 +16,15 @@ __all__ = ["command"]
 
 @click.command("calibrate")
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Calibration file.")
+@click.option(
+    "-o", "--output", required=True, type=click.Path(path_type=Path), help="Calibration file."
+)
 @config_option
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
 @click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
-@click.option("--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE.")
+@click.option(
+    "--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE."
+)
 @click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
 @click.option("--report", type=click.Path(path_type=Path), help="Also write an HTML report.")
 def command(

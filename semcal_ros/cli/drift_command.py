@@ -40,7 +40,9 @@ def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) ->
 @click.command("drift")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="CSV file.")
-@click.option("--calibration", type=click.Path(path_type=Path), help="Work in rectified coordinates.")
+@click.option(
+    "--calibration", type=click.Path(path_type=Path), help="Work in rectified coordinates."
+)
 @config_option
 def command(recording: Path, output: Path, calibration: Path | None, config: str) -> None:
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
@@ -61,14 +63,18 @@ def command(recording: Path, output: Path, calibration: Path | None, config: str
     table.writerow(_COLUMNS)
     states: Counter[str] = Counter()
     first: int | None = None
-    with open_recording(recording, microscope) as opened, progress(
-        opened.frame_count, "drift"
-    ) as bar:
+    with (
+        open_recording(recording, microscope) as opened,
+        progress(opened.frame_count, "drift") as bar,
+    ):
         for frame in opened.frames():
             first = frame.stamp_ns if first is None else first
             camera = camera_of(frame, model, microscope)
             update = tracker.update(
-                to_gray(frame.image), start_time_s(frame, first, microscope), camera, microscope.scan
+                to_gray(frame.image),
+                start_time_s(frame, first, microscope),
+                camera,
+                microscope.scan,
             )
             table.writerow(_row(frame.stamp_ns, update))
             states[update.status] += 1

@@ -14,7 +14,9 @@ __all__ = ["command"]
 
 @click.command("play")
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--rate", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True)
+@click.option(
+    "--rate", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True
+)
 @click.option("--loop", is_flag=True, help="Start again at the end.")
 @click.option("--paused", is_flag=True, help="Wait for a call of ~/pause.")
 @click.option("--no-clock", is_flag=True, help="Do not publish /clock.")

@@ -94,7 +94,10 @@ class _Output:
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Bag to make.")
 @click.option("--no-drift", is_flag=True, help="Leave drift in; correct distortion only.")
 @click.option(
-    "--interpolation", type=click.Choice(["linear", "cubic", "lanczos4"]), default="linear", show_default=True
+    "--interpolation",
+    type=click.Choice(["linear", "cubic", "lanczos4"]),
+    default="linear",
+    show_default=True,
 )
 @click.option("--namespace", default="/sem", show_default=True, help="Of the topics in the output.")
 @config_option

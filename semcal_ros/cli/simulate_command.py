@@ -40,16 +40,40 @@ _FRAME_ID = "sem_optical"
 
 @click.command("simulate")
 @click.argument("output", type=click.Path(path_type=Path))
-@click.option("--plan", type=click.Choice(["grid", "drift", "steps", "zoom"]), default="grid", show_default=True,
-              help="Chess grid at many poses; one place under drift; steps or a sweep of the magnification.")
-@click.option("--preset", "name", type=click.Choice(sorted(PRESETS)), default="jsm820", show_default=True)
+@click.option(
+    "--plan",
+    type=click.Choice(["grid", "drift", "steps", "zoom"]),
+    default="grid",
+    show_default=True,
+    help="Chess grid at many poses; one place under drift; steps or a sweep of the magnification.",
+)
+@click.option(
+    "--preset", "name", type=click.Choice(sorted(PRESETS)), default="jsm820", show_default=True
+)
 @click.option("--specimen", type=click.Choice(SPECIMEN_KINDS), help="All but grid: what is seen.")
-@click.option("--drift", "drift_name", type=click.Choice(sorted(DRIFTS)), help="Drift of the specimen.")
-@click.option("--magnification", "magnifications", type=float, multiple=True,
-              help="grid, steps: repeat for each; drift: one; zoom: first and last.")
-@click.option("--views", type=click.IntRange(1), default=5, show_default=True, help="grid: poses each.")
-@click.option("--frames", type=click.IntRange(1), help="drift, zoom: number of frames; steps: of each step.")
-@click.option("--size", type=click.IntRange(32, 8192), default=512, show_default=True, help="Width and height.")
+@click.option(
+    "--drift", "drift_name", type=click.Choice(sorted(DRIFTS)), help="Drift of the specimen."
+)
+@click.option(
+    "--magnification",
+    "magnifications",
+    type=float,
+    multiple=True,
+    help="grid, steps: repeat for each; drift: one; zoom: first and last.",
+)
+@click.option(
+    "--views", type=click.IntRange(1), default=5, show_default=True, help="grid: poses each."
+)
+@click.option(
+    "--frames", type=click.IntRange(1), help="drift, zoom: number of frames; steps: of each step."
+)
+@click.option(
+    "--size",
+    type=click.IntRange(32, 8192),
+    default=512,
+    show_default=True,
+    help="Width and height.",
+)
 @click.option("--bits", type=click.Choice(["8", "16"]), default="8", show_default=True)
 @click.option("--electrons", type=click.FloatRange(0), help="Per pixel; 0 for no shot noise.")
 @click.option("--blur", type=click.FloatRange(0), help="Sigma of the beam in px.")
@@ -99,7 +123,9 @@ def _check_magnifications(plan: str, values: tuple[float, ...]) -> None:
         raise click.BadParameter("magnifications are finite and greater than 0")
     wanted = {"drift": (0, 1), "zoom": (0, 2)}.get(plan)
     if wanted is not None and len(values) not in wanted:
-        raise click.BadParameter(f"--plan {plan} takes {wanted[1]} --magnification, not {len(values)}")
+        raise click.BadParameter(
+            f"--plan {plan} takes {wanted[1]} --magnification, not {len(values)}"
+        )
 
 
 def _planned(
@@ -155,9 +181,10 @@ def _planned(
 
 def _record(recording: RecordingPlan, output: Path, overwrite: bool) -> None:
     magnification = None
-    with BagWriter(output, overwrite=overwrite) as writer, progress(
-        len(recording), "simulating"
-    ) as bar:
+    with (
+        BagWriter(output, overwrite=overwrite) as writer,
+        progress(len(recording), "simulating") as bar,
+    ):
         writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
         for index, frame in enumerate(recording.frames):
             stamp_ns = _START_NS + round(frame.start_time_s * 1e9)

@@ -11,7 +11,7 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,15 @@ from semcal_ros.core.poses import cross_matrices, rotations_from_vectors
 from semcal_ros.core.projection import project_points, project_points_with_jacobians
 from semcal_ros.core.views import GridView
 
-__all__ = ["BundleResult", "Problem", "State", "make_problem", "refine", "residuals", "theta_system"]
+__all__ = [
+    "BundleResult",
+    "Problem",
+    "State",
+    "make_problem",
+    "refine",
+    "residuals",
+    "theta_system",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

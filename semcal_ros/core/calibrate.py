@@ -236,14 +236,14 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
         )
         if method == "discrete":
             return table_functions(part.magnifications, part.parameters, part.covariances)
-        return pda_functions(
-            part, order=options.pda_order, legendre_degree=options.legendre_degree
-        )
+        return pda_functions(part, order=options.pda_order, legendre_degree=options.legendre_degree)
 
     count = len(setup.magnifications)
     functions, covariance = functions_of(np.ones(count, dtype=bool))
     failed = [
-        f"{g:g}" for g, r in zip(setup.magnifications, discrete.results, strict=True) if not r.converged
+        f"{g:g}"
+        for g, r in zip(setup.magnifications, discrete.results, strict=True)
+        if not r.converged
     ]
     warnings = [f"no convergence at magnification {', '.join(failed)}"] if failed else []
     details = {
@@ -312,7 +312,10 @@ def _data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
     middle = model.at(float(np.sqrt(np.prod(model.magnification_range))))
     assert middle.covariance is not None
     sigma = np.sqrt(np.diag(middle.covariance))
-    for index, name, label in ((3, "px", "principal point"), (5, "rho", "distance of the scan pivot")):
+    for index, name, label in (
+        (3, "px", "principal point"),
+        (5, "rho", "distance of the scan pivot"),
+    ):
         if sigma[index] > 0.8 * setup.prior_of(name)[1]:
             warnings.append(f"the views do not determine the {label}; it is held by its prior")
     counts = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
@@ -342,7 +345,9 @@ def _statistics(
                 "views": int(sum(v.magnification == g for v in setup.views)),
                 "rms_px": rms[float(g)],
                 "held_out_rms_px": held_out.get(float(g)),
-                "held_out_extrapolated": bool(g in (setup.magnifications[0], setup.magnifications[-1])),
+                "held_out_extrapolated": bool(
+                    g in (setup.magnifications[0], setup.magnifications[-1])
+                ),
             }
             for g in setup.magnifications
         ],

@@ -95,7 +95,9 @@ class ScanCamera:
     def __post_init__(self) -> None:
         values = np.append(self.parameters, [self.magnification, self.norm_px])
         if not np.all(np.isfinite(values)):
-            raise InvalidValueError(f"camera parameters {values.tolist()}", expected="finite numbers")
+            raise InvalidValueError(
+                f"camera parameters {values.tolist()}", expected="finite numbers"
+            )
         for name in ("magnification", "m", "aspect", "norm_px", "width", "height"):
             if not getattr(self, name) > 0:
                 raise InvalidValueError(
@@ -163,7 +165,7 @@ class ScanCamera:
             self.parameters, as_points(xyz_m, 3), self.norm_px
         ).d_parameters
         variance = np.einsum("nip,pq,niq->ni", jacobian, self.covariance, jacobian)
-        return np.sqrt(np.maximum(variance, 0.0))
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
 
     def sem_from_ideal(self, xy: ArrayLike, z_m: float = 0.0) -> Array:
         """Sem-frame points (n, 3) in m at height ``z_m`` that are seen at undistorted pixels (n, 2)."""

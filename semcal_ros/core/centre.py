@@ -1,8 +1,8 @@
 """Evidence of radial distortion and its centre (Algorithm 1 of the paper).
 
 The centre is the common left epipole of the radial fundamental matrices between a plane and its images (Hartley and
-Kang 2007, doi:10.1109/TPAMI.2007.1147). Without distortion the matrices are arbitrary. The paper detects that by an error
-below 1e-3 px, which no real corner reaches; here an F-test asks whether the plane's homography leaves anything but
+Kang 2007, doi:10.1109/TPAMI.2007.1147). Without distortion the matrices are arbitrary. The paper detects that by an
+error below 1e-3 px, which no real corner reaches; here an F-test asks whether the plane's homography leaves anything but
 noise, and the fixed threshold stays as an option.
 """
 
@@ -60,7 +60,9 @@ def _radial_fundamental(board: Array, image: Array, from_image: Array) -> Array:
     Normalised 8-point algorithm. ``from_image`` normalises the image of all views alike, so that their matrices share
     the left epipole.
     """
-    b = np.column_stack([transform_points(normalising_similarity(board), board), np.ones(len(board))])
+    b = np.column_stack(
+        [transform_points(normalising_similarity(board), board), np.ones(len(board))]
+    )
     x = np.column_stack([transform_points(from_image, image), np.ones(len(image))])
     rows = (x[:, :, None] * b[:, None, :]).reshape(len(b), 9)
     _, vectors = np.linalg.eigh(rows.T @ rows)

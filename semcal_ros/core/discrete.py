@@ -96,7 +96,11 @@ def _fit_one(setup: Setup, tau_px: float | None) -> tuple[DistortionCentre, Prob
     # A centre outside of the image is noise; the adjustment then starts from the middle.
     inside = np.all((centre.centre_px > 0) & (centre.centre_px < np.array(setup.image_size)))
     ex, ey = centre.centre_px if inside else setup.centre_px
-    return centre, problem, adjust(problem, _with(pinhole.state, {"ex": float(ex), "ey": float(ey)}))
+    return (
+        centre,
+        problem,
+        adjust(problem, _with(pinhole.state, {"ex": float(ex), "ey": float(ey)})),
+    )
 
 
 def fit_discrete(setup: Setup, *, tau_px: float | None = None) -> DiscreteFit:

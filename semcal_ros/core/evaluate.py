@@ -85,7 +85,9 @@ def fit_poses(
     fits = [
         refine(
             problem,
-            State(np.ones(1), np.stack([r[k] for r, _ in starts]), np.stack([t[k] for _, t in starts])),
+            State(
+                np.ones(1), np.stack([r[k] for r, _ in starts]), np.stack([t[k] for _, t in starts])
+            ),
             fixed_theta=True,
         )
         for k in (0, 1)
@@ -100,9 +102,16 @@ def fit_poses(
     return _best_of(usable, problem.starts, magnifications[problem.group])
 
 
-def _best_of(fits: Sequence[BundleResult], starts: NDArray[np.intp], magnifications: Array) -> PoseFit:
+def _best_of(
+    fits: Sequence[BundleResult], starts: NDArray[np.intp], magnifications: Array
+) -> PoseFit:
     costs = np.stack(
-        [np.add.reduceat(np.sum(f.residuals_px**2 * f.huber_weight[:, None], axis=1), starts[:-1]) for f in fits]
+        [
+            np.add.reduceat(
+                np.sum(f.residuals_px**2 * f.huber_weight[:, None], axis=1), starts[:-1]
+            )
+            for f in fits
+        ]
     )
     best = np.argmin(costs, axis=0)
     return PoseFit(

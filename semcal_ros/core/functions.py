@@ -46,9 +46,7 @@ def _ode_row(value: float, weights: Array) -> Array:
     return np.asarray(expm(companion * value)[0], dtype=np.float64)
 
 
-def basis_row(
-    kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array
-) -> Array:
+def basis_row(kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array) -> Array:
     """(size,) values of the basis functions at a magnification inside of ``g_range``."""
     low, high = g_range
     if kind == "chebyshev_log":
@@ -128,7 +126,8 @@ class ContinuousFunction:
         inner = basis_row(
             self.kind, self.size, edge * float(np.exp(step)), self.g_range, self.shape
         )
-        return row + (inner - row) / step * float(np.log(g / edge))
+        tangent = (inner - row) / step
+        return np.asarray(row + tangent * np.log(g / edge), dtype=np.float64)
 
     def __call__(self, g: float) -> float:
         """Value at the magnification ``g``."""

@@ -85,7 +85,9 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     principal = np.array([camera.px, camera.py])
     centre = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
     affine = view_affine(view.board_xy_m[known], ideal[known], centre)
-    metric = np.linalg.solve(camera.ideal_from_sem_jacobian, affine.matrix)
+    metric = np.asarray(
+        np.linalg.solve(camera.ideal_from_sem_jacobian, affine.matrix), dtype=np.float64
+    )
     rotation = rotation_from_affine(metric, affine.gradient)
     both = np.stack([rotation, mirrored_tilt(rotation[None])[0]])
     offset = np.linalg.solve(camera.ideal_from_sem_jacobian, centre - principal)

@@ -57,7 +57,9 @@ def _height_sigma(result: BundleResult) -> float:
     return float(np.clip(np.sqrt(np.mean(square)), 1e-6, 2e-3))
 
 
-def enriched(functions: Functions, sizes: Mapping[str, tuple[str, int]]) -> dict[str, ContinuousFunction]:
+def enriched(
+    functions: Functions, sizes: Mapping[str, tuple[str, int]]
+) -> dict[str, ContinuousFunction]:
     """Functions of other kinds and sizes through the values of the given ones, by least squares."""
     out: dict[str, ContinuousFunction] = {}
     for name, function in functions.items():
@@ -108,7 +110,9 @@ def fit_joint(setup: Setup) -> JointFit:
         sizes = chosen
         functions = enriched(functions, sizes)
         problem = build_problem(setup, functions, setup.views, _height_sigma(result))
-        result = refine(problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE)
+        result = refine(
+            problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
+        )
         functions = with_coefficients(functions, result.state.theta)
     problem = build_problem(setup, functions, setup.views, _height_sigma(result))
     result = adjust(problem, result.state)

@@ -3,8 +3,8 @@
 Each parameter x(g) is taken to obey a linear differential equation with constant coefficients,
 ``D^k x + w_(k-1) D^(k-1) x + ... + w_0 x = 0`` (16)-(18). Derivatives come from finite differences, the weights w from
 weighted least squares (19)-(21), and the equation is solved through fitted boundary values. Equation (21) is printed as
-``(A'A)^-1 A b``; used is ``-(A'A)^-1 A' b``. The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials of
-degree 3 and 5 prone to oscillate; all of these can be selected here so that the comparison can be repeated.
+``(A'A)^-1 A b``; used is ``-(A'A)^-1 A' b``. The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials
+of degree 3 and 5 prone to oscillate; all of these can be selected here so that the comparison can be repeated.
 """
 
 from __future__ import annotations
@@ -43,7 +43,13 @@ def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Ar
 
 
 def _fitted(
-    name: str, kind: str, size: int, shape: Array, magnifications: Array, values: Array, sigma: Array
+    name: str,
+    kind: str,
+    size: int,
+    shape: Array,
+    magnifications: Array,
+    values: Array,
+    sigma: Array,
 ) -> tuple[ContinuousFunction, Array]:
     g_range = (float(magnifications[0]), float(magnifications[-1]))
     blank = ContinuousFunction(kind, np.zeros(size), g_range, shape)
@@ -95,7 +101,8 @@ def pda_functions(
     g = discrete.magnifications
     if len(g) < needed:
         raise CalibrationError(
-            f"{len(g)} magnifications", expected=f"at least {needed} for this method",
+            f"{len(g)} magnifications",
+            expected=f"at least {needed} for this method",
             do='record more magnifications or use method "joint"',
         )
     position = (g - g[0]) / (g[-1] - g[0])

@@ -128,4 +128,4 @@ def rotation_from_affine(matrix: Array, gradient: Array) -> Array:
 def mirrored_tilt(rotations: Array) -> Array:
     """Rotations (n, 3, 3) with the same view under parallel projection and the opposite tilt."""
     sign = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
-    return rotations * sign
+    return np.asarray(rotations * sign, dtype=np.float64)

@@ -23,7 +23,7 @@ __all__ = [
     "constant_functions",
     "prior_vectors",
     "resolve_mirrored_tilts",
-        "theta_of",
+    "theta_of",
     "variance_factor",
     "with_coefficients",
 ]
@@ -153,9 +153,7 @@ def with_coefficients(functions: Functions, theta: Array) -> dict[str, Continuou
     return out
 
 
-def constant_functions(
-    setup: Setup, values: Mapping[str, float]
-) -> dict[str, ContinuousFunction]:
+def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, ContinuousFunction]:
     """Functions that do not depend on the magnification."""
     g_range = (float(setup.magnifications[0]), float(setup.magnifications[-1]))
     return {

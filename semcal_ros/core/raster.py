@@ -1,7 +1,7 @@
 """When each pixel of a scanned frame was acquired.
 
-The beam visits pixels one after the other, so a frame is no instant: with a frame period ``T`` over ``rows`` lines and a
-flyback that takes the fraction ``f`` of each line, pixel (row, col) of pass ``k`` is seen at
+The beam visits pixels one after the other, so a frame is no instant: with a frame period ``T`` over ``rows`` lines and
+a flyback that takes the fraction ``f`` of each line, pixel (row, col) of pass ``k`` is seen at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 

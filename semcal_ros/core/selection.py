@@ -3,7 +3,8 @@
 An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), which is all that a candidate
 set of functions has to be fitted to. A candidate is judged by leave-one-magnification-out cross-validation on these
 summaries: fitted to all magnifications but one, how much worse does it explain that one's images? The two outermost
-magnifications are never left out, since the calibration does not claim to hold beyond them; there the fit itself counts.
+magnifications are never left out, since the calibration does not claim to hold beyond them; there the fit itself
+counts.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def select_functions(
     candidates = _Candidates(summary, setup, functions)
     limit = min(_MAX_SIZE, len(setup.magnifications) - 1)
     sizes = {name: (functions[name].kind, functions[name].size) for name in FUNCTION_NAMES}
-    sizes.update({name: ("chebyshev_log", 1) for name in free})
+    sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
     while True:
         score = candidates.score(sizes)
         best: tuple[float, str, tuple[str, int]] | None = None

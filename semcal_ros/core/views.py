@@ -47,7 +47,9 @@ class GridView:
         n = len(self.board_xy_m)
         shapes = (self.board_xy_m.shape, self.image_xy.shape, self.sigma_px.shape)
         if shapes != ((n, 2), (n, 2), (n,)):
-            raise InvalidValueError(f"view arrays of shapes {shapes}", expected="(n, 2), (n, 2), (n,)")
+            raise InvalidValueError(
+                f"view arrays of shapes {shapes}", expected="(n, 2), (n, 2), (n,)"
+            )
         if not (np.isfinite(self.magnification) and self.magnification > 0):
             raise InvalidValueError(
                 f"magnification {self.magnification}", expected="a positive number"
@@ -150,14 +152,18 @@ def views_from_detections(
         )
     for detection in detections:
         if not detection.accepted:
-            raise CalibrationError(f"a rejected view ({detection.reason})", expected="accepted views")
+            raise CalibrationError(
+                f"a rejected view ({detection.reason})", expected="accepted views"
+            )
     widths = np.array([d.image_size[0] for d in detections], dtype=np.float64)
     nominal = np.asarray(magnifications, dtype=np.float64) * widths / display_width_m
     spacing = np.array([d.spacing_px for d in detections])
     assignment = assign_squares(spacing, nominal, squares_m)
     labels = names if names is not None else [str(i) for i in range(len(detections))]
     views = tuple(
-        GridView(float(g), d.ij * float(square), d.xy, d.sigma_px, label)
+        GridView(
+            float(g), np.asarray(d.ij * float(square), dtype=np.float64), d.xy, d.sigma_px, label
+        )
         for d, g, square, label in zip(
             detections, magnifications, assignment.square_m, labels, strict=True
         )

@@ -66,7 +66,9 @@ def test_start_away_from_the_truth_converges_to_it(poses):
     theta = np.ones(20)
     theta[[0, 10]] = 1.02
     theta[[6, 7, 16, 17]] = 0.0
-    result = refine(problem, State(theta, turned, poses.translations_m + rng.normal(size=(8, 3)) * 1e-6))
+    result = refine(
+        problem, State(theta, turned, poses.translations_m + rng.normal(size=(8, 3)) * 1e-6)
+    )
     assert result.converged
     assert result.cost == pytest.approx(truth.cost, rel=1e-6)
 
@@ -127,9 +129,7 @@ def test_outliers_lose_their_weight(poses):
 def test_fixed_theta_moves_only_the_poses(poses):
     problem = _problem(0.05)
     theta = np.full(20, 1.001)
-    result = refine(
-        problem, State(theta, poses.rotations, poses.translations_m), fixed_theta=True
-    )
+    result = refine(problem, State(theta, poses.rotations, poses.translations_m), fixed_theta=True)
     assert result.converged
     np.testing.assert_array_equal(result.state.theta, theta)
 

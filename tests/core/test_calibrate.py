@@ -41,7 +41,9 @@ def joint():
     return _calibrate("jsm820")
 
 
-@pytest.mark.parametrize("name", ["jsm820", "no_distortion", "strong_perspective", "parallel", "off_centre"])
+@pytest.mark.parametrize(
+    "name", ["jsm820", "no_distortion", "strong_perspective", "parallel", "off_centre"]
+)
 def test_joint_predicts_magnifications_that_it_never_saw(name):
     result = _calibrate(name)
     # 28 views of about 100 corners with 0.05 px noise: a smooth camera is determined to a fraction of the noise. What
@@ -98,7 +100,9 @@ def test_discrete_finds_no_distortion_where_there_is_none():
         assert result.model.at(g).xi_r == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)])
+@pytest.mark.parametrize(
+    "options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)]
+)
 def test_pda_and_legendre_run_between_the_magnifications(options):
     magnifications = [100.0, *(1000.0 * k for k in range(1, 11))]
     result = _calibrate("jsm820", "pda", options, magnifications, views=3)
@@ -150,5 +154,9 @@ def test_bad_requests_are_refused():
         calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="pda")
     with pytest.raises(InvalidValueError, match="order"):
         calibrate_views(
-            views, image_size=(512, 512), display_width_m=0.12, method="pda", options=MethodOptions(5)
+            views,
+            image_size=(512, 512),
+            display_width_m=0.12,
+            method="pda",
+            options=MethodOptions(5),
         )

@@ -16,7 +16,9 @@ from semcal_ros.core.errors import InvalidValueError
 PLAIN = ScanCamera(
     1000.0, 4e6, 1.0, 0.0, 255.5, 255.5, 50.0, 0.0, 0.0, 255.5, 255.5, 256.0, 512, 512
 )
-BENT = replace(PLAIN, aspect=1.01, skew=0.002, px=240.0, py=262.0, xi_r=0.04, xi_t=-0.01, ex=230.0, ey=271.0)
+BENT = replace(
+    PLAIN, aspect=1.01, skew=0.002, px=240.0, py=262.0, xi_r=0.04, xi_t=-0.01, ex=230.0, ey=271.0
+)
 
 xi_r = st.floats(-0.15, 0.15)
 xi_t = st.floats(-0.02, 0.02)
@@ -178,7 +180,14 @@ def test_sigma_without_covariance_is_refused():
 
 @pytest.mark.parametrize(
     "change",
-    [{"m": 0.0}, {"m": -1.0}, {"aspect": 0.0}, {"px": np.nan}, {"rho": np.inf}, {"magnification": 0.0}],
+    [
+        {"m": 0.0},
+        {"m": -1.0},
+        {"aspect": 0.0},
+        {"px": np.nan},
+        {"rho": np.inf},
+        {"magnification": 0.0},
+    ],
 )
 def test_meaningless_cameras_are_refused(change):
     with pytest.raises(InvalidValueError):

@@ -60,6 +60,8 @@ def test_views_get_metres():
 def test_no_or_rejected_detections_are_refused():
     with pytest.raises(CalibrationError, match="no image"):
         views_from_detections([], [], display_width_m=0.12, squares_m=SQUARES)
-    rejected = _Detection(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0.0, accepted=False, reason="blank")
+    rejected = _Detection(
+        np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0.0, accepted=False, reason="blank"
+    )
     with pytest.raises(CalibrationError, match="blank"):
         views_from_detections([rejected], [100.0], display_width_m=0.12, squares_m=SQUARES)

@@ -1,0 +1,71 @@
+"""What every test gets: a ROS domain of its own, no traces in the home folder, the recordings."""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+# Ids above 101 would use ports from the range that Linux hands out to other programs.
+_DOMAIN_IDS = range(1, 102)
+
+
+def _claim_domain() -> tuple[int, int]:
+    """A ROS domain id that no other test process on this machine holds, and the open lock file.
+
+    The lock lives as long as the process, however that ends.
+    """
+    start = os.getpid() % len(_DOMAIN_IDS)
+    for domain_id in [*_DOMAIN_IDS[start:], *_DOMAIN_IDS[:start]]:
+        path = Path(tempfile.gettempdir()) / f"semcal-ros-domain-{os.getuid()}-{domain_id}.lock"
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            continue
+        return domain_id, lock
+    raise RuntimeError("all ROS domain ids are in use by other test runs; wait for them to end")
+
+
+def _isolate() -> int:
+    domain_id, lock = _claim_domain()
+    logs = tempfile.mkdtemp(prefix="semcal-ros-log-")
+    atexit.register(shutil.rmtree, logs, ignore_errors=True)
+    os.environ.update(
+        ROS_DOMAIN_ID=str(domain_id),
+        ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+        ROS_LOG_DIR=logs,
+        MPLBACKEND="Agg",
+    )
+    # Other people's settings must not decide over the outcome of a test.
+    for name in (
+        "ROS_NAMESPACE",
+        "ROS_STATIC_PEERS",
+        "RMW_IMPLEMENTATION",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "ROS_LOCALHOST_ONLY",
+    ):
+        os.environ.pop(name, None)
+    return lock
+
+
+# Here and not in a fixture: the environment must be set before a test module imports rclpy.
+_DOMAIN_LOCK = _isolate()
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Path:
+    """Folder of the reference recordings, named by SEMCAL_REFERENCE_DATA."""
+    value = os.environ.get("SEMCAL_REFERENCE_DATA")
+    if not value:
+        pytest.skip("SEMCAL_REFERENCE_DATA is not set: no reference recordings")
+    path = Path(value)
+    assert path.is_dir(), f"SEMCAL_REFERENCE_DATA is {value!r}, which is no folder"
+    return path
