@@ -2,8 +2,8 @@
 
 The centre is the common left epipole of the radial fundamental matrices between a plane and its images (Hartley and
 Kang 2007, doi:10.1109/TPAMI.2007.1147). Without distortion the matrices are arbitrary. The paper detects that by an
-error below 1e-3 px, which no real corner reaches; here an F-test asks whether the plane's homography leaves anything but
-noise, and the fixed threshold stays as an option.
+error below 1e-3 px, which no real corner reaches; here an F-test asks whether the plane's homography leaves anything
+but noise, and the fixed threshold stays as an option.
 """
 
 from __future__ import annotations
