@@ -1,0 +1,53 @@
+# Everything here needs only Python 3.10 or newer, git and make. `make help` lists the targets.
+
+ROS_DISTRO ?= jazzy
+PYTEST_ARGS ?=
+VENV_PYTHON := .venv/bin/python
+
+# A sourced ROS installation or another environment of wheels must not leak into this one.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH VIRTUAL_ENV
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
+unexport LD_LIBRARY_PATH
+endif
+
+SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test lint demo bench clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@echo "  ROS_DISTRO=kilted selects ROS 2 Kilted (default: jazzy), PYTHON=... the interpreter."
+
+setup: ## make .venv with everything in it (quick when it is there)
+ifdef PYTHON
+	@command -v "$(PYTHON)" >/dev/null && "$(PYTHON)" -c '$(SUITABLE)' || \
+	  { echo "setup: PYTHON=$(PYTHON) is no Python 3.10 to 3.14; choose another" >&2; exit 2; }
+	@"$(PYTHON)" scripts/setup_env.py --distro "$(ROS_DISTRO)" --this-python
+else
+	@for python in python3 python3.12 python3.13 python3.11 python3.10 python3.14; do \
+	  if $$python -c '$(SUITABLE)' >/dev/null 2>&1; then \
+	    exec $$python scripts/setup_env.py --distro "$(ROS_DISTRO)"; fi; done; \
+	echo "setup: no Python 3.10 to 3.14 on the PATH; install one or call make PYTHON=..." >&2; \
+	exit 2
+endif
+
+lint: setup ## style (ruff) and types (mypy)
+	@$(VENV_PYTHON) -m ruff check .
+	@$(VENV_PYTHON) -m mypy
+
+test: lint ## everything that is checked: style, types, tests
+	@$(VENV_PYTHON) -m pytest -q -W error $(PYTEST_ARGS) tests
+
+demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
+	@$(VENV_PYTHON) examples/demo.py
+
+bench: setup ## the benchmarks, as a table
+	@$(VENV_PYTHON) benchmarks/run.py
+
+clean: ## remove what make and the tools made, .venv too
+	rm -rf .venv .venv-jazzy .venv-kilted .venv.lock build install log demo_output
+	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis semcal_ros.egg-info
+	find semcal_ros tests examples benchmarks launch scripts -name __pycache__ -type d \
+	  -prune -exec rm -rf {} + 2>/dev/null || true
