@@ -1,0 +1,215 @@
+"""Executable ``bag_player``: a recording on its own topics, at any rate, without a ROS installation's tools."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_srvs.srv import SetBool
+
+from semcal_ros.bridge import fill_stamp
+from semcal_ros.core.errors import BagError, ConfigError, SemcalError
+from semcal_ros.files.bags import BagTopic, RawMessage, open_bag
+from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.message_types import message_class
+from semcal_ros.nodes.pacing import Pacer
+from semcal_ros.nodes.qos import overridable, stream_output, value_input
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.settings import Setting
+
+__all__ = ["BagPlayer", "main"]
+
+_SETTINGS = (
+    Setting("bag", "", "Recording: a rosbag2 folder, or an .mcap or .db3 file.", fixed=True),
+    Setting("rate", 1.0, "Speed of the replay.", "s of recording per s", 0.001, 1000.0),
+    Setting("loop", False, "Begin again at the end."),
+    Setting("clock", False, "Publish the time of the recording on /clock.", fixed=True),
+    Setting("start_paused", False, "Wait for ~/pause to be called with false.", fixed=True),
+    Setting(
+        "wait_for_subscribers",
+        0,
+        "Start when every image topic (every topic without one) has so many subscribers.",
+        low=0,
+        high=100,
+        fixed=True,
+    ),
+)
+_TICK_S = 0.02
+_ACK_S = 2.0
+_DEPTH = 10
+
+
+class BagPlayer(SemNode):
+    """Publishes the stored bytes of a recording; the node ends with the recording unless it loops."""
+
+    def __init__(self) -> None:
+        super().__init__("bag_player", _SETTINGS)
+        if not self.settings["bag"]:
+            raise ConfigError(
+                "no recording", expected="the parameter bag", do="give --ros-args -p bag:=PATH"
+            )
+        self.exit_status = 0
+        self._bag = open_bag(self.settings["bag"])
+        self._publishers_by_topic = self._make_publishers()
+        self._clock_publisher = (
+            self.create_publisher(ClockMessage, "/clock", 10) if self.settings["clock"] else None
+        )
+        self._pacer = Pacer(self.settings["rate"], paused=self.settings["start_paused"])
+        self._changed = threading.Condition()
+        self._ended = False
+        self.settings.on_change("rate", self._set_rate)
+        self._service = self.create_service(SetBool, "~/pause", self._on_pause)
+        self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
+        self._thread.start()
+
+    def idle(self) -> bool:
+        """A replay takes no frames in."""
+        return True
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also whether the replay is paused."""
+        return super().conditions() + ["paused"] * self._pacer.paused
+
+    def destroy_node(self) -> None:
+        """Stop the replay first."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join(timeout=5.0)
+        self._bag.close()
+        super().destroy_node()
+
+    # -- topics ------------------------------------------------------------------------------------
+
+    def _make_publishers(self) -> dict[str, Any]:
+        publishers: dict[str, Any] = {}
+        for topic in self._bag.topics:
+            publisher = self._make_publisher(topic)
+            if publisher is not None:
+                publishers[topic.name] = publisher
+        if not publishers:
+            raise BagError(
+                f"{self.settings['bag']} has no topic that can be published",
+                expected="at least one topic of an installed message type",
+            )
+        return publishers
+
+    def _make_publisher(self, topic: BagTopic) -> Any:
+        """Publisher of a topic, or None, counted, where its type is not installed."""
+        try:
+            message_type = message_class(topic.type)
+        except ConfigError as error:
+            self.reject(error)
+            return None
+        source = self.config.magnification
+        is_value = topic.type == source.type and topic.name.endswith("/" + source.topic.lstrip("/"))
+        # A magnification stays valid: who comes later must learn it.
+        profile = value_input(1) if topic.latched or is_value else stream_output(_DEPTH)
+        return self.create_publisher(
+            message_type, topic.name, profile, qos_overriding_options=overridable()
+        )
+
+    # -- control -----------------------------------------------------------------------------------
+
+    def _set_rate(self, rate: float) -> None:
+        with self._changed:
+            self._pacer.advance(time.monotonic())
+            self._pacer.rate = rate
+            self._changed.notify_all()
+
+    def _on_pause(self, request: Any, response: Any) -> Any:
+        with self._changed:
+            self._pacer.advance(time.monotonic())
+            self._pacer.paused = bool(request.data)
+            self._changed.notify_all()
+        response.success = True
+        response.message = "paused" if request.data else "playing"
+        return response
+
+    # -- replay ------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            self._wait_for_subscribers()
+            self._play_once()
+            while self.settings["loop"] and not self._ended:
+                self._play_once()
+            self._flush()
+        except SemcalError as error:
+            self.exit_status = 2
+            self.get_logger().error(str(error))
+        except RuntimeError:
+            # Publishing fails once a signal has shut the middleware down.
+            if self.context.ok():
+                raise
+        finally:
+            if not self._ended:
+                self.context.try_shutdown()
+
+    def _wait_for_subscribers(self) -> None:
+        wanted = self.settings["wait_for_subscribers"]
+        images = [t.name for t in self._bag.topics if t.type == "sensor_msgs/msg/Image"]
+        topics = [
+            name
+            for name in images or self._publishers_by_topic
+            if name in self._publishers_by_topic
+        ]
+        while not self._ended and any(
+            self._publishers_by_topic[name].get_subscription_count() < wanted for name in topics
+        ):
+            self._pause_for(_TICK_S)
+
+    def _pause_for(self, seconds: float) -> None:
+        with self._changed:
+            if not self._ended:
+                self._changed.wait(seconds)
+
+    def _messages(self) -> Iterator[RawMessage]:
+        return self._bag.raw_messages(self._publishers_by_topic)
+
+    def _play_once(self) -> None:
+        with self._changed:
+            self._pacer.seek(self._bag.start_ns)
+        for message in self._messages():
+            if not self._wait_until(message.log_time_ns):
+                return
+            self._publish_clock(message.log_time_ns)
+            self._publishers_by_topic[message.topic].publish(bytes(message.data))
+            self.count_published(None)
+
+    def _wait_until(self, target_ns: int) -> bool:
+        """Wait for a position of the recording; False if the replay shall end."""
+        while True:
+            with self._changed:
+                if self._ended:
+                    return False
+                position_ns = self._pacer.advance(time.monotonic())
+                if position_ns >= target_ns and not self._pacer.paused:
+                    return True
+                delay_s = self._pacer.wait_s(target_ns, _TICK_S)
+            self._publish_clock(min(position_ns, target_ns))
+            self._pause_for(delay_s)
+
+    def _publish_clock(self, position_ns: int) -> None:
+        if self._clock_publisher is not None:
+            message = ClockMessage()
+            fill_stamp(message.clock, position_ns)
+            self._clock_publisher.publish(message)
+
+    def _flush(self) -> None:
+        """Give reliable subscribers the time to get the last messages."""
+        for publisher in [] if self._ended else self._publishers_by_topic.values():
+            publisher.wait_for_all_acked(Duration(seconds=_ACK_S))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(BagPlayer, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

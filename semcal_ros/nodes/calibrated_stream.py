@@ -1,0 +1,54 @@
+"""What the rectifying nodes share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from semcal_ros.bridge import MicroscopeConfig
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.rectify import Rectifier
+from semcal_ros.nodes.calibration_input import CalibrationInput
+from semcal_ros.nodes.outputs import RectifiedOutput
+from semcal_ros.nodes.settings import CALIBRATION, INTERPOLATION, Setting
+from semcal_ros.nodes.stream import Frame, StreamNode
+
+__all__ = ["CalibratedStreamNode"]
+
+
+class CalibratedStreamNode(StreamNode):
+    """A stream node with a calibration, a rectifier, and the outputs ``image_rect`` and ``camera_info``."""
+
+    def __init__(self, name: str, settings: Iterable[Setting] = ()) -> None:
+        super().__init__(name, (CALIBRATION, INTERPOLATION, *settings))
+        self.rectifier = Rectifier(self.settings["interpolation"])
+        self.settings.on_change("interpolation", self._set_interpolation)
+        self.calibration = CalibrationInput(self, on_change=self.on_calibration)
+        self.output = RectifiedOutput(self)
+        self._out_of_range = False
+
+    def on_calibration(self) -> None:
+        """Called when another calibration is in force."""
+
+    def _set_interpolation(self, value: str) -> None:
+        self.rectifier = Rectifier(value)
+
+    @property
+    def effective_config(self) -> MicroscopeConfig:
+        """The configuration with the display width of the calibration in force."""
+        return self.calibration.config
+
+    def camera(self, frame: Frame, magnification: float) -> ScanCamera | None:
+        """Calibrated camera of a frame, or None while there is no calibration."""
+        camera = self.calibration.camera(magnification, *frame.size)
+        self._out_of_range = camera is not None and not camera.in_range
+        self.statistics.note("in_calibrated_range", camera is not None and camera.in_range)
+        return camera
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also whether the calibration is missing or does not reach."""
+        found = super().conditions()
+        if self.calibration.current is None:
+            found.append("uncalibrated")
+        elif self._out_of_range:
+            found.append("magnification outside of the calibrated range")
+        return found

@@ -1,0 +1,57 @@
+"""Executable ``drift_compensator``: the stream without drift, and the drift; it needs no calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.rectify import Rectifier
+from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.outputs import DriftOutput, ImageOutput
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.settings import INTERPOLATION
+from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode
+
+__all__ = ["DriftCompensator", "main"]
+
+
+class DriftCompensator(StreamNode):
+    """Publishes ``image_stabilized``, ``drift`` and ``drift_velocity``.
+
+    Metres come from the display width of the configuration; the distortion stays in the images.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("drift_compensator", (INTERPOLATION, *DRIFT_SETTINGS))
+        self._rectifier = Rectifier(self.settings["interpolation"])
+        self.settings.on_change("interpolation", self._set_interpolation)
+        self._drift = LiveDrift(self)
+        self._images = ImageOutput(self, "image_stabilized")
+        self._drifts = DriftOutput(self)
+        self._input = FrameInput(self, self._on_frame)
+
+    def _set_interpolation(self, value: str) -> None:
+        self._rectifier = Rectifier(value)
+
+    def _on_frame(self, frame: Frame) -> None:
+        g = self.known_magnification(frame)
+        if g is None:
+            return
+        camera = ScanCamera.nominal(g, *frame.size, self.config.display_width_m)
+        drift = self._drift.update(frame, camera)
+        image = self._rectifier.rectify(frame.image, camera, drift.raster, self.config.scan)
+        self._images.publish(image, frame)
+        self._drifts.publish(drift, frame)
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also whether the drift is only predicted."""
+        return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(DriftCompensator, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,196 @@
+"""Executable ``parameter_server``: the calibration at any magnification, by topics and as ordinary parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Float64MultiArray, Header, String
+from std_srvs.srv import Trigger
+
+from semcal_ros.bridge import (
+    MagnificationReading,
+    fill_calibration_text,
+    fill_camera_info,
+    fill_projection,
+    is_continuous_parameter,
+    read_parameter,
+)
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.calibration_input import CalibrationInput
+from semcal_ros.nodes.magnification import MagnificationInput
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.settings import CALIBRATION, Setting
+
+__all__ = ["ParameterServer", "main"]
+
+_SIZE = (
+    Setting(
+        "image_width", 0, "Width of the live frames; 0: that of the calibration.", "px", 0, 65536
+    ),
+    Setting(
+        "image_height", 0, "Height of the live frames; 0: that of the calibration.", "px", 0, 65536
+    ),
+)
+
+
+class ParameterServer(SemNode):
+    """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like."""
+
+    def __init__(self) -> None:
+        self._calibration: CalibrationInput | None = None
+        super().__init__("parameter_server", (CALIBRATION, *_SIZE))
+        self._reading: MagnificationReading | None = None
+        self._published_g: float | None = None
+        self._text = self.latched_publisher(String, "calibration")
+        self._info = self.latched_publisher(CameraInfo, "camera_info")
+        self._projection = self.latched_publisher(Float64MultiArray, "projection")
+        # It is the source of the topic; listening to it as well would have it talk to itself.
+        self._calibration = CalibrationInput(self, listen=False, on_change=self._on_calibration)
+        for setting in _SIZE:
+            self.settings.on_change(setting.name, lambda _value: self._refresh())
+        self._magnification = MagnificationInput(self, self._on_reading)
+        self._reload = self.create_service(Trigger, "~/reload", self._on_reload)
+        if self._calibration.current is not None:
+            self._on_calibration()
+
+    def idle(self) -> bool:
+        """A magnification that does not change is no trouble."""
+        return True
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also whether there is no calibration."""
+        missing = self._calibration is None or self._calibration.current is None
+        return super().conditions() + ["uncalibrated"] * missing
+
+    # -- topics ------------------------------------------------------------------------------------
+
+    def _on_calibration(self) -> None:
+        # During construction the publisher of the text comes first and this is called again at the end.
+        if self._calibration is None or self._calibration.current is None:
+            return
+        message = String()
+        fill_calibration_text(message, self._calibration.current.dumps())
+        self._text.publish(message)
+        self._refresh()
+
+    def _on_reading(self, reading: MagnificationReading) -> None:
+        self._reading = reading
+        self._update()
+
+    def _refresh(self) -> None:
+        self._published_g = None
+        self._update()
+
+    def _update(self) -> None:
+        """Publish camera and projection if the magnification is another one than last time."""
+        source = self._calibration
+        if source is None or source.current is None or self._reading is None:
+            return
+        width = self.settings["image_width"] or source.current.image_width
+        height = self.settings["image_height"] or source.current.image_height
+        try:
+            reading = MagnificationReading(
+                self._reading.value, self._reading.stamp_ns, source.config
+            )
+            g = reading.magnification(width)
+            if g == self._published_g:
+                return
+            camera = source.current.at(g).resized(width, height)
+            self._publish(camera, width, height)
+        except SemcalError as error:
+            self.reject(error)
+            return
+        self._published_g = g
+        self.statistics.note("magnification", g)
+        self.statistics.note("in_calibrated_range", camera.in_range)
+
+    def _publish(self, camera: Any, width: int, height: int) -> None:
+        projection = Float64MultiArray()
+        fill_projection(projection, camera)
+        self._projection.publish(projection)
+        self.count_published(None)
+        # A node that describes every single image knows better; two sources would break its pairs.
+        if self.count_publishers(self._info.topic_name) > 1:
+            return
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.frame_id)
+        info = CameraInfo()
+        fill_camera_info(info, camera, header, width, height)
+        self._info.publish(info)
+
+    # -- services ----------------------------------------------------------------------------------
+
+    def _on_reload(self, _request: Any, response: Any) -> Any:
+        path = self.settings["calibration"]
+        try:
+            if not path or self._calibration is None:
+                raise InvalidValueError(
+                    "no calibration file to read again",
+                    expected="the parameter calibration to be set",
+                )
+            self._calibration.load(path)
+            response.success, response.message = True, f"read {path}"
+        except SemcalError as error:
+            self.reject(error)
+            response.success, response.message = False, str(error)
+        return response
+
+    # -- continuous parameters -----------------------------------------------------------------------
+
+    def _continuous(self, name: str) -> Parameter:
+        """Value of ``kind@magnification``; not set, with a warning that says why, where there is none."""
+        try:
+            if self._calibration is None or self._calibration.current is None:
+                raise InvalidValueError(
+                    f"parameter {name} without a calibration",
+                    expected="the parameter calibration to name a file",
+                )
+            value = read_parameter(name, self._calibration.current)
+        except SemcalError as error:
+            self.reject(error)
+            return Parameter(name, Parameter.Type.NOT_SET, None)
+        return Parameter(name, Parameter.Type.DOUBLE_ARRAY, value)
+
+    def get_parameter(self, name: str) -> Parameter:
+        """As for any node; continuous parameters are computed."""
+        if is_continuous_parameter(name):
+            return self._continuous(name)
+        return super().get_parameter(name)
+
+    def get_parameter_type(self, name: str) -> Any:
+        """As for any node."""
+        if is_continuous_parameter(name):
+            return self._continuous(name).type_.value
+        return super().get_parameter_type(name)
+
+    def describe_parameter(self, name: str) -> ParameterDescriptor:
+        """As for any node."""
+        if not is_continuous_parameter(name):
+            return super().describe_parameter(name)
+        return ParameterDescriptor(
+            name=name,
+            type=ParameterType.PARAMETER_DOUBLE_ARRAY,
+            description="Computed from the calibration at the magnification after the @.",
+            read_only=True,
+        )
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """As for any node; continuous parameters are refused."""
+        for parameter in parameter_list:
+            if is_continuous_parameter(parameter.name):
+                reason = f"{parameter.name} is computed from the calibration and cannot be set"
+                return SetParametersResult(successful=False, reason=reason)
+        return super().set_parameters_atomically(parameter_list)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(ParameterServer, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

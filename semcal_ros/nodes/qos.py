@@ -1,0 +1,68 @@
+"""Quality of service of the suite's topics (design section 9). Users override it by `qos_overrides` parameters."""
+
+from __future__ import annotations
+
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+__all__ = ["image_input", "latched", "overridable", "relaxed", "stream_output", "value_input"]
+
+
+def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
+
+
+def image_input() -> QoSProfile:
+    """Only the newest image waits while one is being processed."""
+    return _profile(1, DurabilityPolicy.VOLATILE)
+
+
+def value_input(depth: int = 100) -> QoSProfile:
+    """Every value counts, the last one before the node started too."""
+    return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def stream_output(depth: int = 2) -> QoSProfile:
+    """Images and what goes with each of them."""
+    return _profile(depth, DurabilityPolicy.VOLATILE)
+
+
+def latched() -> QoSProfile:
+    """The last value is kept for those who come later."""
+    return _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def overridable() -> QoSOverridingOptions:
+    """Options that declare ``qos_overrides.<topic>.<publisher|subscription>.<policy>`` parameters."""
+    kinds = (
+        QoSPolicyKind.HISTORY,
+        QoSPolicyKind.DEPTH,
+        QoSPolicyKind.RELIABILITY,
+        QoSPolicyKind.DURABILITY,
+    )
+    return QoSOverridingOptions(kinds)
+
+
+def relaxed(profile: QoSProfile, refused: QoSPolicyKind) -> QoSProfile | None:
+    """The profile without the demand that a publisher does not meet; None if it demands nothing of that kind."""
+    reliability, durability = profile.reliability, profile.durability
+    if refused == QoSPolicyKind.RELIABILITY:
+        reliability = ReliabilityPolicy.BEST_EFFORT
+    elif refused == QoSPolicyKind.DURABILITY:
+        durability = DurabilityPolicy.VOLATILE
+    if (reliability, durability) == (profile.reliability, profile.durability):
+        return None
+    return QoSProfile(
+        history=profile.history, depth=profile.depth, reliability=reliability, durability=durability
+    )

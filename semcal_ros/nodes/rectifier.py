@@ -1,0 +1,54 @@
+"""Executable ``rectifier``: the stream without distortion, with the camera of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from semcal_ros.nodes.calibrated_stream import CalibratedStreamNode
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.settings import Setting
+from semcal_ros.nodes.stream import Frame, FrameInput
+
+__all__ = ["RectifierNode", "main"]
+
+_INPUT = Setting(
+    "input",
+    "raw",
+    "Which images to rectify: those of the microscope, or image_stabilized of drift_compensator.",
+    choices=("raw", "stabilized"),
+    fixed=True,
+)
+
+
+class RectifierNode(CalibratedStreamNode):
+    """Publishes ``image_rect`` and ``camera_info``."""
+
+    def __init__(self) -> None:
+        super().__init__("rectifier", (_INPUT,))
+        stabilized = self.settings["input"] == "stabilized"
+        self._input = FrameInput(
+            self,
+            self._on_frame,
+            topic="image_stabilized" if stabilized else None,
+            # The stabilised image has no data bar any more.
+            databar_rows=0 if stabilized else None,
+        )
+
+    def _on_frame(self, frame: Frame) -> None:
+        camera = None
+        if self.calibration.current is not None:
+            g = self.known_magnification(frame)
+            if g is None:
+                return
+            camera = self.camera(frame, g)
+        image = self.rectifier.rectify(frame.image, camera)
+        self.output.publish(image, camera, frame)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(RectifierNode, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,176 @@
+"""Parameters of a node: declared once with description, unit and range, checked with a reason, applied live."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+
+__all__ = ["CALIBRATION", "CONFIG", "INTERPOLATION", "Setting", "Settings"]
+
+Check = Callable[[Any], None]
+Apply = Callable[[Any], None]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One parameter.
+
+    Attributes
+    ----------
+    name, default
+        Name and default; the type of the default is the type of the parameter. An integer is accepted for a float.
+    description, unit
+        What ``ros2 param describe`` shows.
+    low, high
+        Range of a number, both ends included.
+    choices
+        The accepted strings; any without.
+    fixed
+        Only read when the node starts.
+    """
+
+    name: str
+    default: bool | int | float | str
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    fixed: bool = False
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the parameter is a float, for which an integer is accepted too."""
+        return isinstance(self.default, float)
+
+    @property
+    def expected(self) -> str:
+        """What is accepted, for messages."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        kind = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
+        text = kind[type(self.default)]
+        if self.low is not None and self.high is not None:
+            text += f" from {self.low:g} to {self.high:g}"
+        return f"{text} ({self.unit})" if self.unit else text
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Descriptor for ``declare_parameter``."""
+        text = f"{self.description} Accepted: {self.expected}."
+        descriptor = ParameterDescriptor(description=text, read_only=self.fixed)
+        # A statically typed double would refuse `rate:=5`.
+        descriptor.dynamic_typing = self.is_float
+        if self.low is not None and self.high is not None:
+            if self.is_float:
+                limits = FloatingPointRange(from_value=float(self.low), to_value=float(self.high))
+                descriptor.floating_point_range = [limits]
+            else:
+                whole = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
+                descriptor.integer_range = [whole]
+        return descriptor
+
+    def checked(self, value: Any) -> Any:
+        """``value`` in the type of the setting, or :class:`InvalidValueError`."""
+        wanted = type(self.default)
+        if self.is_float and type(value) is int:
+            value = float(value)
+        good = type(value) is wanted
+        if good and self.choices:
+            good = value in self.choices
+        if good and isinstance(value, (int, float)) and not isinstance(value, bool):
+            good = math.isfinite(value)
+            good = good and (self.low is None or value >= self.low)
+            good = good and (self.high is None or value <= self.high)
+        if not good:
+            raise InvalidValueError(f"parameter {self.name} = {value!r}", expected=self.expected)
+        return value
+
+
+CONFIG = Setting(
+    "config",
+    "generic",
+    "Description of the microscope's topics: a msg_configs file or the name of one that is shipped.",
+    fixed=True,
+)
+CALIBRATION = Setting(
+    "calibration", "", "Calibration file; empty to wait for one on the topic `calibration`."
+)
+INTERPOLATION = Setting(
+    "interpolation",
+    "linear",
+    "Interpolation between raw pixels.",
+    choices=("linear", "cubic", "lanczos4"),
+)
+
+
+class Settings:
+    """The declared parameters of one node, by name.
+
+    Parameters
+    ----------
+    node
+        The node that declares them.
+    settings
+        What to declare.
+
+    Raises
+    ------
+    InvalidValueError
+        A value given at start is refused.
+    """
+
+    def __init__(self, node: Node, settings: Iterable[Setting]) -> None:
+        # The last one of a name counts: a node may change a default.
+        self._known = {setting.name: setting for setting in settings}
+        self._values: dict[str, Any] = {}
+        self._checks: dict[str, Check] = {}
+        self._applies: dict[str, Apply] = {}
+        for setting in self._known.values():
+            given = node.declare_parameter(setting.name, setting.default, setting.descriptor())
+            self._values[setting.name] = setting.checked(given.value)
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._after_set)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
+        """Call ``apply(value)`` after each accepted change, and ``check(value)``, which may raise, before."""
+        self._applies[name] = apply
+        if check is not None:
+            self._checks[name] = check
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            for parameter in parameters:
+                setting = self._known.get(parameter.name)
+                if setting is None:
+                    continue
+                value = setting.checked(parameter.value)
+                if parameter.name in self._checks:
+                    self._checks[parameter.name](value)
+        except SemcalError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _after_set(self, parameters: list[Parameter]) -> None:
+        for parameter in parameters:
+            setting = self._known.get(parameter.name)
+            if setting is None:
+                continue
+            self._values[parameter.name] = setting.checked(parameter.value)
+            if parameter.name in self._applies:
+                self._applies[parameter.name](self._values[parameter.name])

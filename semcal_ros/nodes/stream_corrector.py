@@ -1,0 +1,58 @@
+"""Executable ``stream_corrector``: drift and distortion removed in one interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.nodes.calibrated_stream import CalibratedStreamNode
+from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.outputs import DriftOutput
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.stream import Frame, FrameInput
+
+__all__ = ["StreamCorrector", "main"]
+
+
+class StreamCorrector(CalibratedStreamNode):
+    """Publishes ``image_rect``, ``camera_info``, ``drift`` and ``drift_velocity``.
+
+    Without a calibration the drift is still removed, on the scale of the display width.
+    """
+
+    def __init__(self) -> None:
+        self._drift: LiveDrift | None = None
+        super().__init__("stream_corrector", DRIFT_SETTINGS)
+        self._drift = LiveDrift(self)
+        self._drifts = DriftOutput(self)
+        self._input = FrameInput(self, self._on_frame)
+
+    def on_calibration(self) -> None:
+        """A keyframe in the coordinates of the old calibration is of no use."""
+        if self._drift is not None:
+            self._drift.reset()
+
+    def _on_frame(self, frame: Frame) -> None:
+        g = self.known_magnification(frame)
+        if g is None or self._drift is None:
+            return
+        camera = self.camera(frame, g)
+        width_m = self.effective_config.display_width_m
+        used = camera or ScanCamera.nominal(g, *frame.size, width_m)
+        drift = self._drift.update(frame, used)
+        image = self.rectifier.rectify(frame.image, used, drift.raster, self.config.scan)
+        self.output.publish(image, camera, frame)
+        self._drifts.publish(drift, frame)
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also whether the drift is only predicted."""
+        return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(StreamCorrector, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

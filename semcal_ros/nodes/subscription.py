@@ -1,0 +1,152 @@
+"""A subscription that does not stay deaf when a publisher offers less than it asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSProfile
+
+from semcal_ros.nodes.qos import overridable, relaxed
+
+__all__ = ["AdaptiveSubscription", "MessageInfo", "published_ns"]
+
+MessageInfo = Mapping[str, Any]
+Callback = Callable[[Any, MessageInfo], None]
+
+# What a middleware reports that does not number its messages.
+_NO_NUMBER = 2**64 - 1
+
+
+def published_ns(info: MessageInfo) -> int:
+    """When the message was published, ns; when it was received where the middleware does not tell."""
+    return int(info["source_timestamp"] or info["received_timestamp"])
+
+
+class AdaptiveSubscription:
+    """Subscribes as wished, then again with less when the incompatible-QoS event tells that nothing would arrive.
+
+    When the last publisher is gone, :meth:`tend` returns to the wished quality.
+
+    Parameters
+    ----------
+    node
+        The node.
+    message_type, topic
+        What to subscribe to.
+    callback
+        Called with each message and its information from the middleware.
+    profile
+        The wished quality; overridable by parameters.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        message_type: Any,
+        topic: str,
+        callback: Callback,
+        profile: QoSProfile,
+        group: CallbackGroup | None = None,
+    ) -> None:
+        self._node = node
+        self._type = message_type
+        self._callback = callback
+        self._group = group
+        self._refused: list[QoSPolicyKind] = []
+        self.topic = topic
+        self.lost = 0
+        self.incompatible_types = 0
+        self._guard = node.create_guard_condition(self._relax, callback_group=group)
+        # The override parameters are written into the profile.
+        self._wished = self._profile = profile
+        self._subscription = self._subscribe(overridable())
+
+    @property
+    def downgraded(self) -> str:
+        """The demands that were dropped, such as ``"reliability"``; empty while there are none."""
+        if self._profile is self._wished:
+            return ""
+        kinds = ("reliability", "durability")
+        return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._wished, k))
+
+    def _subscribe(self, options: Any = None) -> Any:
+        self._last_number = None
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=self._on_incompatible, incompatible_type=self._on_incompatible_type
+        )
+        return self._node.create_subscription(
+            self._type,
+            self.topic,
+            self._on_message,
+            self._profile,
+            callback_group=self._group,
+            event_callbacks=events,
+            qos_overriding_options=options,
+        )
+
+    def _on_message(self, message: Any, info: MessageInfo) -> None:
+        self._count_gap(info)
+        self._callback(message, info)
+
+    def _count_gap(self, info: MessageInfo) -> None:
+        number = info.get("publication_sequence_number")
+        if number is None or number == _NO_NUMBER:
+            return
+        # A smaller number is that of a publisher that started anew; several publishers count independently.
+        missed = 0 if self._last_number is None else number - self._last_number - 1
+        if missed > 0 and self._subscription.get_publisher_count() == 1:
+            self.lost += missed
+        self._last_number = number
+
+    def take_waiting(self) -> None:
+        """Run the callback for everything that has already arrived.
+
+        An executor serves one message per topic and turn; without this, a newer image would be handled before the
+        values published ahead of it.
+        """
+        while True:
+            handle = self._subscription.handle
+            with handle:
+                taken = handle.take_message(self._type, False)
+            if taken is None:
+                return
+            self._on_message(*taken)
+
+    # -- quality of service ------------------------------------------------------------------------
+
+    def _on_incompatible(self, event: Any) -> None:
+        # The subscription must not be destroyed inside of its own event.
+        self._refused.append(QoSPolicyKind(event.last_policy_kind))
+        self._guard.trigger()
+
+    def _on_incompatible_type(self, _event: Any) -> None:
+        self.incompatible_types += 1
+        self._node.get_logger().warning(
+            f"a publisher on {self.topic} has another type than {self._type.__name__}; expected"
+            f" {self._type.__module__.split('.')[0]}/msg/{self._type.__name__}; correct the configuration"
+        )
+
+    def _relax(self) -> None:
+        while self._refused:
+            refused = self._refused.pop()
+            weaker = relaxed(self._profile, refused)
+            if weaker is None:
+                continue
+            self._profile = weaker
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = self._subscribe()
+            self._node.get_logger().warning(
+                f"a publisher on {self.topic} does not offer the wished {refused.name.lower()};"
+                f" subscribed again without ({self.downgraded})"
+            )
+
+    def tend(self) -> None:
+        """Return to the wished quality once nobody publishes any more; to be called now and then."""
+        if self._profile is not self._wished and self._subscription.get_publisher_count() == 0:
+            self._node.destroy_subscription(self._subscription)
+            self._profile = self._wished
+            self._subscription = self._subscribe()

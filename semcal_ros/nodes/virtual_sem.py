@@ -1,0 +1,186 @@
+"""Executable ``virtual_sem``: a live microscope with a stage and a magnification knob, for trying everything out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from sensor_msgs.msg import Image
+from std_msgs.msg import Float64, Header
+
+from semcal_ros.bridge import check_magnification, fill_header, fill_image
+from semcal_ros.core.errors import ConfigError, SemcalError
+from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.qos import stream_output
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.settings import CONFIG, Setting
+from semcal_ros.synthetic import (
+    DRIFTS,
+    PRESETS,
+    SPECIMEN_KINDS,
+    Detector,
+    LiveScene,
+    Pose,
+    VirtualMicroscope,
+    drift_preset,
+    preset,
+)
+
+__all__ = ["VirtualSem", "main"]
+
+_SETTINGS = (
+    replace(CONFIG, default="virtual_sem"),
+    Setting("preset", "jsm820", "Microscope.", choices=tuple(PRESETS), fixed=True),
+    Setting("specimen", "grid", "Specimen.", choices=tuple(SPECIMEN_KINDS), fixed=True),
+    Setting("drift", "none", "Drift of the specimen.", choices=tuple(DRIFTS), fixed=True),
+    Setting("width", 512, "Image width.", "px", 32, 8192, fixed=True),
+    Setting("height", 512, "Image height.", "px", 32, 8192, fixed=True),
+    Setting("seed", 0, "Seed of specimen and noise.", low=0, high=2**31 - 1, fixed=True),
+    Setting("rate", 0.0, "Frames per second; 0: as fast as they are scanned.", "Hz", 0.0, 200.0),
+    Setting("bits", 8, "Depth of the pixels, 8 or 16.", low=8, high=16),
+    Setting("magnification", 1000.0, "Magnification at the start.", "", 1.0, 1e6, fixed=True),
+    Setting("tilt_deg", 0.0, "Tilt of the stage.", "degrees", -60.0, 60.0),
+    Setting(
+        "tilt_axis_deg", 0.0, "Direction of the tilt axis in the image.", "degrees", -360.0, 360.0
+    ),
+    Setting("rotation_deg", 0.0, "Rotation of the specimen.", "degrees", -360.0, 360.0),
+    Setting("height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3),
+)
+_POSE = ("tilt_deg", "tilt_axis_deg", "rotation_deg", "height_m")
+_ENCODINGS = {8: "mono8", 16: "mono16"}
+
+
+class VirtualSem(SemNode):
+    """Publishes ``image_raw`` and, whenever it changes, ``magnification``.
+
+    Listens to ``~/stage`` and ``~/set_magnification``.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("virtual_sem", _SETTINGS)
+        self._start_ns = self.get_clock().now().nanoseconds
+        self._scene = LiveScene(
+            self._microscope(),
+            self.settings["specimen"],
+            magnification=self.settings["magnification"],
+            pose=self._pose(),
+            drift=drift_preset(self.settings["drift"]),
+            detector=self._detector(self.settings["bits"]),
+            seed=self.settings["seed"],
+        )
+        for name in _POSE:
+            self.settings.on_change(name, self._set_pose)
+        self.settings.on_change("bits", self._set_bits, self._detector)
+        self.settings.on_change("rate", self._set_rate)
+        source = self._checked_source()
+        self._images = self.stream_publisher(Image, self.config.image.topic)
+        self._magnification = self.latched_publisher(Float64, source)
+        self._announced: float | None = None
+        self._announce()
+        self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
+        self._knob = self.create_subscription(
+            Float64, "~/set_magnification", self._on_magnification, stream_output(10)
+        )
+        self._timer = self.create_timer(self._period_s(), self._take_frame)
+
+    def idle(self) -> bool:
+        """It takes no frames in."""
+        return True
+
+    # -- set-up ------------------------------------------------------------------------------------
+
+    def _checked_source(self) -> str:
+        source = self.config.magnification
+        if (source.quantity, source.type, source.field) != (
+            "magnification",
+            "std_msgs/msg/Float64",
+            "data",
+        ):
+            raise ConfigError(
+                f"config {self.config.name} with a {source.quantity} in {source.type}",
+                expected="a magnification in std_msgs/msg/Float64, which is what this node publishes",
+                do="use the configuration virtual_sem",
+            )
+        return source.topic
+
+    def _microscope(self) -> VirtualMicroscope:
+        microscope = preset(self.settings["preset"])
+        microscope = replace(microscope, display_width_m=self.config.display_width_m)
+        if self.config.scan is not None:
+            microscope = microscope.with_timing(self.config.scan)
+        return microscope.with_image_size(self.settings["width"], self.settings["height"])
+
+    def _detector(self, bits: int) -> Detector:
+        return Detector(bits=bits, databar_rows=self.config.image.databar_rows)
+
+    def _pose(self) -> Pose:
+        tilt, axis, rotation = (math.radians(self.settings[name]) for name in _POSE[:3])
+        return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, self.settings["height_m"]))
+
+    def _period_s(self) -> float:
+        rate = self.settings["rate"]
+        return 1.0 / rate if rate > 0.0 else self._scene.microscope.timing.acquisition_time_s
+
+    # -- control -----------------------------------------------------------------------------------
+
+    def _set_pose(self, _value: float) -> None:
+        self._scene.pose = self._pose()
+
+    def _set_bits(self, bits: int) -> None:
+        self._scene.set_detector(bits=bits)
+
+    def _set_rate(self, _value: float) -> None:
+        self._timer.timer_period_ns = round(self._period_s() * 1e9)
+
+    def _on_stage(self, message: Any) -> None:
+        try:
+            self._scene.set_twist(
+                self._now_s(), (message.linear.x, message.linear.y), message.angular.z
+            )
+        except SemcalError as error:
+            self.reject(error)
+
+    def _on_magnification(self, message: Any) -> None:
+        try:
+            self._scene.set_magnification(check_magnification(message.data))
+        except SemcalError as error:
+            self.reject(error)
+
+    # -- frames ------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        return (self.get_clock().now().nanoseconds - self._start_ns) * 1e-9
+
+    def _announce(self) -> None:
+        """Publish the magnification if it is not the published one; always before the first frame at it."""
+        if self._scene.magnification != self._announced:
+            self._announced = self._scene.magnification
+            self._magnification.publish(Float64(data=self._announced))
+            self.statistics.note("magnification", self._announced)
+
+    def _take_frame(self) -> None:
+        # The frame that has just been completed: what the stamp means is when its first pixel was scanned.
+        start_s = self._now_s() - self._scene.microscope.timing.acquisition_time_s
+        try:
+            self._announce()
+            frame = self._scene.frame(start_s)
+            stamp_ns = self._start_ns + round((start_s - self.config.start_offset_s) * 1e9)
+            header, message = Header(), Image()
+            fill_header(header, stamp_ns, self.config.frame_id)
+            fill_image(message, frame.image, _ENCODINGS[8 * frame.image.dtype.itemsize], header)
+            self._images.publish(message)
+            self.count_published(stamp_ns)
+        except SemcalError as error:
+            self.reject(error)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(VirtualSem, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
