@@ -19,8 +19,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
+from demo_picture import overview
 from live_suite import LiveSuite, Received
 
 from semcal_ros import Calibration
@@ -153,8 +153,8 @@ def main() -> int:
         (f"{label}: last frame", received.images[topic][last])
         for topic, (label, _) in STAGES.items()
     ]
-    for topic in STAGES:
-        cv2.imwrite(str(OUTPUT / f"{topic}.png"), received.images[topic][last])
+    stamps = sorted(received.images["image_rect"])[-FRAMES:]
+    overview(OUTPUT / "overview.png", received.images, stamps, rms, REPLAYED, cal)
     correction_report(
         rows,
         pictures,
@@ -166,7 +166,8 @@ def main() -> int:
         ],
     )
     print(
-        f"\nLook at {OUTPUT}/report.html and {OUTPUT}/correction.html ({time.monotonic() - started:.0f} s)"
+        f"\nLook at {OUTPUT}/report.html, {OUTPUT}/correction.html and {OUTPUT}/overview.png "
+        f"({time.monotonic() - started:.0f} s)"
     )
     return 0
 

@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
 _MAX_TEXT = 64 * 1024 * 1024
-_HEADER = "# Calibration of a scanning electron microscope as functions of the magnification. SI units.\n"
+_HEADER = (
+    "# Calibration of a scanning electron microscope as functions of the magnification. SI units.\n"
+)
 
 # libyaml where it was built in: 20 times faster on the covariance.
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -31,10 +31,11 @@ def command(calibration: Path, recording: Path, config: str, as_json: bool) -> N
     """
     model = Calibration.load(calibration)
     microscope = configured(config)
-    with open_recording(recording, microscope) as opened, progress(opened.frame_count, "finding corners") as bar:
-        frames = (
-            (f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames())
-        )
+    with (
+        open_recording(recording, microscope) as opened,
+        progress(opened.frame_count, "finding corners") as bar,
+    ):
+        frames = ((f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames()))
         found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
     collected = collect_views(
         found,

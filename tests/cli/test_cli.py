@@ -38,7 +38,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = tmp_path_factory.mktemp("cli")
     grid = [x for g in (300, 1000, 3000) for x in ("--magnification", g)]
     assert run("simulate", base / "grid", "--views", 3, *grid) == 0
-    assert run("calibrate", base / "grid", "-o", base / "cal.yaml", "--report", base / "r.html") == 0
+    assert (
+        run("calibrate", base / "grid", "-o", base / "cal.yaml", "--report", base / "r.html") == 0
+    )
     zoom = ("--magnification", 500, "--magnification", 2000)
     assert run("simulate", base / "zoom", "--plan", "zoom", "--frames", 4, *zoom) == 0
     gold = ("--magnification", 2500, "--bits", 16)
@@ -149,7 +151,9 @@ def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     cal, out = folder / "cal.yaml", tmp_path / "out"
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "does not exist" in refused(capsys, "calibrate", tmp_path / "no", "-o", tmp_path / "c.yaml")
+    assert "does not exist" in refused(
+        capsys, "calibrate", tmp_path / "no", "-o", tmp_path / "c.yaml"
+    )
     assert "expected" in refused(capsys, "info", empty)
     assert "magnification" in refused(capsys, "at", cal, "nan")
     assert "magnification" in refused(capsys, "at", cal, "--", "-3")
@@ -158,14 +162,22 @@ def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     assert "not a calibration" in refused(capsys, "at", _file(tmp_path / "b.yaml", "a: 1"), 100)
     newer = cal.read_text().replace("version: 1", "version: 2")
     assert "update" in refused(capsys, "at", _file(tmp_path / "n.yaml", newer), 100)
-    assert "folder" in refused(capsys, "calibrate", folder / "grid", "-o", tmp_path / "x" / "c.yaml")
+    assert "folder" in refused(
+        capsys, "calibrate", folder / "grid", "-o", tmp_path / "x" / "c.yaml"
+    )
     assert "config" in refused(capsys, "info", folder / "grid", "--config", "unknown_microscope")
     assert "grid" in refused(capsys, "calibrate", folder / "gold", "-o", tmp_path / "c.yaml")
     truncated = tmp_path / "t.mcap"
     data = next((folder / "grid").glob("*.mcap")).read_bytes()
     truncated.write_bytes(data[: len(data) // 2])
     refused(capsys, "rectify", truncated, "--calibration", cal, "-o", out)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.yaml", "b.yaml", "empty", "n.yaml", "t.mcap"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "a.yaml",
+        "b.yaml",
+        "empty",
+        "n.yaml",
+        "t.mcap",
+    ]
 
 
 def _file(path: Path, text: str) -> Path:
@@ -176,7 +188,13 @@ def _file(path: Path, text: str) -> Path:
 def test_an_existing_output_is_not_touched(folder, tmp_path, capsys):
     before = sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir())
     line = refused(
-        capsys, "rectify", folder / "gold", "--calibration", folder / "cal.yaml", "-o", folder / "zoom"
+        capsys,
+        "rectify",
+        folder / "gold",
+        "--calibration",
+        folder / "cal.yaml",
+        "-o",
+        folder / "zoom",
     )
     assert "exists" in line
     assert sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir()) == before

@@ -1,0 +1,150 @@
+"""Every executable is where `ros2 run` looks for it, starts, and ends cleanly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from ament_index_python import get_package_prefix, get_package_share_directory
+from rclpy.context import Context
+from rclpy.node import Node
+
+NODES = (
+    "bag_player",
+    "calibration_server",
+    "drift_compensator",
+    "parameter_server",
+    "rectifier",
+    "stream_corrector",
+    "virtual_sem",
+)
+# A process must import numpy, cv2 and rclpy and be discovered: 2 s alone, more on a busy machine.
+START_S = 60.0
+STOP_S = 20.0
+
+
+def _executable(name: str) -> Path:
+    return Path(get_package_prefix("semcal_ros")) / "lib" / "semcal_ros" / name
+
+
+@pytest.fixture(scope="module")
+def observer() -> Iterator[Node]:
+    context = Context()
+    rclpy.init(context=context)
+    node = Node("packaging_observer", context=context, enable_rosout=False)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """What an executable cannot start without."""
+    bag = tmp_path_factory.mktemp("bag") / "tiny"
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "semcal_ros",
+            "simulate",
+            str(bag),
+            "--plan",
+            "drift",
+            "--frames",
+            "2",
+            "--size",
+            "64",
+        ],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
+    return {"bag_player": ["--ros-args", "-p", f"bag:={bag}", "-p", "loop:=true"]}
+
+
+def _wait_for(observer: Node, name: str, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
+        if (name, "/sem") in observer.get_node_names_and_namespaces():
+            return
+        if process.poll() is not None:
+            raise AssertionError(f"{name} ended with {process.returncode}: {process.communicate()}")
+        time.sleep(0.05)
+    raise AssertionError(f"{name} did not appear in the ROS graph within {START_S} s")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["sigint", "sigterm"])
+@pytest.mark.parametrize("name", NODES)
+def test_an_executable_starts_and_stops(
+    name: str, stop: signal.Signals, observer: Node, arguments: dict[str, list[str]]
+) -> None:
+    process = subprocess.Popen(
+        [str(_executable(name)), *arguments.get(name, [])],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        _wait_for(observer, name, process)
+        process.send_signal(stop)
+        _, errors = process.communicate(timeout=STOP_S)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+
+
+def test_nothing_else_is_in_the_executables_folder() -> None:
+    found = {path.name for path in _executable("x").parent.iterdir() if os.access(path, os.X_OK)}
+    # A colcon workspace has the command `semcal` there as well.
+    assert found - {"semcal"} == set(NODES)
+
+
+def test_the_index_is_found_without_any_environment() -> None:
+    """A plain shell, as after a login: nothing is set but PATH."""
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from ament_index_python import get_package_prefix as p; print(p('semcal_ros'))",
+        ],
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stdout.strip() == get_package_prefix("semcal_ros"), done.stderr
+
+
+def test_semcal_is_a_command_of_the_environment() -> None:
+    command = Path(sys.executable).parent / "semcal"
+    done = subprocess.run(
+        [command, "--version"],
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "0." in done.stdout
+
+
+@pytest.mark.parametrize("part", ["package.xml", "launch", "msg_configs", "dds"])
+def test_share_holds_what_a_workspace_would(part: str) -> None:
+    share = Path(get_package_share_directory("semcal_ros"))
+    source = Path(__file__).resolve().parents[2] / part
+    assert (share / part).exists()
+    if source.is_dir():
+        installed = {path.name for path in (share / part).iterdir()}
+        assert installed >= {path.name for path in source.iterdir() if path.is_file()}
