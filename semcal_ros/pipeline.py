@@ -87,7 +87,7 @@ class RecordingCalibration:
 
 def _detect(item: tuple[str, NDArray[Any], float]) -> FoundView:
     name, image, magnification = item
-    return FoundView(name, magnification, image, find_lattice(to_gray(image)))
+    return FoundView(name, magnification, image, find_lattice(image))
 
 
 def _in_batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
@@ -99,7 +99,7 @@ def _in_batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
 def find_views(
     frames: Iterable[tuple[str, NDArray[Any], float]], *, on_progress: Progress | None = None
 ) -> tuple[list[FoundView], list[RejectedView]]:
-    """Find the grid in (name, image, magnification) frames, on all cores.
+    """Find the grid in (name, grey image, magnification) frames, on all cores.
 
     Frames are taken from the iterable a few at a time, so a long recording is never in memory as a whole.
     """
@@ -107,9 +107,8 @@ def find_views(
     rejected: list[RejectedView] = []
     workers = os.cpu_count() or 1
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(
-        1
-    )  # the frames are the parallel work; threads inside OpenCV would only compete
+    # The frames are the parallel work; threads inside OpenCV would only compete.
+    cv2.setNumThreads(1)
     try:
         with ThreadPoolExecutor(workers) as pool:
             for batch in _in_batches(frames, 4 * workers):
@@ -227,7 +226,8 @@ def calibrate_recording(
     """
     with open_recording(path, config) as recording:
         frames = (
-            (f"frame {i}", f.image, f.magnification) for i, f in enumerate(recording.frames())
+            (f"frame {i}", to_gray(f.image, f.encoding), f.magnification)
+            for i, f in enumerate(recording.frames())
         )
         found, rejected = find_views(frames, on_progress=on_progress)
     return calibrate_found(
@@ -254,7 +254,8 @@ def calibrate(
     Parameters
     ----------
     source
-        A bag, a folder of SEM TIFF files, or an iterable of (image, magnification) pairs.
+        A bag, a folder of SEM TIFF files, or an iterable of (image, magnification) pairs; images
+        are (h, w) or, in the channel order of OpenCV, (h, w, 3).
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     display_width_m, squares_m
@@ -279,7 +280,7 @@ def calibrate(
         done = calibrate_recording(Path(source), chosen, method=method, options=options)
         return done.calibration
     frames = (
-        (f"image {i}", np.asarray(image), checked_magnification(g))
+        (f"image {i}", to_gray(np.asarray(image)), checked_magnification(g))
         for i, (image, g) in enumerate(source)
     )
     found, rejected = find_views(frames)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -11,17 +10,17 @@ import click
 import numpy as np
 
 from semcal_ros.bridge.config import MicroscopeConfig
-from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, progress, require_folder
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker, DriftUpdate
-from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
 
-__all__ = ["camera_of", "command", "start_time_s"]
+__all__ = ["camera_of", "command", "echo_states", "kind_of", "start_time_s"]
 
-_COLUMNS = ("stamp_ns", "dx_m", "dy_m", "sigma_x_m", "sigma_y_m", "dx_px", "dy_px", "status")
+
+_NUMBER = re.compile(r"-?\d[\d.]*")
 
 
 def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig) -> ScanCamera:
@@ -35,6 +34,17 @@ def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig)
 def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
     """Start of the acquisition in seconds after the first frame's stamp."""
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
+
+
+def kind_of(update: DriftUpdate) -> str:
+    """The status without the numbers of the single frame, so that frames can be counted by kind."""
+    return _NUMBER.sub("…", update.status)
+
+
+def echo_states(states: Counter[str]) -> None:
+    """Print how many frames had which kind of drift."""
+    for kind, count in states.most_common():
+        click.echo(f"{count} frames {kind}")
 
 
 @click.command("drift")
@@ -58,9 +68,7 @@ def command(recording: Path, output: Path, calibration: Path | None, config: str
     microscope = configured(config)
     model = None if calibration is None else Calibration.load(calibration)
     tracker = DriftTracker()
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(_COLUMNS)
+    rows: list[tuple[object, ...]] = []
     states: Counter[str] = Counter()
     first: int | None = None
     with (
@@ -71,32 +79,25 @@ def command(recording: Path, output: Path, calibration: Path | None, config: str
             first = frame.stamp_ns if first is None else first
             camera = camera_of(frame, model, microscope)
             update = tracker.update(
-                to_gray(frame.image),
+                frame.image,
                 start_time_s(frame, first, microscope),
                 camera,
                 microscope.scan,
             )
-            table.writerow(_row(frame.stamp_ns, update))
-            states[update.status] += 1
+            rows.append(_row(frame.stamp_ns, update))
+            states[kind_of(update)] += 1
             bar.update(1)
-    atomic_write_text(output, text.getvalue())
+    write_csv(output, DRIFT_COLUMNS, rows)
     if model is None:
         click.echo(
             "note: without --calibration drift is in raw pixels, scaled by the nominal pixel size of "
             f"the display width {microscope.display_width_m:g} m",
             err=True,
         )
-    for status, count in states.most_common():
-        click.echo(f"{count} frames {status}")
+    echo_states(states)
     click.echo(f"drift: {output}")
 
 
-def _row(stamp_ns: int, update: DriftUpdate) -> list[str]:
+def _row(stamp_ns: int, update: DriftUpdate) -> tuple[object, ...]:
     sigma = np.sqrt(np.diag(update.covariance)[:2])
-    numbers = [*update.drift_m, *sigma]
-    return [
-        str(stamp_ns),
-        *(f"{v:.6e}" for v in numbers),
-        *(f"{v:.5f}" for v in update.drift_px),
-        update.status,
-    ]
+    return (stamp_ns, *update.drift_m, *sigma, *update.drift_px, update.status)

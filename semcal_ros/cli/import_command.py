@@ -14,9 +14,16 @@ __all__ = ["command"]
 @click.command("import")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
+@click.option(
+    "--databar-rows",
+    type=click.IntRange(0),
+    help="Rows of text at the bottom, where the metadata do not tell (Zeiss).",
+)
 @config_option
 @overwrite_option
-def command(folder: Path, output: Path, config: str, overwrite: bool) -> None:
+def command(
+    folder: Path, output: Path, databar_rows: int | None, config: str, overwrite: bool
+) -> None:
     """Make the bag OUTPUT from the SEM TIFF files in FOLDER (Zeiss, Thermo Fisher, TESCAN, JEOL).
 
     Pixel size, databar, working distance and scan rotation come from each file's metadata. Magnifications refer to the
@@ -33,6 +40,7 @@ def command(folder: Path, output: Path, config: str, overwrite: bool) -> None:
             folder,
             output,
             config=configured(config),
+            databar_rows=databar_rows,
             overwrite=overwrite,
             on_progress=lambda n: bar.update(n) and None,
         )

@@ -12,11 +12,11 @@ from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image, to_gray
+from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
-from semcal_ros.cli.drift_command import camera_of, start_time_s
+from semcal_ros.cli.drift_command import camera_of, echo_states, kind_of, start_time_s
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker, DriftUpdate
 from semcal_ros.core.rectify import Rectifier
@@ -137,8 +137,8 @@ def command(
             update = None
             if tracker is not None:
                 time_s = start_time_s(frame, first, microscope)
-                update = tracker.update(to_gray(frame.image), time_s, camera, microscope.scan)
-                states[update.status] += 1
+                update = tracker.update(frame.image, time_s, camera, microscope.scan)
+                states[kind_of(update)] += 1
             image = rectifier.rectify(
                 frame.image, camera, None if update is None else update.raster, microscope.scan
             )
@@ -150,6 +150,5 @@ def command(
         click.echo(f"note: {note}", err=True)
     if extrapolated:
         click.echo(f"warning: {extrapolated} frames are outside of the calibrated range", err=True)
-    for status, number in states.most_common():
-        click.echo(f"{number} frames {status}")
+    echo_states(states)
     click.echo(f"{count} frames: {output}")
