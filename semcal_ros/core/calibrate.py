@@ -34,6 +34,8 @@ Functions = Mapping[str, ContinuousFunction]
 
 METHODS = ("joint", "pda", "discrete")
 _MIN_CORNERS = 8
+# A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
+_MIN_VIEWS = 3
 # Variance factor beyond which the misfit is the model's and not a matter of the corners' sigmas.
 _MISFIT = 9.0
 
@@ -103,6 +105,12 @@ def _checked(views: Sequence[GridView], method: str) -> tuple[GridView, ...]:
             "no usable view",
             expected="images of a chess grid",
             do="check focus and contrast, and that the grid fills the image",
+        )
+    if len(views) < _MIN_VIEWS:
+        raise CalibrationError(
+            f"a calibration from {len(views)} views",
+            expected=f"at least {_MIN_VIEWS} views of the grid in different directions",
+            do="add tilted views",
         )
     for view in views:
         if len(view.board_xy_m) < _MIN_CORNERS:

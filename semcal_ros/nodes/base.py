@@ -127,7 +127,9 @@ class SemNode(Node):
 
     def conditions(self) -> list[str]:
         """What is not as it should be at present, in a few words each."""
-        return [f"{s.topic} without {s.downgraded}" for s in self.adaptive if s.downgraded]
+        weak = [f"{s.topic} without {s.downgraded}" for s in self.adaptive if s.downgraded]
+        foreign = [(s.topic, s.foreign_types) for s in self.adaptive if s.foreign_types]
+        return weak + [f"{types} on {topic}" for topic, types in foreign]
 
     def idle(self) -> bool:
         """Whether this node has no stream whose silence would be news."""
@@ -137,11 +139,6 @@ class SemNode(Node):
         for topic, publisher in self._outputs.items():
             count = publisher.get_subscription_count()
             self.statistics.note(f"subscribers.{topic}", count)
-        for subscription in self.adaptive:
-            if subscription.incompatible_types:
-                self.statistics.note(
-                    f"wrong_type.{subscription.topic}", subscription.incompatible_types
-                )
         summary = self.statistics.summary(time.monotonic())
         if self.idle() and summary.level == DiagnosticLevel.STALE:
             summary = replace(summary, level=DiagnosticLevel.OK, message="ready")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -80,20 +81,22 @@ def serve() -> None:
 
 def run_job(job: CalibrationJob, still_wanted: Callable[[], bool]) -> JobResult:
     """Calibrate in a new process and wait for it; it is ended when the result is no longer wanted."""
-    # A session of its own: Ctrl-C is for the node, which decides what becomes of this process.
-    process = subprocess.Popen(
-        [sys.executable, "-c", _COMMAND],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,
-    )
-    pending: bytes | None = pickle.dumps(job)
+    with tempfile.TemporaryFile() as stdin:
+        # Not through a pipe: communicate() with a timeout stops feeding one that was once full.
+        pickle.dump(job, stdin)
+        stdin.seek(0)
+        # A session of its own: Ctrl-C is for the node, which decides what becomes of this process.
+        process = subprocess.Popen(
+            [sys.executable, "-c", _COMMAND],
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
     try:
         while still_wanted():
             try:
-                answer, _ = process.communicate(pending, timeout=_POLL_S)
+                answer, _ = process.communicate(timeout=_POLL_S)
             except subprocess.TimeoutExpired:
-                pending = None
                 continue
             return _result_of(answer, process.returncode)
     finally:

@@ -59,7 +59,7 @@ class AdaptiveSubscription:
         self._refused: list[QoSPolicyKind] = []
         self.topic = topic
         self.lost = 0
-        self.incompatible_types = 0
+        self._foreign_types: set[str] = set()
         self._guard = node.create_guard_condition(self._relax, callback_group=group)
         # The override parameters are written into the profile.
         self._wished = self._profile = profile
@@ -75,9 +75,7 @@ class AdaptiveSubscription:
 
     def _subscribe(self, options: Any = None) -> Any:
         self._last_number = None
-        events = SubscriptionEventCallbacks(
-            incompatible_qos=self._on_incompatible, incompatible_type=self._on_incompatible_type
-        )
+        events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         return self._node.create_subscription(
             self._type,
             self.topic,
@@ -123,13 +121,6 @@ class AdaptiveSubscription:
         self._refused.append(QoSPolicyKind(event.last_policy_kind))
         self._guard.trigger()
 
-    def _on_incompatible_type(self, _event: Any) -> None:
-        self.incompatible_types += 1
-        self._node.get_logger().warning(
-            f"a publisher on {self.topic} has another type than {self._type.__name__}; expected"
-            f" {self._type.__module__.split('.')[0]}/msg/{self._type.__name__}; correct the configuration"
-        )
-
     def _relax(self) -> None:
         while self._refused:
             refused = self._refused.pop()
@@ -145,8 +136,30 @@ class AdaptiveSubscription:
             )
 
     def tend(self) -> None:
-        """Return to the wished quality once nobody publishes any more; to be called now and then."""
-        if self._profile is not self._wished and self._subscription.get_publisher_count() == 0:
+        """Look at who publishes; to be called now and then.
+
+        Warns of publishers of another type, which the middleware leaves out silently, and returns to the wished
+        quality once nobody publishes any more.
+        """
+        publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
+        foreign = {p.topic_type for p in publishers} - {self._type_name}
+        for type_name in foreign - self._foreign_types:
+            self._node.get_logger().warning(
+                f"{type_name} is published on {self.topic}; expected {self._type_name}; correct the"
+                " configuration or the publisher"
+            )
+        self._foreign_types = foreign
+        if self._profile is not self._wished and not publishers:
             self._node.destroy_subscription(self._subscription)
             self._profile = self._wished
             self._subscription = self._subscribe()
+
+    @property
+    def foreign_types(self) -> str:
+        """Other types that are published on the topic; empty while there are none."""
+        return ", ".join(sorted(self._foreign_types))
+
+    @property
+    def _type_name(self) -> str:
+        package = self._type.__module__.partition(".")[0]
+        return f"{package}/msg/{self._type.__name__}"

@@ -160,3 +160,8 @@ def test_bad_requests_are_refused():
             method="pda",
             options=MethodOptions(5),
         )
+
+
+def test_two_views_cannot_determine_scale_aspect_and_skew():
+    with pytest.raises(CalibrationError, match="at least 3 views"):
+        _calibrate("jsm820", magnifications=[1000.0], views=2)

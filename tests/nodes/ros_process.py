@@ -154,6 +154,12 @@ class Peer:
             self._executor.spin_once(timeout_sec=0.05)
         return result
 
+    def spin(self, seconds: float) -> None:
+        """Handle what arrives for a while."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
     def call(self, service_type: Any, name: str, request: Any, timeout_s: float = TIMEOUT_S) -> Any:
         """Answer of a service."""
         client = self.node.create_client(service_type, name)

@@ -1,0 +1,227 @@
+"""What README and doc/ claim: links, commands, executables, parameters, keys, and a snippet that runs."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# rclpy imports a parser whose dependency uses modules that Python 3.11 deprecates; only the import is excused.
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from rclpy.node import Node
+
+from node_scenes import make_calibration
+
+from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
+from semcal_ros.bridge.parameters import PARAMETER_KINDS
+from semcal_ros.nodes import base
+from semcal_ros.nodes.settings import Setting
+
+ROOT = Path(__file__).resolve().parents[2]
+DOC = ROOT / "doc"
+PAGES = [ROOT / "README.md", *sorted(DOC.glob("*.md"))]
+NODES = tuple(re.findall(r'^    "(\w+)",$', (ROOT / "setup.py").read_text("utf-8"), re.MULTILINE))
+COMMANDS = {
+    path.stem.removesuffix("_command")
+    for path in (ROOT / "semcal_ros" / "cli").glob("*_command.py")
+}
+_FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+
+
+def _text(name: str) -> str:
+    return (DOC / name).read_text(encoding="utf-8")
+
+
+def _prose(path: Path) -> str:
+    return _FENCE.sub("", path.read_text(encoding="utf-8"))
+
+
+def _anchors(path: Path) -> set[str]:
+    """Anchors of the headings, made as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", _prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in headings}
+
+
+def _name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_relative_links_resolve(page: Path) -> None:
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", _prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        found = (page.parent / file).resolve() if file else page
+        if not found.exists() or (anchor and anchor not in _anchors(found)):
+            broken.append(target)
+    assert not broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_named_commands_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    # A command is named in code: after a backtick, a prompt, an indentation or a heading.
+    named = set(re.findall(r"(?:`|\$ |^    |^## )semcal ([a-z]+)\b", text, re.MULTILINE))
+    assert named <= COMMANDS
+
+
+def test_every_command_is_described() -> None:
+    described = set(re.findall(r"^## semcal (\w+)$", _text("cli.md"), re.MULTILINE))
+    assert described == COMMANDS
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_option_is_described(command: str) -> None:
+    module = importlib.import_module(f"semcal_ros.cli.{command}_command")
+    text = _text("cli.md")
+    options = {name for option in module.command.params for name in option.opts if "--" in name}
+    # Those of the introduction: the output is in every example.
+    options -= {"--output"}
+    assert {name for name in options if name not in text} == set()
+
+
+def test_named_options_exist() -> None:
+    """Options in the examples and descriptions of the command line."""
+    known = {"--help", "--version"}
+    for command in COMMANDS:
+        module = importlib.import_module(f"semcal_ros.cli.{command}_command")
+        known |= {name for option in module.command.params for name in option.opts}
+    text = "".join(_text(name) for name in ("cli.md", "calibration.md", "sem_tiff.md", "paper.md"))
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known
+
+
+def test_the_nodes_are_those_of_the_package() -> None:
+    text = _text("nodes.md")
+    table = re.findall(r"^\| \[`(\w+)`\]\(#\w+\)", text, re.MULTILINE)
+    sections = [h for h in re.findall(r"^## (\w+)$", text, re.MULTILINE) if "_" in h or h in NODES]
+    run = re.findall(r"ros2 run semcal_ros (\w+)", "".join(p.read_text("utf-8") for p in PAGES))
+    assert len(NODES) == 7
+    assert sorted(table) == sorted(sections) == sorted(NODES)
+    assert set(run) <= set(NODES)
+
+
+class _Captured(Exception):
+    """Ends the construction of a node once its parameters are known."""
+
+
+def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Setting]:
+    """What a node declares, without ROS at work."""
+    module = importlib.import_module(f"semcal_ros.nodes.{node}")
+    (kind,) = (name for name in module.__all__ if name != "main")
+    captured: dict[str, Setting] = {}
+
+    def capture(_node: Any, settings: Iterable[Setting]) -> None:
+        captured.update({setting.name: setting for setting in settings})
+        raise _Captured
+
+    monkeypatch.setattr(Node, "__init__", lambda *_args, **_kwargs: None)
+    monkeypatch.setattr(base, "Settings", capture)
+    with pytest.raises(_Captured):
+        getattr(module, kind)()
+    return captured
+
+
+def _section(text: str, heading: str) -> str:
+    return text.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_every_parameter_is_described(node: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = _text("nodes.md")
+    described = _section(text, node) + _section(text, "Parameters of all nodes")
+    settings = _settings_of(node, monkeypatch)
+    assert set(settings) >= {"config"}
+    assert [name for name in settings if f"`{name}`" not in described] == []
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_described_choices_are_those_of_the_code(
+    node: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = _section(_text("nodes.md"), node)
+    for name, setting in _settings_of(node, monkeypatch).items():
+        row = re.search(rf"^\| [^|]*`{name}`[^|]*\|(.*)$", section, re.MULTILINE)
+        if row is None or "as for" in row.group(1):
+            continue  # described in prose, or at another node
+        assert [choice for choice in setting.choices if f"`{choice}`" not in row.group(1)] == []
+        if setting.fixed:
+            assert "*start*" in row.group(1), f"{name} is only read at start"
+
+
+def test_the_diagnostic_keys_are_those_of_the_code() -> None:
+    section = _section(_text("nodes.md"), "Diagnostics")
+    described = {
+        key.partition(".")[0]
+        for row in re.findall(r"^\| (`.+?`) \|", section, re.MULTILINE)
+        for key in re.findall(r"`([^`]+)`", row)
+    }
+    files = [*(ROOT / "semcal_ros/nodes").glob("*.py"), ROOT / "semcal_ros/bridge/diagnostics.py"]
+    code = "".join(path.read_text(encoding="utf-8") for path in files)
+    noted = set(re.findall(r'\.note\(\s*f?"(\w+)', code)) | set(
+        re.findall(r'^ +\("(drift_\w+)", ', code, re.MULTILINE)
+    )
+    assert noted <= described
+    assert {key for key in described if f'"{key}' not in code} == set()
+
+
+def test_every_continuous_parameter_is_described() -> None:
+    section = _section(_text("nodes.md"), "parameter_server")
+    assert [kind for kind in PARAMETER_KINDS if f"| `{kind}` |" not in section] == []
+
+
+def test_every_key_of_the_calibration_file_is_described() -> None:
+    schema = json.loads(
+        (ROOT / "semcal_ros/schemas/calibration.schema.json").read_text(encoding="utf-8")
+    )
+    keys = {
+        *schema["properties"],
+        *schema["properties"]["functions"]["required"],
+        *schema["properties"]["covariance"]["properties"],
+        *schema["$defs"]["function"]["properties"],
+        *schema["$defs"]["function"]["properties"]["kind"]["enum"],
+    }
+    text = _text("calibration_file.md")
+    assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+def test_every_key_of_a_configuration_is_described() -> None:
+    described = set(re.findall(r"^\| `([\w.]+)` \|", _text("msg_configs.md"), re.MULTILINE))
+    for key, value in CONFIG_SCHEMA["properties"].items():
+        names = [f"{key}.{inner}" for inner in value.get("properties", ())]
+        # A mapping with required keys of its own may be left out; it is a row then.
+        assert set(names or [key]) <= described
+
+
+def test_the_notebook_snippet_runs(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    snippets = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    (snippet,) = (s for s in snippets if "Calibration.load" in s)
+    make_calibration().save(tmp_path / "cal.yaml")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", snippet],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "nan" not in done.stdout
+
+
+def test_the_readme_is_short_and_its_snippets_are_python() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 200
+    for snippet in re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        compile(snippet, "README.md", "exec")
