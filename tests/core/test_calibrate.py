@@ -145,7 +145,7 @@ def test_what_the_views_cannot_determine_is_said():
 
 
 def test_bad_requests_are_refused():
-    views = grid_views(preset("jsm820").camera_at, [1000.0], views=2)
+    views = grid_views(preset("jsm820").camera_at, [1000.0], views=3)
     with pytest.raises(InvalidValueError, match="method"):
         calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="magic")
     with pytest.raises(CalibrationError, match="no usable view"):
