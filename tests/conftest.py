@@ -7,6 +7,7 @@ import fcntl
 import os
 import shutil
 import tempfile
+import warnings
 from pathlib import Path
 
 import hypothesis
@@ -63,6 +64,12 @@ def _isolate() -> int:
 
 # Here and not in a fixture: the environment must be set before a test module imports rclpy.
 _DOMAIN_LOCK = _isolate()
+
+
+# rclpy imports a parser whose dependency uses modules that Python 3.11 deprecates; only the import is excused.
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import rosidl_generator_py  # noqa: F401
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import click
 from tqdm import tqdm
 
 from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -35,9 +37,10 @@ overwrite_option = click.option(
 )
 
 
-def configured(name: str) -> MicroscopeConfig:
-    """The configuration that the ``--config`` option names."""
-    return load_config(name)
+def configured(name: str, model: Calibration | None = None) -> MicroscopeConfig:
+    """The configuration that the ``--config`` option names, with the display width of a calibration."""
+    config = load_config(name)
+    return config if model is None else replace(config, display_width_m=model.display_width_m)
 
 
 def progress(total: int | None, label: str) -> tqdm[Any]:

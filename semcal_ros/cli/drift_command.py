@@ -65,8 +65,8 @@ def command(recording: Path, output: Path, calibration: Path | None, config: str
       semcal drift recordings/gold --calibration cal.yaml -o drift.csv
     """
     require_folder(output)
-    microscope = configured(config)
     model = None if calibration is None else Calibration.load(calibration)
+    microscope = configured(config, model)
     tracker = DriftTracker()
     rows: list[tuple[object, ...]] = []
     states: Counter[str] = Counter()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, echo_json, echo_table, progress
 from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
@@ -30,12 +31,15 @@ def command(calibration: Path, recording: Path, config: str, as_json: bool) -> N
       semcal evaluate cal.yaml recordings/other_grid
     """
     model = Calibration.load(calibration)
-    microscope = configured(config)
+    microscope = configured(config, model)
     with (
         open_recording(recording, microscope) as opened,
         progress(opened.frame_count, "finding corners") as bar,
     ):
-        frames = ((f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames()))
+        frames = (
+            (f"frame {i}", to_gray(f.image, f.encoding), f.magnification)
+            for i, f in enumerate(opened.frames())
+        )
         found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
     collected = collect_views(
         found,

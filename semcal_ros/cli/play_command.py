@@ -19,8 +19,17 @@ __all__ = ["command"]
 )
 @click.option("--loop", is_flag=True, help="Start again at the end.")
 @click.option("--paused", is_flag=True, help="Wait for a call of ~/pause.")
+@click.option(
+    "--wait",
+    type=click.IntRange(0, 100),
+    default=0,
+    show_default=True,
+    help="Start when images and magnification have so many subscribers each.",
+)
 @click.option("--no-clock", is_flag=True, help="Do not publish /clock.")
-def command(recording: Path, rate: float, loop: bool, paused: bool, no_clock: bool) -> None:
+def command(
+    recording: Path, rate: float, loop: bool, paused: bool, wait: int, no_clock: bool
+) -> None:
     """Replay RECORDING as ROS topics, as `ros2 run semcal_ros bag_player` does.
 
     \b
@@ -40,6 +49,7 @@ def command(recording: Path, rate: float, loop: bool, paused: bool, no_clock: bo
         "rate": f"{rate}",
         "loop": str(loop).lower(),
         "start_paused": str(paused).lower(),
+        "wait_for_subscribers": str(wait),
         "clock": str(not no_clock).lower(),
     }
     arguments = ["--ros-args"]

@@ -119,7 +119,7 @@ def command(
       semcal rectify recordings/zoom --calibration cal.yaml -o zoom_rect
     """
     model = Calibration.load(calibration)
-    microscope = configured(config)
+    microscope = configured(config, model)
     tracker = None if no_drift else DriftTracker()
     rectifier = Rectifier(interpolation)
     states: Counter[str] = Counter()

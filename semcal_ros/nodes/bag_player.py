@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
@@ -32,12 +33,13 @@ _SETTINGS = (
     Setting(
         "wait_for_subscribers",
         0,
-        "Start when every image topic (every topic without one) has so many subscribers.",
+        "Start when images and magnification (all topics, where there are none) have so many subscribers each.",
         low=0,
         high=100,
         fixed=True,
     ),
 )
+_IMAGE = "sensor_msgs/msg/Image"
 _TICK_S = 0.02
 _ACK_S = 2.0
 _DEPTH = 10
@@ -60,6 +62,8 @@ class BagPlayer(SemNode):
         )
         self._pacer = Pacer(self.settings["rate"], paused=self.settings["start_paused"])
         self._changed = threading.Condition()
+        # Shutting the context down from the replay's own thread would make that thread wait for itself.
+        self._end = self.create_guard_condition(self._leave)
         self._ended = False
         self.settings.on_change("rate", self._set_rate)
         self._service = self.create_service(SetBool, "~/pause", self._on_pause)
@@ -105,13 +109,16 @@ class BagPlayer(SemNode):
         except ConfigError as error:
             self.reject(error)
             return None
-        source = self.config.magnification
-        is_value = topic.type == source.type and topic.name.endswith("/" + source.topic.lstrip("/"))
         # A magnification stays valid: who comes later must learn it.
-        profile = value_input(1) if topic.latched or is_value else stream_output(_DEPTH)
+        lasting = topic.latched or self._is_magnification(topic)
+        profile = value_input(1) if lasting else stream_output(_DEPTH)
         return self.create_publisher(
             message_type, topic.name, profile, qos_overriding_options=overridable()
         )
+
+    def _is_magnification(self, topic: BagTopic) -> bool:
+        source = self.config.magnification
+        return topic.type == source.type and topic.name.endswith("/" + source.topic.lstrip("/"))
 
     # -- control -----------------------------------------------------------------------------------
 
@@ -147,20 +154,18 @@ class BagPlayer(SemNode):
             if self.context.ok():
                 raise
         finally:
-            if not self._ended:
-                self.context.try_shutdown()
+            if not self._ended and self.context.ok():
+                self._end.trigger()
+
+    def _leave(self) -> None:
+        raise ExternalShutdownException
 
     def _wait_for_subscribers(self) -> None:
         wanted = self.settings["wait_for_subscribers"]
-        images = [t.name for t in self._bag.topics if t.type == "sensor_msgs/msg/Image"]
-        topics = [
-            name
-            for name in images or self._publishers_by_topic
-            if name in self._publishers_by_topic
-        ]
-        while not self._ended and any(
-            self._publishers_by_topic[name].get_subscription_count() < wanted for name in topics
-        ):
+        streams = [t for t in self._bag.topics if t.type == _IMAGE or self._is_magnification(t)]
+        names = {t.name for t in streams} & set(self._publishers_by_topic)
+        awaited = [self._publishers_by_topic[name] for name in names or self._publishers_by_topic]
+        while not self._ended and any(p.get_subscription_count() < wanted for p in awaited):
             self._pause_for(_TICK_S)
 
     def _pause_for(self, seconds: float) -> None:

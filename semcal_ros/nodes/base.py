@@ -73,10 +73,19 @@ class SemNode(Node):
     # -- entities ----------------------------------------------------------------------------------
 
     def listen(
-        self, message_type: Any, topic: str, callback: Any, profile: QoSProfile, group: Any = None
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Any,
+        profile: QoSProfile,
+        group: Any = None,
+        *,
+        raw: bool = False,
     ) -> AdaptiveSubscription:
-        """Subscribe; the callback takes the message and its information."""
-        subscription = AdaptiveSubscription(self, message_type, topic, callback, profile, group)
+        """Subscribe; the callback takes the message, or its bytes if ``raw``, and its information."""
+        subscription = AdaptiveSubscription(
+            self, message_type, topic, callback, profile, group, raw=raw
+        )
         self.adaptive.append(subscription)
         return subscription
 

@@ -26,8 +26,6 @@ class CalibrationInput:
     ----------
     node
         A node that declares the parameter ``calibration``.
-    listen
-        Whether to subscribe to the topic ``calibration``.
     on_change
         Called after each change.
 
@@ -37,9 +35,7 @@ class CalibrationInput:
         The file given at start cannot be used.
     """
 
-    def __init__(
-        self, node: SemNode, *, listen: bool = True, on_change: Callable[[], None] | None = None
-    ) -> None:
+    def __init__(self, node: SemNode, *, on_change: Callable[[], None] | None = None) -> None:
         self._node = node
         self._on_change = on_change
         self._checked: tuple[str, Calibration] | None = None
@@ -51,8 +47,7 @@ class CalibrationInput:
         if path:
             self._install(Calibration.load(path), path)
         node.settings.on_change("calibration", self._apply_file, self._check_file)
-        if listen:
-            node.listen(String, "calibration", self._on_message, latched())
+        node.listen(String, "calibration", self._on_message, latched())
 
     @property
     def config(self) -> MicroscopeConfig:
@@ -83,8 +78,11 @@ class CalibrationInput:
             return
         try:
             text = calibration_text_from_message(message)
-            self._install(Calibration.loads(text, source="topic calibration"), "topic")
+            calibration = Calibration.loads(text, source="topic calibration")
             self._topic_ns = published_ns(info)
+            # The same again, from another node or as an echo, is no reason to start drift anew.
+            if self.current is None or calibration.dumps() != self.current.dumps():
+                self._install(calibration, "topic")
         except SemcalError as error:
             self._node.reject(error)
 

@@ -66,14 +66,14 @@ class MagnificationInput:
             self._on_reading(reading)
 
     def at(
-        self, stamp_ns: int, info: MessageInfo, image_width_px: int, config: MicroscopeConfig
+        self, stamp_ns: int, sent_ns: int, image_width_px: int, config: MicroscopeConfig
     ) -> float | None:
         """Magnification of a frame, or None while it is not known.
 
         Parameters
         ----------
-        stamp_ns, info
-            Header stamp of the frame and what the middleware tells of its message.
+        stamp_ns, sent_ns
+            Header stamp of the frame, and when the microscope published it.
         image_width_px
             Width of the frame.
         config
@@ -85,7 +85,7 @@ class MagnificationInput:
             The magnification is out of all reason for frames of this width.
         """
         self._subscription.take_waiting()
-        reading = self._history.at(stamp_ns if self._has_stamp else published_ns(info))
+        reading = self._history.at(stamp_ns if self._has_stamp else sent_ns)
         if reading is None:
             return None
         return replace(reading, config=config).magnification(image_width_px)

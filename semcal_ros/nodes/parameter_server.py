@@ -39,7 +39,10 @@ _SIZE = (
 
 
 class ParameterServer(SemNode):
-    """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like."""
+    """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like.
+
+    A calibration that another node publishes is taken over, and published again for those who come later.
+    """
 
     def __init__(self) -> None:
         self._calibration: CalibrationInput | None = None
@@ -49,8 +52,7 @@ class ParameterServer(SemNode):
         self._text = self.latched_publisher(String, "calibration")
         self._info = self.latched_publisher(CameraInfo, "camera_info")
         self._projection = self.latched_publisher(Float64MultiArray, "projection")
-        # It is the source of the topic; listening to it as well would have it talk to itself.
-        self._calibration = CalibrationInput(self, listen=False, on_change=self._on_calibration)
+        self._calibration = CalibrationInput(self, on_change=self._on_calibration)
         for setting in _SIZE:
             self.settings.on_change(setting.name, lambda _value: self._refresh())
         self._magnification = MagnificationInput(self, self._on_reading)

@@ -19,6 +19,7 @@ from semcal_ros.core.errors import ConfigError
 from semcal_ros.nodes.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.magnification import MagnificationInput
 from semcal_ros.nodes.qos import image_input
+from semcal_ros.nodes.sending_times import SendingTimes
 from semcal_ros.nodes.settings import Setting
 from semcal_ros.nodes.subscription import MessageInfo
 
@@ -65,7 +66,8 @@ class FrameInput:
     on_frame
         Called with each frame; what it raises of :data:`NODE_ERRORS` is counted.
     topic, databar_rows
-        Where the images are and how many rows at the bottom are text; those of the configuration without.
+        Where the images are, if they are not the microscope's own but made from these, and how many rows at the
+        bottom are text; those of the configuration without.
     group
         Callback group of both subscriptions.
     """
@@ -86,6 +88,7 @@ class FrameInput:
         self._databar_rows = source.databar_rows if databar_rows is None else databar_rows
         # Before the images, so that a late-joining node knows the magnification of its first frame.
         self._magnification = MagnificationInput(node, group=group)
+        self._sent = SendingTimes(node, source.topic if topic else None)
         self._images = node.listen(
             Image, topic or source.topic, self._on_image, image_input(), group
         )
@@ -100,7 +103,8 @@ class FrameInput:
         try:
             image = without_databar(image_from_message(message), self._databar_rows)
             stamp_ns = stamp_ns_from_msg(message)
-            g = self._magnification.at(stamp_ns, info, image.shape[1], node.effective_config)
+            sent_ns = self._sent.of(stamp_ns, info)
+            g = self._magnification.at(stamp_ns, sent_ns, image.shape[1], node.effective_config)
             node.statistics.note("magnification", "unknown" if g is None else g)
             self._on_frame(Frame(image, message.encoding, message.header, stamp_ns, g))
         except NODE_ERRORS as error:

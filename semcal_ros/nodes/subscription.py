@@ -41,6 +41,8 @@ class AdaptiveSubscription:
         Called with each message and its information from the middleware.
     profile
         The wished quality; overridable by parameters.
+    raw
+        Whether the callback takes the serialized bytes.
     """
 
     def __init__(
@@ -51,11 +53,14 @@ class AdaptiveSubscription:
         callback: Callback,
         profile: QoSProfile,
         group: CallbackGroup | None = None,
+        *,
+        raw: bool = False,
     ) -> None:
         self._node = node
         self._type = message_type
         self._callback = callback
         self._group = group
+        self._raw = raw
         self._refused: list[QoSPolicyKind] = []
         self.topic = topic
         self.lost = 0
@@ -84,6 +89,7 @@ class AdaptiveSubscription:
             callback_group=self._group,
             event_callbacks=events,
             qos_overriding_options=options,
+            raw=self._raw,
         )
 
     def _on_message(self, message: Any, info: MessageInfo) -> None:
@@ -109,7 +115,7 @@ class AdaptiveSubscription:
         while True:
             handle = self._subscription.handle
             with handle:
-                taken = handle.take_message(self._type, False)
+                taken = handle.take_message(self._type, self._raw)
             if taken is None:
                 return
             self._on_message(*taken)

@@ -48,6 +48,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return base
 
 
+def test_the_display_width_is_that_of_the_calibration(folder, tmp_path, capsys):
+    """A configuration of another display width, whose topic says to which width its numbers refer."""
+    config = tmp_path / "wide.yaml"
+    config.write_text(
+        "name: wide\ndisplay_width_m: 0.24\n"
+        "magnification: {quantity: magnification, display_width_m: 0.12}\n"
+    )
+    capsys.readouterr()
+    assert run("evaluate", folder / "cal.yaml", folder / "grid", "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    command = ("evaluate", folder / "cal.yaml", folder / "grid", "--json", "--config", config)
+    assert run(*command) == 0
+    assert json.loads(capsys.readouterr().out) == plain
+
+
 def test_calibration_and_report_are_there(folder):
     assert (folder / "cal.yaml").read_text().startswith("# Calibration")
     assert "<html" in (folder / "r.html").read_text()

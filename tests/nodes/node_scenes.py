@@ -87,16 +87,20 @@ def stamp_of(message: Any) -> tuple[int, int]:
 
 
 def write_recording(
-    path: Path, magnifications: Sequence[float], period_s: float = 0.2, size: int = SIZE
+    path: Path,
+    magnifications: Sequence[float],
+    period_s: float = 0.2,
+    size: int = SIZE,
+    lead_s: float = 0.001,
 ) -> list[NDArray[np.uint8]]:
-    """A bag with one frame per magnification, which is published just before; returns the images."""
+    """A bag with one frame per magnification, published ``lead_s`` before; returns the images."""
     images = [texture(seed, size) for seed in range(len(magnifications))]
     with BagWriter(path) as writer:
         for index, (g, image) in enumerate(zip(magnifications, images, strict=True)):
             stamp_ns = 1_700_000_000_000_000_000 + round(index * period_s * 1e9)
             value = blank_message("std_msgs/msg/Float64")
             value.data = float(g)
-            writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
+            writer.write("/sem/magnification", stamp_ns - round(lead_s * 1e9), value)
             frame = blank_message("sensor_msgs/msg/Image")
             frame.header.stamp.sec, frame.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             frame.header.frame_id = "camera"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -230,6 +231,27 @@ def test_reload_reads_the_file_again(replay: Replay) -> None:
     assert "not valid YAML" in answer.message
     (d,) = replay.peer.get_parameters(SERVER, "d@1000")
     assert math.isclose(d.double_array_value[0], CALIBRATION.at(1000.0).xi_r)
+
+
+def test_a_calibration_from_another_node_is_taken_over(replay: Replay) -> None:
+    """As after ~/calibrate of calibration_server; reload returns to the file."""
+    scale = CALIBRATION.functions["scale"]
+    functions = {
+        **CALIBRATION.functions,
+        "scale": dataclasses.replace(scale, coefficients=scale.coefficients * 1.1),
+    }
+    other = dataclasses.replace(CALIBRATION, functions=functions)
+    publisher = replay.peer.node.create_publisher(String, "calibration", LATCHED)
+    publisher.publish(String(data=other.dumps()))
+
+    def scale_is(calibration: Calibration) -> bool:
+        (k,) = replay.peer.get_parameters(SERVER, "k@1000")
+        return math.isclose(k.double_array_value[0], calibration.at(1000.0).K[0, 0])
+
+    replay.peer.wait_for(lambda: scale_is(other), "the other calibration")
+    assert replay.peer.trigger(f"{SERVER}/reload").success
+    replay.peer.wait_for(lambda: scale_is(CALIBRATION), "the file's calibration")
+    replay.peer.node.destroy_publisher(publisher)
 
 
 # -- both jobs in one node ----------------------------------------------------------------------

@@ -1,0 +1,57 @@
+"""When the microscope published the frames that another node has worked on."""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+
+from sensor_msgs.msg import Image
+
+from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.qos import stream_output
+from semcal_ros.nodes.subscription import MessageInfo, published_ns
+
+__all__ = ["SendingTimes"]
+
+_KEPT = 256
+# Encapsulation, and the stamp with which std_msgs/Header and so every image begins.
+_ENCAPSULATION = 4
+_NS_PER_S = 1_000_000_000
+
+
+class SendingTimes:
+    """Publication time of the original of a frame, by header stamp.
+
+    A magnification without a stamp is matched by the order of publication. A frame that another node made, such as
+    ``image_stabilized``, was published later than its original, perhaps after the next magnification; so the originals
+    are watched, but only their first bytes are read.
+
+    Parameters
+    ----------
+    node
+        The node.
+    topic
+        Topic of the originals; None where the frames are the originals.
+    """
+
+    def __init__(self, node: SemNode, topic: str | None) -> None:
+        self._times: OrderedDict[int, int] = OrderedDict()
+        self._originals = (
+            None
+            if topic is None
+            else node.listen(Image, topic, self._on_original, stream_output(10), raw=True)
+        )
+
+    def _on_original(self, serialized: bytes, info: MessageInfo) -> None:
+        order = "<" if serialized[1] & 1 else ">"
+        seconds, nanoseconds = struct.unpack_from(f"{order}iI", serialized, _ENCAPSULATION)
+        self._times[seconds * _NS_PER_S + nanoseconds] = published_ns(info)
+        while len(self._times) > _KEPT:
+            self._times.popitem(last=False)
+
+    def of(self, stamp_ns: int, info: MessageInfo) -> int:
+        """When the original of a frame was published, ns; of the frame itself if the original was not seen."""
+        if self._originals is not None:
+            # The frame may be handled before originals that arrived ahead of it.
+            self._originals.take_waiting()
+        return self._times.get(stamp_ns) or published_ns(info)
