@@ -18,6 +18,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from demo_picture import overview
@@ -74,7 +75,7 @@ def replay(calibration: Path) -> Received:
     )
     print("\nNodes on the replay:", flush=True)
     with LiveSuite(OUTPUT / "logs", config="virtual_sem", calibration=calibration) as suite:
-        received = suite.replay(OUTPUT / "replay", frames=FRAMES * len(REPLAYED), rate=2.0)
+        received = suite.replay(OUTPUT / "replay", frames=FRAMES * len(REPLAYED), rate=1.5)
         matrix = suite.parameter("p@2345.6")
     for topic, messages in received.counts().items():
         print(f"  {topic:18} {messages} messages")
@@ -109,17 +110,26 @@ def reprojection_rms(
     return float(np.sqrt(np.mean(np.concatenate(errors))))
 
 
+def frames_at(g: float) -> list[dict[str, Any]]:
+    """What truth.json says of the frames at a magnification."""
+    truth = json.loads((OUTPUT / "replay" / "truth.json").read_text())
+    return [f for f in truth["frames"] if f["magnification"] == g]
+
+
+def stamps_at(g: float, received: Received) -> list[int]:
+    """Header stamps, ns, of the frames at a magnification."""
+    start = min(received.images["image_raw"])
+    return [start + round(f["start_time_s"] * 1e9) for f in frames_at(g)]
+
+
 def measure(received: Received, cal: Calibration) -> dict[str, list[float]]:
     """Step 4: RMS of each stage at each magnification."""
-    truth = json.loads((OUTPUT / "replay" / "truth.json").read_text())
-    start = min(received.images["image_raw"])
     rows: dict[str, list[float]] = {topic: [] for topic in STAGES}
     for g in REPLAYED:
-        frames = [f for f in truth["frames"] if f["magnification"] == g]
-        stamps = [start + round(f["start_time_s"] * 1e9) for f in frames]
+        stamps = stamps_at(g, received)
         first = next(s for s in stamps if s in received.images["image_rect"])
         found = find_lattice(received.images["image_rect"][first])
-        view = GridView(float(g), found.ij * frames[0]["square_m"], found.xy, found.sigma_px)
+        view = GridView(float(g), found.ij * frames_at(g)[0]["square_m"], found.xy, found.sigma_px)
         for topic in STAGES:
             images = {s: received.images[topic][s] for s in stamps if s in received.images[topic]}
             rows[topic].append(reprojection_rms(images, first, view, cal))
@@ -148,12 +158,13 @@ def main() -> int:
             f"{label:40}" + "".join(f"{v:9.3f}" for v in rms[topic]) + f"{total:9.3f}   {printed}"
         )
 
-    last = max(received.images["image_rect"])
+    through = set.intersection(*(set(received.images[topic]) for topic in STAGES))
+    last = max(through)
     pictures = [
         (f"{label}: last frame", received.images[topic][last])
         for topic, (label, _) in STAGES.items()
     ]
-    stamps = sorted(received.images["image_rect"])[-FRAMES:]
+    stamps = sorted(through & set(stamps_at(REPLAYED[-1], received)))
     overview(OUTPUT / "overview.png", received.images, stamps, rms, REPLAYED, cal)
     correction_report(
         rows,

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rclpy
@@ -25,6 +24,8 @@ from semcal_ros.bridge.images import image_from_message
 NODES = ("parameter_server", "drift_compensator", "stream_corrector")
 IMAGES = ("image_raw", "image_stabilized", "image_rect")
 TIMEOUT_S = 60.0
+# Nothing new for so long after the end of the replay: what is missing was overtaken by newer frames.
+SILENCE_S = 3.0
 
 
 @dataclass
@@ -77,18 +78,20 @@ class LiveSuite:
         self._node.destroy_node()
         rclpy.try_shutdown()
 
-    def _start(self, name: str, parameters: dict[str, str]) -> None:
+    def _start(self, name: str, parameters: dict[str, str]) -> subprocess.Popen[bytes]:
         command = [str(self._executables / name), "--ros-args", "-r", "__ns:=/sem"]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         with open(self._logs / f"{name}.log", "wb") as log:
-            self._processes.append(subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT))
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        self._processes.append(process)
+        return process
 
     def replay(self, bag: Path, *, frames: int, rate: float) -> Received:
-        """Replay a recording; returns what arrived once every frame has come through, or time is up."""
+        """Replay a recording; returns what arrived when every frame has come through, or nothing comes any more."""
         received = Received()
         self._subscribe(received)
-        self._start(
+        player = self._start(
             "bag_player",
             {
                 "bag": str(bag.absolute()),
@@ -97,9 +100,7 @@ class LiveSuite:
                 "wait_for_subscribers": "3",
             },
         )
-        self._spin_until(
-            lambda: min(received.counts()[t] for t in (*IMAGES, "camera_info")) >= frames
-        )
+        self._spin_while(player, received, frames)
         return received
 
     def _subscribe(self, received: Received) -> None:
@@ -123,13 +124,19 @@ class LiveSuite:
             Float64MultiArray, "projection", received.projections.append, reliable
         )
 
-    def _spin_until(self, done: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + TIMEOUT_S
-        while not done():
-            if time.monotonic() > deadline:
-                print(f"  gave up after {TIMEOUT_S:g} s: not every frame came through")
-                return
+    def _spin_while(self, player: subprocess.Popen[bytes], received: Received, frames: int) -> None:
+        topics = (*IMAGES, "camera_info")
+        seen, last_s = 0, time.monotonic()
+        while min(received.counts()[topic] for topic in topics) < frames:
             rclpy.spin_once(self._node, timeout_sec=0.1)
+            if any(process.poll() for process in self._processes):
+                raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+            total = sum(received.counts().values())
+            if total > seen or player.poll() is None:
+                seen, last_s = total, time.monotonic()
+            elif time.monotonic() - last_s > SILENCE_S:
+                print("  this machine was too busy: some frames were overtaken by newer ones")
+                return
 
     def parameter(self, name: str) -> list[float]:
         """Value of a continuous parameter of the parameter server."""

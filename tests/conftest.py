@@ -48,6 +48,8 @@ def _isolate() -> int:
         ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
         ROS_LOG_DIR=logs,
         MPLBACKEND="Agg",
+        # As the executables do: threads of OpenBLAS would only wait for each other.
+        OPENBLAS_NUM_THREADS="1",
     )
     # Other people's settings must not decide over the outcome of a test.
     for name in (

@@ -1,0 +1,70 @@
+"""All benchmarks as plain text tables.
+
+    python benchmarks/run.py                  everything
+    python benchmarks/run.py --quick          smaller and fewer
+    python benchmarks/run.py drift rectify    only these parts
+
+========================  ==========================================================================
+calibration.py            joint, pda and discrete calibration beside cv2.calibrateCamera, judged at
+                          magnifications that none of them saw; the corner finder beside OpenCV's
+drift.py                  registration beside phase correlation, ECC and, where it is installed,
+                          scikit-image, and the Cramer-Rao bound
+rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
+live.py                   the node stream_corrector over DDS beside a process that only relays
+========================  ==========================================================================
+
+Everything is measured on simulated data whose truth is known, with fixed seeds. Accuracy is in px
+and stands beside a bound wherever there is one. A time is never given in seconds: it is the ratio
+of two medians, taken turn by turn in one run, so that it means something on another machine or on a
+busy one. Ratios of a few percent are still chance. Nothing here passes or fails.
+
+Each part runs in a process of its own and can be started alone: python benchmarks/drift.py --quick
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import scipy
+
+PARTS = ("calibration", "drift", "rectify", "live")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help="; ".join(PARTS))
+    parser.add_argument("--quick", action="store_true", help="less of everything")
+    options = parser.parse_args()
+    for part in options.parts:
+        if part not in PARTS:
+            parser.error(f"no part {part}; there are {', '.join(PARTS)}")
+    print(
+        f"Python {platform.python_version()}, numpy {np.__version__}, scipy {scipy.__version__},"
+        f" OpenCV {cv2.__version__} with {cv2.getNumThreads()} threads, {os.cpu_count()} processors",
+        flush=True,
+    )
+    failed = []
+    for part in options.parts or PARTS:
+        start = time.monotonic()
+        command = [sys.executable, str(Path(__file__).with_name(f"{part}.py"))]
+        done = subprocess.run(command + ["--quick"] * options.quick, check=False)
+        if done.returncode:
+            failed.append(part)
+        print(f"[{part}: {time.monotonic() - start:.0f} s]", flush=True)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
