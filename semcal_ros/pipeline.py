@@ -271,7 +271,10 @@ def calibrate(
         cal = calibrate("recordings/grid", config="jsm820")
         cal.save("jsm820.yaml")
     """
-    chosen = config if isinstance(config, MicroscopeConfig) else load_config(config or "generic")
+    if isinstance(config, MicroscopeConfig):
+        chosen = config
+    else:
+        chosen = load_config("generic" if config is None else os.fspath(config))
     if display_width_m is not None:
         chosen = replace(chosen, display_width_m=float(display_width_m))
     if squares_m is not None:
