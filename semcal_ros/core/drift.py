@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift_types import DriftSettings, DriftUpdate
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.kalman import DriftState, predict, update
+from semcal_ros.core.kalman import DriftState, predict, process_noise, update
 from semcal_ros.core.keyframe import (
     Keyframe,
     Shot,
@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 # Innovations beyond this normalised square happen to a correct filter once in a million frames.
 _GATE = 27.6
+# Multiple of the first step's sigma within which a shift agrees with what was expected.
+_REACH = 2.0
 # The shear that a wrong velocity leaves is worth a second look from here on.
 _SHEAR_PX = 0.1
 
@@ -70,7 +72,7 @@ class DriftTracker:
         self._psd = 0.0
         self._frames = 0
         self._misses = 0
-        self._pending: tuple[float, Array] | None = None
+        self._pending: tuple[tuple[float, Array], ...] = ()
 
     def update(
         self,
@@ -169,16 +171,19 @@ class DriftTracker:
         if jump:
             return self._missed(predicted, shot, jump, found.registration, rescaled)
         outcome = update(predicted, found.drift, found.covariance, self._gate())
-        if not outcome.accepted and not self._confirmed(predicted, found):
-            reason = f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
-            return self._missed(predicted, shot, reason, found.registration, rescaled)
-        state = outcome.state if outcome.accepted else self._reseeded(predicted, found)
+        state = outcome.state
+        if not outcome.accepted:
+            revised = self._revised(predicted, shot, found)
+            if revised is None:
+                reason = f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
+                return self._missed(predicted, shot, reason, found.registration, rescaled)
+            predicted = revised
+            state = update(predicted, found.drift, found.covariance).state
         if self._sheared(predicted.velocity, state.velocity, shot):
             found, state = self._looked_again(predicted, found, state, shot, rescaled)
-        if outcome.accepted:
-            self._adapt(outcome.nis)
+        self._adapt(outcome.nis)
         self._state = state
-        self._misses, self._pending = 0, None
+        self._misses, self._pending = 0, ()
         self._shared = found.covariance
         self._frames += 1
         return self._tracked(shot, found.registration, rescaled)
@@ -250,23 +255,45 @@ class DriftTracker:
             return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
         return ""
 
-    def _confirmed(self, predicted: DriftState, found: _Measurement) -> bool:
-        """Whether an unexpected shift is the second in a row that says the same."""
-        pending, self._pending = self._pending, (predicted.time_s, found.drift)
-        if pending is None:
-            return False
-        dt = predicted.time_s - pending[0]
-        noise = predicted.covariance[2:, 2:] * dt**2 + 4.0 * found.covariance
-        away = found.drift - pending[1] - predicted.velocity * dt
-        return float(away @ np.linalg.solve(noise, away)) <= _GATE
+    def _revised(self, predicted: DriftState, shot: Shot, found: _Measurement) -> DriftState | None:
+        """Another prediction that an unexpected shift agrees with, or None if it is not to be believed.
 
-    def _reseeded(self, predicted: DriftState, found: _Measurement) -> DriftState:
-        """The measured drift with the predicted velocity: the filter's history no longer counts."""
-        covariance = predicted.covariance.copy()
-        covariance[:2, :] = covariance[:, :2] = 0.0
-        covariance[:2, :2] = found.covariance
-        mean = np.concatenate([found.drift, predicted.velocity])
-        return DriftState(predicted.time_s, mean, covariance)
+        It is believed if drift can get so far between two frames, if the unexpected shift before
+        says the same, or if the two before say that the drift goes on like this.
+        """
+        earlier = self._pending
+        self._pending = (*earlier, (predicted.time_s, found.drift))[-2:]
+        reach = _REACH * self.settings.first_step_px * np.linalg.inv(shot.px_from_unit)
+
+        def near(expected: Array) -> bool:
+            return bool(np.linalg.norm(np.linalg.solve(reach, found.drift - expected)) <= 1.0)
+
+        if near(predicted.position):
+            return self._loosened(predicted, found)
+        if not earlier:
+            return None
+        time_s, drift = earlier[-1]
+        since_s = predicted.time_s - time_s
+        paces = [predicted.velocity]
+        if len(earlier) == 2:
+            paces.append((drift - earlier[0][1]) / (time_s - earlier[0][0]))
+        for pace in paces:
+            expected = drift + pace * since_s
+            if near(expected):
+                covariance = np.zeros((4, 4))
+                covariance[:2, :2] = reach @ reach.T
+                covariance[2:, 2:] = covariance[:2, :2] / since_s**2
+                return DriftState(predicted.time_s, np.concatenate([expected, pace]), covariance)
+        return None
+
+    def _loosened(self, predicted: DriftState, found: _Measurement) -> DriftState:
+        """The prediction with as much more process noise as the measured drift asks for."""
+        state = self._state
+        assert state is not None
+        dt = predicted.time_s - state.time_s
+        away = found.drift - predicted.position
+        extra = process_noise(dt, 1.5 * float(away @ away) / dt**3)
+        return DriftState(predicted.time_s, predicted.mean, predicted.covariance + extra)
 
     def _adapt(self, nis: float) -> None:
         """Nudge the process noise until innovations are as large as predicted (2 on average)."""
@@ -318,7 +345,7 @@ class DriftTracker:
         if candidate.reference.complaint:
             return self._report(shot, f"coasting: {candidate.reference.complaint}", None, np.nan)
         self._rekey(shot)
-        self._misses, self._pending = 0, None
+        self._misses, self._pending = 0, ()
         return self._report(shot, f"coasting: {reason}", None, np.nan)
 
     # -- reporting --------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drift_scenes import DriftingSpecimen, lattice, noisy, small_camera
+from scipy import ndimage
 
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
@@ -176,6 +177,28 @@ def test_a_small_real_jump_is_believed_when_it_stays() -> None:
     assert "deviations from the prediction" in statuses[8].reason
     assert statuses[9].accepted
     np.testing.assert_allclose(statuses[10].drift_px, [9.0, 0.0], atol=0.1)
+
+
+@pytest.mark.parametrize("pace", [3.2, 13.0])
+def test_a_sudden_onset_of_drift_is_followed(pace: float) -> None:
+    """Rest, then a steady pace: nothing of the way may be lost, however sure the filter was of the rest."""
+    tracker = DriftTracker()
+    wide = DriftingSpecimen(pitch_m=1.0, seed=5)
+    way = np.concatenate([np.zeros(8), pace * np.arange(1, 9)])
+
+    def view(k: int) -> np.ndarray:
+        shifted = ndimage.shift(wide.picture[260:500, 200:500], (0.0, way[k]), order=5)
+        return noisy(shifted[40:200, 120:280].astype(np.float64), 4.0, k)
+
+    updates = [tracker.update(view(k), float(k)) for k in range(len(way))]
+    refused = [k for k, u in enumerate(updates) if not u.accepted]
+    # A pace that drift is not expected to have must be seen three times.
+    assert refused == ([] if pace < 6.0 else [8, 9])
+    for k in range(10, len(way)):
+        sigma = np.sqrt(np.diag(updates[k].covariance)[:2])
+        error = np.abs(updates[k].drift_px - [way[k], 0.0])
+        assert np.all(error < 5.0 * sigma + 0.03), (k, error, sigma)
+    np.testing.assert_allclose(updates[-1].velocity_m_s, [pace, 0.0], atol=0.1)
 
 
 def test_lattice_is_followed_without_hops() -> None:

@@ -44,6 +44,7 @@ def test_frames_follow_magnification_and_depth(peer: Peer) -> None:
         assert stamp_of(images[0]) < stamp_of(images[1])
         assert pixels(images[0]).std() > 5.0
 
+        peer.wait_for(lambda: knob.get_subscription_count() == 1, "the knob")
         knob.publish(Float64(data=-3.0))
         peer.wait_for(lambda: peer.state(SEM).get("rejected") == "1", "the refusal")
         knob.publish(Float64(data=8000.0))
@@ -74,6 +75,7 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
         outputs = ("image_stabilized", "drift", "drift_velocity")
         peer.wait_heard("/sem/drift_compensator", *outputs)
         peer.wait_for(lambda: raw and len(held) >= 2, "frames of the resting stage")
+        peer.wait_for(lambda: stage.get_subscription_count() == 1, "the stage")
         twist = Twist()
         twist.linear.x, twist.linear.y = (speed_px_s * PIXEL_M).tolist()
         stage.publish(twist)
