@@ -1,95 +1,43 @@
-"""Bundle adjustment of coefficient vectors and grid poses.
+"""Bundle adjustment of coefficient vectors and grid poses: Levenberg-Marquardt with a Huber loss.
 
-The unknowns are one vector ``theta`` of coefficients, from which the camera of each magnification follows linearly
-(``camera = design @ theta``), and six pose unknowns per view. The poses are eliminated view by view (Schur complement),
-so that the reduced system has the size of ``theta`` whatever the number of views; what is left of a view is a 10 x 10
-information matrix on the camera of its magnification. Levenberg-Marquardt with a Huber loss.
-
-Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, sections 4 and 6.
+Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.poses import cross_matrices, rotations_from_vectors
-from semcal_ros.core.projection import project_points, project_points_with_jacobians
-from semcal_ros.core.views import GridView
+from semcal_ros.core.reprojection import (
+    NormalEquations,
+    Problem,
+    State,
+    moved,
+    normal_equations,
+    part_of,
+    prior_cost,
+    reduced,
+    residuals,
+    scaled_solve,
+    theta_system,
+    view_costs,
+)
 
-__all__ = [
-    "BundleResult",
-    "Problem",
-    "State",
-    "make_problem",
-    "refine",
-    "residuals",
-    "theta_system",
-]
+__all__ = ["BundleResult", "refine"]
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MAX_ITERATIONS = 60
-_MAX_DAMPING = 1e10
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
+# Decrease over its prediction, below which the quadratic model of a view has failed.
+_POOR_GAIN = 0.25
+_FOLLOWING_STEPS = 6
+# A change of a view's half chi-square that is nothing.
+_NEGLIGIBLE = 1e-2
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-9
-# Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
-_HUBER = 3.0
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Observations and priors of one adjustment.
-
-    Attributes
-    ----------
-    board_m, observed_px, weight
-        (N, 3), (N, 2) and (N,): grid points, observed raw pixels, 1 / sigma.
-    starts
-        (V + 1,) offsets of the views in these arrays.
-    group
-        (V,) index of each view's magnification in ``designs``.
-    designs
-        (M, 10, K): camera parameters of each magnification per unit of theta.
-    unit_m
-        (V,) metres per pose unit (about one pixel), which keeps the equations well scaled.
-    norm_px
-        Normalisation of the distortion.
-    prior_mean, prior_sigma
-        (K,) prior of theta; an infinite sigma is no prior.
-    height_sigma_m
-        Prior 1-sigma of each view's height t_z about the reference plane.
-    """
-
-    board_m: Array
-    observed_px: Array
-    weight: Array
-    starts: Index
-    group: Index
-    designs: Array
-    unit_m: Array
-    norm_px: float
-    prior_mean: Array
-    prior_sigma: Array
-    height_sigma_m: float
-
-    @property
-    def view_of_point(self) -> Index:
-        """(N,) view index of every point."""
-        return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
-
-
-@dataclass(frozen=True)
-class State:
-    """Values of the unknowns: theta (K,), rotations (V, 3, 3) and translations (V, 3) in m."""
-
-    theta: Array
-    rotations: Array
-    translations_m: Array
 
 
 @dataclass(frozen=True)
@@ -135,160 +83,27 @@ class BundleResult:
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
 
-def make_problem(
-    views: Sequence[GridView],
-    magnifications: Array,
-    designs: Array,
-    *,
-    norm_px: float,
-    nominal_px_per_m: Array,
-    prior_mean: Array,
-    prior_sigma: Array,
-    height_sigma_m: float,
-) -> Problem:
-    """Arrange views for the adjustment; ``magnifications`` (M,) are the distinct ones, in order."""
-    counts = [len(v.board_xy_m) for v in views]
-    group = np.searchsorted(magnifications, [v.magnification for v in views]).astype(np.intp)
-    board = np.concatenate([v.board_xy_m for v in views])
-    return Problem(
-        board_m=np.column_stack([board, np.zeros(len(board))]),
-        observed_px=np.concatenate([v.image_xy for v in views]),
-        weight=1.0 / np.concatenate([v.sigma_px for v in views]),
-        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
-        group=group,
-        designs=designs,
-        unit_m=1.0 / nominal_px_per_m[group],
-        norm_px=norm_px,
-        prior_mean=prior_mean,
-        prior_sigma=prior_sigma,
-        height_sigma_m=height_sigma_m,
-    )
-
-
-def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
-    view = problem.view_of_point
-    rotated = np.einsum("nij,nj->ni", state.rotations[view], problem.board_m)
-    cameras = (problem.designs @ state.theta)[problem.group]
-    return rotated, rotated + state.translations_m[view], cameras[view]
-
-
-def residuals(problem: Problem, state: State) -> Array:
-    """(N, 2) observed minus projected pixels; NaN where a point has no projection."""
-    _, points, cameras = _points_and_cameras(problem, state)
-    return problem.observed_px - project_points(cameras, points, problem.norm_px)
-
-
-def _huber(norm: Array) -> tuple[Array, Array]:
-    """Huber's loss (half squared norm inside) and weight of the whitened residual norms."""
-    outside = norm > _HUBER
-    loss = np.where(outside, _HUBER * (norm - 0.5 * _HUBER), 0.5 * norm * norm)
-    return loss, np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
-
-
-def _cost(problem: Problem, state: State) -> float:
-    miss = residuals(problem, state)
-    norm = np.hypot(miss[:, 0], miss[:, 1]) * problem.weight
-    if not np.all(np.isfinite(norm)):
-        return float("inf")
-    prior = (state.theta - problem.prior_mean) / problem.prior_sigma
-    height = state.translations_m[:, 2] / problem.height_sigma_m
-    return float(_huber(norm)[0].sum() + 0.5 * (prior @ prior + height @ height))
-
-
 @dataclass(frozen=True)
-class _Normal:
-    """Normal equations: per view (V, 16, 16) and (V, 16), with camera first and pose last."""
+class _Step:
+    """A damped Gauss-Newton step, and the decrease of the cost that its quadratic model predicts for each view."""
 
-    matrix: Array
-    right: Array
-    residuals_px: Array
-    huber_weight: Array
-
-
-def _normal_equations(problem: Problem, state: State) -> _Normal:
-    rotated, points, cameras = _points_and_cameras(problem, state)
-    jacobians = project_points_with_jacobians(cameras, points, problem.norm_px)
-    miss = problem.observed_px - jacobians.xy
-    norm = np.hypot(miss[:, 0], miss[:, 1]) * problem.weight
-    huber = _huber(norm)[1]
-    whiten = (problem.weight * np.sqrt(huber))[:, None]
-    unit = problem.unit_m[problem.view_of_point][:, None, None]
-
-    rows = np.empty((len(points), 2, 17))
-    rows[:, :, :10] = jacobians.d_parameters
-    rows[:, :, 10:13] = -jacobians.d_xyz @ cross_matrices(rotated)
-    rows[:, :, 13:16] = jacobians.d_xyz * unit
-    rows[:, :, 16] = miss
-    rows *= whiten[:, :, None]
-
-    n_views = len(problem.group)
-    matrix = np.empty((n_views, 17, 17))
-    for v in range(n_views):
-        block = rows[problem.starts[v] : problem.starts[v + 1]].reshape(-1, 17)
-        matrix[v] = block.T @ block
-    height = problem.unit_m / problem.height_sigma_m
-    matrix[:, 15, 15] += height**2
-    matrix[:, 15, 16] -= height * state.translations_m[:, 2] / problem.height_sigma_m
-    return _Normal(matrix[:, :16, :16], matrix[:, :16, 16], miss, huber)
+    state: State
+    predicted: Array
+    predicted_prior: float
 
 
-def _reduce(problem: Problem, normal: _Normal, damping: float) -> tuple[Array, Array, Array, Array]:
-    """Eliminate the poses: information (M, 10, 10), gradient (M, 10), V^-1 W' and V^-1 b per view."""
-    pose = normal.matrix[:, 10:, 10:].copy()
-    diagonal = np.arange(6)
-    pose[:, diagonal, diagonal] *= 1.0 + damping
-    right = np.concatenate([normal.matrix[:, 10:, :10], normal.right[:, 10:, None]], axis=2)
-    solved = np.linalg.solve(pose, right)
-    cross = normal.matrix[:, :10, 10:]
-    information = np.zeros((len(problem.designs), 10, 10))
-    gradient = np.zeros((len(problem.designs), 10))
-    np.add.at(information, problem.group, normal.matrix[:, :10, :10] - cross @ solved[:, :, :10])
-    np.add.at(gradient, problem.group, normal.right[:, :10] - (cross @ solved[:, :, 10:])[:, :, 0])
-    return information, gradient, solved[:, :, :10], solved[:, :, 10]
-
-
-def theta_system(
-    problem: Problem, theta: Array, information: Array, gradient: Array
-) -> tuple[Array, Array]:
-    """Reduced normal equations (K, K) and (K,) of theta, with its prior, from the blocks per magnification."""
-    designs = problem.designs
-    matrix = np.einsum("mpk,mpq,mql->kl", designs, information, designs, optimize=True)
-    right = np.einsum("mpk,mp->k", designs, gradient)
-    matrix[np.diag_indices_from(matrix)] += problem.prior_sigma**-2.0
-    right = right - (theta - problem.prior_mean) * problem.prior_sigma**-2.0
-    return matrix, right
-
-
-def _scaled_solve(matrix: Array, right: Array, damping: float) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
-    scaled = matrix * np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += damping
-    return np.asarray(scale * np.linalg.solve(scaled, scale * right), dtype=np.float64)
-
-
-def _step(
-    problem: Problem, state: State, normal: _Normal, damping: float, fixed: bool
-) -> tuple[State, float]:
-    """The damped Gauss-Newton step and the decrease of the cost that its quadratic model predicts."""
-    information, gradient, back_camera, back_right = _reduce(problem, normal, damping)
-    change = np.zeros_like(state.theta)
-    if not fixed:
-        matrix, right = theta_system(problem, state.theta, information, gradient)
-        change = _scaled_solve(matrix, right, damping)
+def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
+    information, gradient, back_camera, back_right = reduced(problem, normal, damping)
+    matrix, right = theta_system(problem, state.theta, information, gradient)
+    change = scaled_solve(matrix, right, damping)
     camera_change = (problem.designs @ change)[problem.group]
     pose = back_right - np.einsum("vpq,vq->vp", back_camera, camera_change)
-    new = State(
-        state.theta + change,
-        rotations_from_vectors(pose[:, :3]) @ state.rotations,
-        state.translations_m + pose[:, 3:] * problem.unit_m[:, None],
-    )
+    new = moved(problem, state, change, pose)
     whole = np.concatenate([camera_change, pose], axis=1)
-    linear = np.einsum("vp,vp->", normal.right, whole)
-    quadratic = np.einsum("vp,vpq,vq->", whole, normal.matrix, whole, optimize=True)
+    bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
     precision = problem.prior_sigma**-2.0
-    linear += np.sum((problem.prior_mean - state.theta) * precision * change)
-    quadratic += np.sum(change * change * precision)
-    return new, float(linear - 0.5 * quadratic)
+    prior = (problem.prior_mean - state.theta) * precision * change - 0.5 * change**2 * precision
+    return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), float(prior.sum()))
 
 
 def refine(
@@ -304,36 +119,96 @@ def refine(
     With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost that ends the
     iteration. Never raises for lack of convergence: the result says how it ended.
     """
-    cost = _cost(problem, state)
+    costs = view_costs(problem, state)
+    cost = float(costs.sum()) + prior_cost(problem, state)
     if not np.isfinite(cost):
         return _no_result(problem, state)
-    damping, growth, iterations, reason = 1e-5, 2.0, 0, ""
+    if fixed_theta:
+        return _refine_poses(problem, state, costs, max_iterations, tolerance)
+    damping, iterations, reason = _FIRST_DAMPING, 0, ""
     while not reason and iterations < max_iterations:
         iterations += 1
-        normal = _normal_equations(problem, state)
+        normal = normal_equations(problem, state)
         while True:
-            trial, predicted = _step(problem, state, normal, damping, fixed_theta)
-            trial_cost = _cost(problem, trial)
+            step = _step(problem, state, normal, damping)
+            trial, trial_costs = _with_poses_that_follow(problem, state, costs, step)
+            trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
             if trial_cost <= cost or damping >= _MAX_DAMPING:
                 break
-            damping, growth = damping * growth, 2.0 * growth
+            damping *= 10.0
         if trial_cost > cost:
             reason = "converged: no step lowers the cost"
             break
-        decrease, cost, state = cost - trial_cost, trial_cost, trial
-        # Damping follows how well the quadratic model predicted the decrease (Nielsen 1999).
-        gain = min(decrease / max(predicted, 1e-300), 1.0)
-        damping, growth = max(damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12), 2.0
+        decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
+        damping = max(0.1 * damping, _MIN_DAMPING)
+        predicted = float(step.predicted.sum()) + step.predicted_prior
         if decrease <= tolerance * cost and predicted <= 1e3 * tolerance * (1.0 + cost):
             reason = "converged: relative decrease below the tolerance"
     return _result(problem, state, cost, iterations, reason)
 
 
+def _with_poses_that_follow(
+    problem: Problem, state: State, costs: Array, step: _Step
+) -> tuple[State, Array]:
+    """The state after a step, and its costs per view.
+
+    The tilt of a nearly flat view acts by its square, so that its quadratic model holds for very small steps only.
+    Where the model failed, the pose is adjusted to the new camera by itself; else a few such views would hold back
+    the rest.
+    """
+    trial = step.state
+    trial_costs = view_costs(problem, trial)
+    short = trial_costs > costs - _POOR_GAIN * step.predicted + _NEGLIGIBLE
+    if not np.any(short):
+        return trial, trial_costs
+    part = part_of(problem, short)
+    start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
+    own = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3).state
+    rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
+    rotations[short], translations[short] = own.rotations, own.translations_m
+    trial = State(trial.theta, rotations, translations)
+    trial_costs[short] = view_costs(part, own)
+    return trial, trial_costs
+
+
+def _refine_poses(
+    problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
+) -> BundleResult:
+    """Levenberg-Marquardt on each view by itself, for all views at once."""
+    damping = np.full(len(costs), _FIRST_DAMPING)
+    iterations, reason = 0, ""
+    while not reason and iterations < max_iterations:
+        iterations += 1
+        normal = normal_equations(problem, state)
+        pose = normal.matrix[:, 10:, 10:].copy()
+        diagonal = np.arange(6)
+        pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        change: Array = np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0]
+        trial = moved(problem, state, np.zeros_like(state.theta), change)
+        trial_costs = view_costs(problem, trial)
+        better = trial_costs <= costs
+        decrease = np.where(better, costs - trial_costs, 0.0)
+        state = State(
+            state.theta,
+            np.where(better[:, None, None], trial.rotations, state.rotations),
+            np.where(better[:, None], trial.translations_m, state.translations_m),
+        )
+        costs = np.where(better, trial_costs, costs)
+        damping = np.where(better, np.maximum(0.1 * damping, _MIN_DAMPING), 10.0 * damping)
+        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, 10:], change)
+        small = tolerance * (1.0 + costs)
+        if np.all(np.where(better, decrease, predicted) <= small):
+            reason = "converged: relative decrease below the tolerance"
+    return _result(
+        problem, state, float(costs.sum()) + prior_cost(problem, state), iterations, reason
+    )
+
+
 def _result(
     problem: Problem, state: State, cost: float, iterations: int, reason: str
 ) -> BundleResult:
-    normal = _normal_equations(problem, state)
-    information, gradient, back_camera, _ = _reduce(problem, normal, 0.0)
+    normal = normal_equations(problem, state)
+    information, gradient, back_camera, _ = reduced(problem, normal, 0.0)
     matrix, _ = theta_system(problem, state.theta, information, gradient)
     covariance = _covariance(matrix)
     spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)

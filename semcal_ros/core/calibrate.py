@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, theta_system
+from semcal_ros.core.bundle import BundleResult
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
@@ -25,6 +25,7 @@ from semcal_ros.core.problem import (
     variance_factor,
     with_coefficients,
 )
+from semcal_ros.core.reprojection import theta_system
 from semcal_ros.core.views import GridView
 
 __all__ = ["METHODS", "CalibrationResult", "MethodOptions", "calibrate_views"]
@@ -93,6 +94,7 @@ class _Fitted:
     covariance: Array
     without: Callable[[int], Functions]
     height_sigma_m: float
+    poses: tuple[Array, Array] | None
     details: dict[str, Any]
     warnings: tuple[str, ...]
 
@@ -164,7 +166,7 @@ def calibrate_views(
     fitted = _fit_joint(setup) if method == "joint" else _fit_discrete(setup, method, chosen)
 
     model = _model(setup, fitted.functions, fitted.covariance, method)
-    poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m)
+    poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses)
     held_out = _held_out(setup, fitted, method)
     warnings = (*fitted.warnings, *_data_warnings(setup, model))
     statistics = _statistics(setup, fitted, poses, held_out, warnings)
@@ -211,6 +213,7 @@ def _fit_joint(setup: Setup) -> _Fitted:
         fit.result.covariance * factor,
         lambda index: _joint_without(fit, index),
         fit.problem.height_sigma_m,
+        (fit.result.state.rotations, fit.result.state.translations_m),
         details,
         tuple(warnings),
     )
@@ -269,6 +272,7 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
         covariance,
         lambda index: functions_of(np.arange(count) != index)[0],
         setup.priors.height_sigma_m,
+        None,
         details,
         tuple(warnings),
     )
@@ -293,11 +297,13 @@ def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
     if count < 2:
         return out
     for index, g in enumerate(setup.magnifications):
-        own = [v for v in setup.views if v.magnification == g]
+        mine = [i for i, v in enumerate(setup.views) if v.magnification == g]
+        own = [setup.views[i] for i in mine]
+        starts = None if fitted.poses is None else (fitted.poses[0][mine], fitted.poses[1][mine])
         try:
             functions = fitted.without(index)
             camera_at = _predictor(setup, functions, index, method)
-            fit = fit_poses(own, camera_at, height_sigma_m=fitted.height_sigma_m)
+            fit = fit_poses(own, camera_at, height_sigma_m=fitted.height_sigma_m, starts=starts)
         except (CalibrationError, InvalidValueError):
             # The method has no answer there: that is an infinite error, not a missing one.
             out[float(g)] = float("inf")

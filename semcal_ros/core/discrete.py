@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, Problem, State
+from semcal_ros.core.bundle import BundleResult
 from semcal_ros.core.centre import DistortionCentre, find_distortion_centre
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.initial import initial_values
@@ -28,6 +28,7 @@ from semcal_ros.core.problem import (
     theta_of,
     variance_factor,
 )
+from semcal_ros.core.reprojection import Problem, State
 
 __all__ = ["DiscreteFit", "fit_discrete", "table_functions"]
 

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, State, make_problem, refine
+from semcal_ros.core.bundle import BundleResult, refine
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.core.initial import pose_from_camera
+from semcal_ros.core.reprojection import State, make_problem
 from semcal_ros.core.views import GridView
 
 __all__ = ["PoseFit", "fit_poses", "rms_by_magnification"]
@@ -56,10 +57,12 @@ def fit_poses(
     camera_at: Callable[[float], ScanCamera],
     *,
     height_sigma_m: float = 1e-4,
+    starts: tuple[Array, Array] | None = None,
 ) -> PoseFit:
     """Fit the pose of every view with the camera of its magnification held fixed.
 
-    Both signs of the tilt are tried. ``height_sigma_m`` is the prior 1-sigma of each view's height.
+    ``height_sigma_m`` is the prior 1-sigma of each view's height. ``starts`` are rotations (V, 3, 3) and translations
+    (V, 3) near the solution; without them both signs of the tilt are tried.
 
     Raises
     ------
@@ -81,16 +84,15 @@ def fit_poses(
         prior_sigma=np.ones(1),
         height_sigma_m=height_sigma_m,
     )
-    starts = [pose_from_camera(v, c) for v, c in zip(views, of_view, strict=True)]
+    if starts is None:
+        both = [pose_from_camera(v, c) for v, c in zip(views, of_view, strict=True)]
+        rotations = np.stack([r for r, _ in both], axis=1)
+        translations = np.stack([t for _, t in both], axis=1)
+    else:
+        rotations, translations = starts[0][None], starts[1][None]
     fits = [
-        refine(
-            problem,
-            State(
-                np.ones(1), np.stack([r[k] for r, _ in starts]), np.stack([t[k] for _, t in starts])
-            ),
-            fixed_theta=True,
-        )
-        for k in (0, 1)
+        refine(problem, State(np.ones(1), r, t), fixed_theta=True)
+        for r, t in zip(rotations, translations, strict=True)
     ]
     usable = [f for f in fits if np.isfinite(f.cost)]
     if not usable:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, Problem, State, refine
+from semcal_ros.core.bundle import BundleResult, refine
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.initial import initial_values
 from semcal_ros.core.problem import (
@@ -25,7 +25,9 @@ from semcal_ros.core.problem import (
     theta_of,
     with_coefficients,
 )
+from semcal_ros.core.reprojection import Problem, State
 from semcal_ros.core.selection import Summary, select_functions
+from semcal_ros.core.views import GridView
 
 __all__ = ["JointFit", "fit_joint"]
 
@@ -34,6 +36,8 @@ Array = NDArray[np.float64]
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
 _HEIGHT_UPDATES = 3
+# For what only has to be near: signs of tilts, poses, moderately flexible functions.
+_ENOUGH_CORNERS = 60
 # Tolerance of the adjustments on the way; only the last one has to be exact.
 _COARSE = 1e-6
 # The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
@@ -72,13 +76,21 @@ def enriched(
     return out
 
 
-def fit_joint(setup: Setup) -> JointFit:
-    """Calibrate from nominal values alone.
+def _thinned(view: GridView) -> GridView:
+    """The view with a spread of at most so many corners as its pose and a rough camera need."""
+    if len(view.board_xy_m) <= _ENOUGH_CORNERS:
+        return view
+    keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
+    return replace(
+        view,
+        board_xy_m=view.board_xy_m[keep],
+        image_xy=view.image_xy[keep],
+        sigma_px=view.sigma_px[keep],
+    )
 
-    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions;
-    from there the number of coefficients of every function is chosen by leaving out one magnification at a time, until
-    the choice no longer changes.
-    """
+
+def _started(setup: Setup) -> tuple[Functions, State, float]:
+    """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     functions: Functions = constant_functions(
@@ -89,33 +101,52 @@ def fit_joint(setup: Setup) -> JointFit:
     state = State(theta_of(functions), start.rotations, start.translations_m)
     state, _ = resolve_mirrored_tilts(problem, state)
 
-    count = len(setup.magnifications)
-    sizes = {name: ("chebyshev_log", min(3, max(1, count - 1))) for name in _SMOOTH}
-    functions = enriched(functions, sizes)
+    size = min(3, max(1, len(setup.magnifications) - 1))
+    functions = enriched(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, height)
     result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
     for _ in range(_HEIGHT_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
-        problem = replace(problem, height_sigma_m=_height_sigma(result))
+        height = _height_sigma(result)
+        problem = replace(problem, height_sigma_m=height)
         result = refine(problem, result.state, tolerance=_COARSE)
-    functions = with_coefficients(functions, result.state.theta)
+    return with_coefficients(functions, result.state.theta), result.state, height
 
-    settled, rounds = count < 3, 0
+
+def fit_joint(setup: Setup) -> JointFit:
+    """Calibrate from nominal values alone.
+
+    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
+    both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
+    one magnification at a time, until the choice no longer changes.
+    """
+    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    functions, state, height = _started(thin)
+    problem = build_problem(setup, functions, setup.views, height)
+    result = refine(problem, state, tolerance=_COARSE)
+
+    settled, rounds = len(setup.magnifications) < 3, 0
+    tried: list[dict[str, tuple[str, int]]] = []
     while rounds < _MAX_ROUNDS and not settled:
         rounds += 1
         chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH)
-        settled = rounds > 1 and chosen == sizes
+        # Coming back to an earlier choice, two of them are equally good.
+        settled = chosen in tried
         if settled:
             break
-        sizes = chosen
-        functions = enriched(functions, sizes)
+        tried.append(chosen)
+        functions = enriched(with_coefficients(functions, result.state.theta), chosen)
         problem = build_problem(setup, functions, setup.views, _height_sigma(result))
         result = refine(
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
-        functions = with_coefficients(functions, result.state.theta)
-    problem = build_problem(setup, functions, setup.views, _height_sigma(result))
-    result = adjust(problem, result.state)
+    functions = with_coefficients(functions, result.state.theta)
+    height = _height_sigma(result)
+    turned, _ = resolve_mirrored_tilts(
+        build_problem(thin, functions, thin.views, height), result.state
+    )
+    problem = build_problem(setup, functions, setup.views, height)
+    result = refine(problem, turned)
     return JointFit(
         with_coefficients(functions, result.state.theta), result, problem, rounds, settled
     )

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, Problem, State, make_problem, refine
+from semcal_ros.core.bundle import BundleResult, refine
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.model import FUNCTION_NAMES, design_matrix
 from semcal_ros.core.poses import mirrored_tilt
+from semcal_ros.core.reprojection import Problem, State, make_problem
 from semcal_ros.core.views import GridView
 
 __all__ = [

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.bundle import BundleResult, Problem
+from semcal_ros.core.bundle import BundleResult
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.model import FUNCTION_NAMES
 from semcal_ros.core.problem import Setup, variance_factor
+from semcal_ros.core.reprojection import Problem
 
 __all__ = ["Summary", "select_functions"]
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.bundle import State, make_problem, refine, residuals
+from semcal_ros.core.bundle import refine
 from semcal_ros.core.poses import rotations_from_vectors
+from semcal_ros.core.reprojection import State, make_problem, residuals
 from semcal_ros.core.views import GridView
 from semcal_ros.synthetic import preset
 
