@@ -56,7 +56,12 @@ class LiveSuite:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self._executables = Path(get_package_prefix("semcal_ros")) / "lib" / "semcal_ros"
         self._logs = logs
-        self._parameters = {"config": config, "calibration": str(calibration.absolute())}
+        self._parameters = {
+            "config": config,
+            "calibration": str(calibration.absolute()),
+            # Live, the newest frame wins; here all frames are to be measured, however busy the machine is.
+            "qos_overrides./sem/image_raw.subscription.depth": "50",
+        }
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> LiveSuite:

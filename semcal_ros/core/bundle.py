@@ -183,7 +183,9 @@ def _refine_poses(
         pose = normal.matrix[:, 10:, 10:].copy()
         diagonal = np.arange(6)
         pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        change: Array = np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0]
+        change = np.asarray(
+            np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0], dtype=np.float64
+        )
         trial = moved(problem, state, np.zeros_like(state.theta), change)
         trial_costs = view_costs(problem, trial)
         better = trial_costs <= costs

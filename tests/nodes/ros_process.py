@@ -34,6 +34,10 @@ BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+# Every frame counts in a test, however busy the machine is.
+PATIENT = {"qos_overrides./sem/image_raw.subscription.depth": 50}
+
+
 class NodeProcess:
     """One executable; ``output`` is what it wrote so far."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from node_scenes import make_calibration, stamp_of, write_recording
-from ros_process import Peer, running
+from ros_process import PATIENT, Peer, running
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import SetBool
 
@@ -22,10 +22,14 @@ def test_a_stabilized_frame_is_rectified_at_its_own_magnification(tmp_path: Path
     peer = Peer()
     infos = peer.collect(CameraInfo, "camera_info")
     images = peer.collect(Image, "image_rect")
-    settings = {"calibration": tmp_path / "cal.yaml", "input": "stabilized"}
+    settings = {
+        "calibration": tmp_path / "cal.yaml",
+        "input": "stabilized",
+        "qos_overrides./sem/image_stabilized.subscription.depth": 50,
+    }
     playing = {"bag": tmp_path / "bag", "start_paused": True, "wait_for_subscribers": 2}
     with (
-        running("drift_compensator"),
+        running("drift_compensator", PATIENT),
         running("rectifier", settings) as rectifier,
         running("bag_player", playing),
     ):

@@ -16,7 +16,7 @@ from node_scenes import make_calibration, stamp_of, write_recording
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameterTypes
-from ros_process import LATCHED, RELIABLE, NodeProcess, Peer, running
+from ros_process import LATCHED, PATIENT, RELIABLE, NodeProcess, Peer, running
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, String
@@ -55,7 +55,7 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Replay]:
     with (
         running("bag_player", playing) as player,
         running("parameter_server", {"calibration": folder / "cal.yaml"}) as server,
-        running("rectifier") as rectifier,
+        running("rectifier", PATIENT) as rectifier,
     ):
         run = Replay(peer, images, server)
         run.rectified = peer.collect(Image, "image_rect")
@@ -269,7 +269,11 @@ def test_stream_corrector_corrects_every_frame(replay: Replay, tmp_path: Path) -
     infos = peer.collect(CameraInfo, "camera_info")
     drifts = peer.collect(PoseWithCovarianceStamped, "drift")
     velocities = peer.collect(TwistWithCovarianceStamped, "drift_velocity", RELIABLE)
-    with running("stream_corrector", {"config": "virtual_sem"}, *remap) as corrector:
+    settings = {
+        "config": "virtual_sem",
+        "qos_overrides./other/image_raw.subscription.depth": 50,
+    }
+    with running("stream_corrector", settings, *remap) as corrector:
         peer.wait_for(lambda: "calibration from topic" in corrector.output, "the calibration")
         outputs = ("image_rect", "camera_info", "drift", "drift_velocity")
         peer.wait_heard("/other/stream_corrector", *outputs)

@@ -10,7 +10,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
 from node_scenes import stamp_of
 from rcl_interfaces.msg import ParameterType, ParameterValue
-from ros_process import LATCHED, RELIABLE, Peer, running
+from ros_process import LATCHED, PATIENT, RELIABLE, Peer, running
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
@@ -70,7 +70,7 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
     drifts = peer.collect(PoseWithCovarianceStamped, "drift")
     rates = peer.collect(TwistWithCovarianceStamped, "drift_velocity")
     stage = peer.node.create_publisher(Twist, f"{SEM}/stage", RELIABLE)
-    config = {"config": "virtual_sem"}
+    config = {"config": "virtual_sem", **PATIENT}
     with running("drift_compensator", config), running("virtual_sem", SETTINGS):
         outputs = ("image_stabilized", "drift", "drift_velocity")
         peer.wait_heard("/sem/drift_compensator", *outputs)
