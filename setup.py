@@ -29,6 +29,7 @@ NODES = (
 RUNTIME = (
     "click>=8.1",
     "jinja2>=3.0",
+    "joblib>=1.3",
     "jsonschema>=4.10",
     "matplotlib>=3.6",
     "numpy>=1.26",

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from joblib import Parallel, cpu_count, delayed
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.config import MicroscopeConfig, load_config
@@ -39,6 +39,8 @@ __all__ = [
 
 Progress = Callable[[int], None]
 
+# Fewer images are found sooner than other processes have started.
+_TOO_FEW_TO_SHARE = 12
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
 
@@ -85,42 +87,45 @@ class RecordingCalibration:
     collected: CollectedViews
 
 
-def _detect(item: tuple[str, NDArray[Any], float]) -> FoundView:
-    name, image, magnification = item
+def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView:
+    # The images are the parallel work; threads inside OpenCV would only compete.
+    cv2.setNumThreads(1)
     return FoundView(name, magnification, image, find_lattice(image))
 
 
-def _in_batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
-    iterator = iter(items)
-    while batch := list(islice(iterator, size)):
-        yield batch
-
-
 def find_views(
-    frames: Iterable[tuple[str, NDArray[Any], float]], *, on_progress: Progress | None = None
+    frames: Iterable[tuple[str, NDArray[Any], float]],
+    *,
+    on_progress: Progress | None = None,
+    processes: int | None = None,
 ) -> tuple[list[FoundView], list[RejectedView]]:
     """Find the grid in (name, grey image, magnification) frames, on all cores.
 
-    Frames are taken from the iterable a few at a time, so a long recording is never in memory as a whole.
+    Parameters
+    ----------
+    frames
+        Taken a few at a time, so a long recording is never in memory as a whole.
+    on_progress
+        Called with 1 after each frame.
+    processes
+        Number of processes; one per core without. 1 works in this process.
     """
     found: list[FoundView] = []
     rejected: list[RejectedView] = []
-    workers = os.cpu_count() or 1
+    iterator = iter(frames)
+    first = list(islice(iterator, _TOO_FEW_TO_SHARE))
+    if len(first) < _TOO_FEW_TO_SHARE:
+        processes = 1
+    work = Parallel(n_jobs=processes or cpu_count(), return_as="generator")
     threads = cv2.getNumThreads()
-    # The frames are the parallel work; threads inside OpenCV would only compete.
-    cv2.setNumThreads(1)
     try:
-        with ThreadPoolExecutor(workers) as pool:
-            for batch in _in_batches(frames, 4 * workers):
-                for view in pool.map(_detect, batch):
-                    if view.detection.accepted:
-                        found.append(view)
-                    else:
-                        rejected.append(
-                            RejectedView(view.name, view.magnification, view.detection.reason)
-                        )
-                    if on_progress is not None:
-                        on_progress(1)
+        for view in work(delayed(_detect)(*frame) for frame in chain(first, iterator)):
+            if view.detection.accepted:
+                found.append(view)
+            else:
+                rejected.append(RejectedView(view.name, view.magnification, view.detection.reason))
+            if on_progress is not None:
+                on_progress(1)
     finally:
         cv2.setNumThreads(threads)
     return found, rejected
