@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -23,7 +23,7 @@ from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.core.model import checked_magnification
 from semcal_ros.core.views import GridView, SquareAssignment, views_from_detections
-from semcal_ros.files.recordings import open_recording
+from semcal_ros.files.recordings import Recording, open_recording
 
 __all__ = [
     "CollectedViews",
@@ -35,6 +35,7 @@ __all__ = [
     "calibrate_recording",
     "collect_views",
     "find_views",
+    "named_frames",
 ]
 
 Progress = Callable[[int], None]
@@ -62,6 +63,7 @@ class RejectedView:
     name: str
     magnification: float
     reason: str
+    image: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,12 @@ def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView:
     # The images are the parallel work; threads inside OpenCV would only compete.
     cv2.setNumThreads(1)
     return FoundView(name, magnification, image, find_lattice(image))
+
+
+def named_frames(recording: Recording) -> Iterator[tuple[str, NDArray[Any], float]]:
+    """(name, grey image, magnification) of each usable frame of an open recording."""
+    for index, frame in enumerate(recording.frames()):
+        yield f"frame {index}", to_gray(frame.image, frame.encoding), frame.magnification
 
 
 def find_views(
@@ -123,7 +131,8 @@ def find_views(
             if view.detection.accepted:
                 found.append(view)
             else:
-                rejected.append(RejectedView(view.name, view.magnification, view.detection.reason))
+                reason = view.detection.reason
+                rejected.append(RejectedView(view.name, view.magnification, reason, view.image))
             if on_progress is not None:
                 on_progress(1)
     finally:
@@ -230,11 +239,7 @@ def calibrate_recording(
         If its images do not allow a calibration.
     """
     with open_recording(path, config) as recording:
-        frames = (
-            (f"frame {i}", to_gray(f.image, f.encoding), f.magnification)
-            for i, f in enumerate(recording.frames())
-        )
-        found, rejected = find_views(frames, on_progress=on_progress)
+        found, rejected = find_views(named_frames(recording), on_progress=on_progress)
     return calibrate_found(
         found,
         rejected,

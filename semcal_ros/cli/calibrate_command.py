@@ -9,7 +9,7 @@ import click
 from semcal_ros.cli.common import config_option, configured, echo_table, progress, require_folder
 from semcal_ros.core.calibrate import METHODS, MethodOptions
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views
+from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views, named_frames
 
 __all__ = ["command"]
 
@@ -49,10 +49,9 @@ def command(
     microscope = configured(config)
     with open_recording(recording, microscope) as opened:
         with progress(opened.frame_count, "finding corners") as bar:
-            frames = (
-                (f"frame {i}", f.image, f.magnification) for i, f in enumerate(opened.frames())
+            found, rejected = find_views(
+                named_frames(opened), on_progress=lambda n: bar.update(n) and None
             )
-            found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
         notes = opened.notes
     with progress(None, "adjusting"):
         done = calibrate_found(
@@ -67,7 +66,7 @@ def command(
     _tell(done, notes)
     click.echo(f"calibration: {output}")
     if report is not None:
-        _write_report(done, report)
+        _write_report(done, report, f"Calibration from {recording.absolute().name}")
         click.echo(f"report: {report}")
 
 
@@ -110,9 +109,13 @@ def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
         click.echo(f"warning: {warning}", err=True)
 
 
-def _write_report(done: RecordingCalibration, path: Path) -> None:
+def _write_report(done: RecordingCalibration, path: Path, title: str) -> None:
     from semcal_ros.report import calibration_report
 
     calibration_report(
-        done.result, path, detections=done.collected.found, rejected=done.collected.rejected
+        done.result,
+        path,
+        detections=done.collected.found,
+        rejected=done.collected.rejected,
+        title=title,
     )

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, echo_json, echo_table, progress
 from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.pipeline import collect_views, find_views
+from semcal_ros.pipeline import collect_views, find_views, named_frames
 
 __all__ = ["command"]
 
@@ -36,11 +35,9 @@ def command(calibration: Path, recording: Path, config: str, as_json: bool) -> N
         open_recording(recording, microscope) as opened,
         progress(opened.frame_count, "finding corners") as bar,
     ):
-        frames = (
-            (f"frame {i}", to_gray(f.image, f.encoding), f.magnification)
-            for i, f in enumerate(opened.frames())
+        found, rejected = find_views(
+            named_frames(opened), on_progress=lambda n: bar.update(n) and None
         )
-        found, rejected = find_views(frames, on_progress=lambda n: bar.update(n) and None)
     collected = collect_views(
         found,
         rejected,

@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
+_RESERVE, _LEAST_SIZE = 1, 4
 _HEIGHT_UPDATES = 3
 # For what only has to be near: signs of tilts, poses, moderately flexible functions.
 _ENOUGH_CORNERS = 60
@@ -113,6 +114,23 @@ def _started(setup: Setup) -> tuple[Functions, State, float]:
     return with_coefficients(functions, result.state.theta), result.state, height
 
 
+def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
+    """The functions with some more coefficients than were chosen, held near zero by their priors.
+
+    A coefficient that is left out counts as known to be zero. What the data do not tell about it belongs into the
+    uncertainty of the calibration.
+    """
+    sizes = {
+        name: (functions[name].kind, max(functions[name].size + _RESERVE, _LEAST_SIZE))
+        for name in _SMOOTH
+    }
+    return (
+        enriched(functions, sizes)
+        if functions["scale"].g_range[0] < functions["scale"].g_range[1]
+        else dict(functions)
+    )
+
+
 def fit_joint(setup: Setup) -> JointFit:
     """Calibrate from nominal values alone.
 
@@ -126,25 +144,22 @@ def fit_joint(setup: Setup) -> JointFit:
     result = refine(problem, state, tolerance=_COARSE)
 
     settled, rounds = len(setup.magnifications) < 3, 0
-    tried: list[dict[str, tuple[str, int]]] = []
+    sizes: dict[str, tuple[str, int]] | None = None
     while rounds < _MAX_ROUNDS and not settled:
         rounds += 1
-        chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH)
-        # Coming back to an earlier choice, two of them are equally good.
-        settled = chosen in tried
+        chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
+        settled = chosen == sizes
         if settled:
             break
-        tried.append(chosen)
+        sizes = chosen
         functions = enriched(with_coefficients(functions, result.state.theta), chosen)
         problem = build_problem(setup, functions, setup.views, _height_sigma(result))
         result = refine(
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
-    functions = with_coefficients(functions, result.state.theta)
-    height = _height_sigma(result)
-    turned, _ = resolve_mirrored_tilts(
-        build_problem(thin, functions, thin.views, height), result.state
-    )
+    functions = _with_reserve(with_coefficients(functions, result.state.theta))
+    state, height = replace(result.state, theta=theta_of(functions)), _height_sigma(result)
+    turned, _ = resolve_mirrored_tilts(build_problem(thin, functions, thin.views, height), state)
     problem = build_problem(setup, functions, setup.views, height)
     result = refine(problem, turned)
     return JointFit(

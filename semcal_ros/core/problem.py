@@ -50,6 +50,10 @@ class Priors:
         Distortion about zero.
     aspect_sigma, skew_sigma, scale_sigma
         About 1, 0 and the nominal scale.
+    scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
+        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, k times over. A few times
+        what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a magnification.
+        What the data cannot tell of a change is uncertain by this much, and not taken for none.
     height_sigma_m
         Height of a view about the reference plane; re-estimated from the data.
     """
@@ -63,6 +67,12 @@ class Priors:
     aspect_sigma: float = 0.05
     skew_sigma: float = 0.02
     scale_sigma: float = 0.5
+    scale_change: float = 0.02
+    aspect_change: float = 0.01
+    skew_change: float = 0.002
+    xi_r_change: float = 0.02
+    xi_t_change: float = 0.005
+    centre_change_fraction: float = 0.02
     height_sigma_m: float = 1e-4
 
 
@@ -89,6 +99,33 @@ class Setup:
     def nominal_px_per_m(self, g: Array) -> Array:
         """Scales that the display width alone predicts."""
         return np.asarray(g * self.image_size[0] / self.display_width_m, dtype=np.float64)
+
+    def change_prior_of(self, name: str) -> float:
+        """1-sigma of the change of a camera parameter over the calibrated range."""
+        p = self.priors
+        centre = p.centre_change_fraction * self.image_size[0]
+        return {
+            "scale": p.scale_change,
+            "aspect": p.aspect_change,
+            "skew": p.skew_change,
+            "xi_r": p.xi_r_change,
+            "xi_t": p.xi_t_change,
+            "ex": centre,
+            "ey": centre,
+        }.get(name, self.prior_of(name)[1])
+
+    def coefficient_priors(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
+        """(size,) means and sigmas of the coefficients of a camera parameter's function.
+
+        The constant of a polynomial has the parameter's own prior, the others say how it changes; all values of a
+        table have the parameter's own.
+        """
+        mean, sigma = self.prior_of(name)
+        if kind == "linear_log":
+            return np.full(size, mean), np.full(size, sigma)
+        order = np.arange(1, size)
+        sigmas = np.concatenate([[sigma], self.change_prior_of(name) / order])
+        return np.concatenate([[mean], np.zeros(size - 1)]), sigmas
 
     def prior_of(self, name: str) -> tuple[float, float]:
         """(mean, sigma) of a camera parameter."""
@@ -133,14 +170,12 @@ def build_problem(
 
 
 def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
-    """(K,) means and sigmas of all coefficients: the parameter's own for the constant, zero mean for the others."""
-    means, sigmas = [], []
-    for name in FUNCTION_NAMES:
-        mean, sigma = setup.prior_of(name)
-        size = functions[name].size
-        means.append(np.concatenate([[mean], np.zeros(size - 1)]))
-        sigmas.append(np.full(size, sigma))
-    return np.concatenate(means), np.concatenate(sigmas)
+    """(K,) means and sigmas of all coefficients, as in :meth:`Setup.coefficient_priors`."""
+    parts = [
+        setup.coefficient_priors(name, functions[name].kind, functions[name].size)
+        for name in FUNCTION_NAMES
+    ]
+    return np.concatenate([m for m, _ in parts]), np.concatenate([s for _, s in parts])
 
 
 def with_coefficients(functions: Functions, theta: Array) -> dict[str, ContinuousFunction]:

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 _MAX_SIZE = 8
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0
+# Half chi-squares by which a choice must be better to replace the one before.
+_CLEARLY = 2.0
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class _Candidates:
         for row, (name, block) in enumerate(zip(FUNCTION_NAMES, blocks, strict=True)):
             stop = column + block.shape[1]
             designs[:, row, column:stop] = block
-            centre, sigma = self.setup.prior_of(name)
-            mean[column] = centre
+            centre, sigma = self.setup.coefficient_priors(name, *sizes[name])
+            mean[column:stop] = centre
             precision[column:stop] = sigma**-2.0
             column = stop
         transposed = np.swapaxes(designs, 1, 2)
@@ -116,11 +118,13 @@ def select_functions(
     setup: Setup,
     functions: Mapping[str, ContinuousFunction],
     free: Sequence[str],
+    current: Mapping[str, tuple[str, int]] | None = None,
 ) -> dict[str, tuple[str, int]]:
     """Greedy choice of (kind, size) for the functions named in ``free``.
 
     Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the cross-validation gains
-    more than :data:`_GAIN_PER_COEFFICIENT` for each, and taken away again where that costs less.
+    more than :data:`_GAIN_PER_COEFFICIENT` for each, and taken away again where that costs less. The ``current``
+    choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions)
     limit = min(_MAX_SIZE, len(setup.magnifications) - 1)
@@ -136,8 +140,14 @@ def select_functions(
             if gain > 1e-6 and (best is None or gain > best[0]):
                 best = (gain, name, option)
         if best is None:
-            return {name: sizes[name] for name in free}
+            break
         sizes[best[1]] = best[2]
+    if current is not None:
+        kept = {**sizes, **current}
+        more = sum(kept[name][1] - sizes[name][1] for name in free)
+        if candidates.score(kept) + _GAIN_PER_COEFFICIENT * more < score + _CLEARLY:
+            sizes = kept
+    return {name: sizes[name] for name in free}
 
 
 def _moves(

@@ -118,6 +118,16 @@ def assign_squares(
     )
 
 
+def _centred_ij(detection: LatticeDetection) -> Array:
+    """(n, 2) lattice indices with the origin at the corner nearest to the middle of the image.
+
+    The height of a view is that of its origin, and what its prior speaks of is the height of what is looked at.
+    """
+    middle = 0.5 * (np.array(detection.image_size, dtype=np.float64) - 1.0)
+    nearest = np.argmin(np.sum((detection.xy - middle) ** 2, axis=1))
+    return np.asarray(detection.ij - detection.ij[nearest], dtype=np.float64)
+
+
 def views_from_detections(
     detections: Sequence[LatticeDetection],
     magnifications: Sequence[float],
@@ -161,9 +171,7 @@ def views_from_detections(
     assignment = assign_squares(spacing, nominal, squares_m)
     labels = names if names is not None else [str(i) for i in range(len(detections))]
     views = tuple(
-        GridView(
-            float(g), np.asarray(d.ij * float(square), dtype=np.float64), d.xy, d.sigma_px, label
-        )
+        GridView(float(g), _centred_ij(d) * float(square), d.xy, d.sigma_px, label)
         for d, g, square, label in zip(
             detections, magnifications, assignment.square_m, labels, strict=True
         )

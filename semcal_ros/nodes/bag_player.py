@@ -49,6 +49,10 @@ class BagPlayer(SemNode):
     """Publishes the stored bytes of a recording; the node ends with the recording unless it loops."""
 
     def __init__(self) -> None:
+        # The middleware may end a node that is still being made.
+        self._changed = threading.Condition()
+        self._ended = False
+        self._thread: threading.Thread | None = None
         super().__init__("bag_player", _SETTINGS)
         if not self.settings["bag"]:
             raise ConfigError(
@@ -61,10 +65,8 @@ class BagPlayer(SemNode):
             self.create_publisher(ClockMessage, "/clock", 10) if self.settings["clock"] else None
         )
         self._pacer = Pacer(self.settings["rate"], paused=self.settings["start_paused"])
-        self._changed = threading.Condition()
         # Shutting the context down from the replay's own thread would make that thread wait for itself.
         self._end = self.create_guard_condition(self._leave)
-        self._ended = False
         self.settings.on_change("rate", self._set_rate)
         self._service = self.create_service(SetBool, "~/pause", self._on_pause)
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
@@ -83,8 +85,9 @@ class BagPlayer(SemNode):
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-        self._thread.join(timeout=5.0)
-        self._bag.close()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._bag.close()
         super().destroy_node()
 
     # -- topics ------------------------------------------------------------------------------------

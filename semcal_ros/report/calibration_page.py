@@ -12,42 +12,56 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibrate import CalibrationResult
 from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.evaluate import rms_by_magnification
 from semcal_ros.core.model import CalibrationModel
-from semcal_ros.report.curve_figures import (
-    parameter_pictures,
-    pixel_size_pictures,
-    rms_picture,
-    sigma_picture,
+from semcal_ros.report.coverage_figures import (
+    coverage_picture,
+    filled_picture,
+    pose_picture,
+    tilt_picture,
 )
+from semcal_ros.report.error_figures import residual_histogram, rms_picture
 from semcal_ros.report.examples import (
     ExampleView,
     UnusedView,
     best_per_magnification,
     overlay_of,
+    rejected_pictures,
 )
 from semcal_ros.report.field_figures import (
-    coverage_picture,
     distortion_picture,
     mean_residual_picture,
-    pose_picture,
+    residual_field_pictures,
     residual_picture,
 )
 from semcal_ros.report.findings import findings
+from semcal_ros.report.geometry import rms_without_distortion
 from semcal_ros.report.numbers import (
     PAPER_RMS_PX,
     facts,
+    fitted_inner_px,
     format_length,
     format_px,
     held_out_px,
     magnification_rows,
     plain,
+    view_rows,
 )
 from semcal_ros.report.page import render, write_page
+from semcal_ros.report.paper import paper_rows
+from semcal_ros.report.parameter_figures import parameter_groups
 from semcal_ros.report.pictures import captioned_pictures
+from semcal_ros.report.pixel_size_figures import pixel_size_pictures
+from semcal_ros.report.prediction_figures import prediction_pictures
 
 __all__ = ["calibration_report"]
 
 _MAX_OVERLAYS = 24
+# Seen at once; the others unfold.
+_FIRST_OVERLAYS = 8
+_MAX_THUMBNAILS = 12
+_MAX_REJECTED = 200
+_WORST_VIEWS = 5
 
 
 def calibration_report(
@@ -70,7 +84,8 @@ def calibration_report(
     detections
         Images with their corners; the one with most corners is shown for each magnification.
     rejected
-        Images that were not used, with the reason.
+        Images that were not used, with the reason; with their picture where they have an
+        attribute ``image``.
     images
         More pictures as (caption, image), shown at the end.
     title
@@ -89,18 +104,41 @@ def calibration_report(
     model = result.model
     extra = captioned_pictures(images)
     shown = _spread(best_per_magnification(detections), _MAX_OVERLAYS)
+    first = _spread(shown, _FIRST_OVERLAYS)
+    examples = _low_middle_high(model)
+    rms, straight = rms_by_magnification(result.fit), rms_without_distortion(result)
     values = {
         "title": plain(title),
         "summary": _summary(result, len(rejected)),
-        "warnings": findings(result),
-        "overlays": [overlay_of(view) for view in shown],
-        "coverage": [coverage_picture(result), pose_picture(result)],
-        "residuals": [mean_residual_picture(result), residual_picture(result)],
-        "errors": [rms_picture(result), sigma_picture(model)],
+        "warnings": findings(result, rejected),
+        "errors": [rms_picture(result, straight)],
+        "paper": paper_rows(result, rms, straight),
+        "predicted": prediction_pictures(model),
+        "residuals": [
+            mean_residual_picture(result),
+            residual_picture(result),
+            residual_histogram(result),
+        ],
+        "distortion": [distortion_picture(camera) for camera in examples],
+        "residual_field": residual_field_pictures(model, examples),
         "pixel_size": pixel_size_pictures(model),
-        "distortion": [distortion_picture(camera) for camera in _low_middle_high(model)],
-        "parameters": parameter_pictures(model),
-        "rejected": [(plain(r.name), f"{r.magnification:g}×", plain(r.reason)) for r in rejected],
+        "parameters": parameter_groups(model),
+        "coverage": [
+            coverage_picture(result),
+            filled_picture(result),
+            pose_picture(result),
+            tilt_picture(result),
+        ],
+        "overlays": [overlay_of(view) for view in first],
+        "more_overlays": [overlay_of(v) for v in shown if all(v is not f for f in first)],
+        "refused_corners": sum(d.detection.rejected for d in detections),
+        "rejected_images": rejected_pictures(rejected, _MAX_THUMBNAILS),
+        "rejected": [
+            (plain(r.name), f"{r.magnification:g}×", plain(r.reason))
+            for r in rejected[:_MAX_REJECTED]
+        ],
+        "rejected_count": len(rejected),
+        "worst_views": view_rows(result)[:_WORST_VIEWS],
         "rows": magnification_rows(result),
         "facts": facts(result),
         "images": extra,
@@ -140,11 +178,12 @@ def _summary(result: CalibrationResult, rejected: int) -> list[tuple[str, str, s
         (
             "Held-out error",
             format_px(held_out),
-            f"RMS, inner magnifications; {paper}"
+            "RMS of images left out, without the outermost magnifications; "
+            f"fitted: {format_px(fitted_inner_px(result))}"
             if held_out is not None
             else "needs 3 magnifications",
         ),
-        ("Error of all views", format_px(result.fit.rms_px()), f"RMS; {paper}"),
+        ("Error of all views", format_px(result.fit.rms_px()), f"RMS of all corners; {paper}"),
         ("Magnification", span, f"{len(model.magnifications)} calibrated, continuous in between"),
         ("Pixel size", pixel, "along x"),
         ("Views", f"{len(result.views)} used", f"{rejected} rejected"),

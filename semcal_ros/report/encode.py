@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.core.errors import InvalidValueError
 
@@ -21,6 +22,8 @@ __all__ = ["Picture", "as_bytes_image", "data_uri", "jpeg_of", "picture_of_figur
 _FIGURE_DPI = 192.0
 _CSS_PX_PER_INCH = 96.0
 _JPEG_QUALITY = 82
+# Line drawings with soft edges need no more colours; the file is three times smaller than in RGB.
+_COLORS = 128
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,18 @@ def data_uri(kind: str, data: bytes) -> str:
 
 def picture_of_figure(figure: Figure, alt: str, caption: str = "") -> Picture:
     """The figure as a PNG picture; the figure is emptied afterwards, so that its memory is free."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_FIGURE_DPI)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=_FIGURE_DPI)
     width, height = figure.get_size_inches() * _CSS_PX_PER_INCH
     figure.clear()
+    with Image.open(drawn) as image:
+        few = image.convert("RGB").quantize(
+            _COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+        )
+    small = io.BytesIO()
+    few.save(small, format="png", optimize=True)
     return Picture(
-        data_uri("png", buffer.getvalue()), alt, caption, round(float(width)), round(float(height))
+        data_uri("png", small.getvalue()), alt, caption, round(float(width)), round(float(height))
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,10 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.corners import LatticeDetection
-from semcal_ros.report.encode import as_bytes_image, data_uri, jpeg_of, shrunk
+from semcal_ros.report.encode import Picture, as_bytes_image, data_uri, jpeg_of, shrunk
 from semcal_ros.report.numbers import plain
 
-__all__ = ["ExampleView", "Overlay", "UnusedView", "best_per_magnification", "overlay_of"]
+__all__ = [
+    "ExampleView",
+    "Overlay",
+    "UnusedView",
+    "best_per_magnification",
+    "overlay_of",
+    "rejected_pictures",
+]
 
 Array = NDArray[np.float64]
 
@@ -23,6 +31,7 @@ _OVERLAY_WIDTH = 320
 _MARK_OF_SPACING = 0.2
 _MARK_LIMITS_PX = (0.8, 4.0)
 _JPEG_QUALITY = 70
+_REJECTED_WIDTH = 200
 
 
 class ExampleView(Protocol):
@@ -46,7 +55,10 @@ class ExampleView(Protocol):
 
 
 class UnusedView(Protocol):
-    """What the report needs of an image that was not used."""
+    """What the report needs of an image that was not used.
+
+    An attribute ``image`` with the pixels, where there is one, is shown too.
+    """
 
     @property
     def name(self) -> str:
@@ -109,6 +121,8 @@ def overlay_of(view: ExampleView) -> Overlay:
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
     xy = (np.asarray(view.detection.xy, dtype=np.float64) + 0.5) * factor
     count = len(xy)
+    refused = view.detection.rejected
+    dropped = f", {refused} refused" if refused else ""
     sigma = view.detection.sigma_px
     precision = f", median 1-sigma {np.median(sigma):.3f} px" if len(sigma) else ""
     return Overlay(
@@ -117,5 +131,27 @@ def overlay_of(view: ExampleView) -> Overlay:
         height=small.shape[0],
         marks=_marks(xy, view.detection.spacing_px * factor),
         alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
-        caption=plain(f"{view.magnification:g}×: {count} corners{precision} ({view.name})"),
+        caption=plain(
+            f"{view.magnification:g}×: {count} corners{dropped}{precision} ({view.name})"
+        ),
     )
+
+
+def rejected_pictures(views: Sequence[UnusedView], count: int) -> list[Picture]:
+    """Thumbnails of rejected images that carry their pixels, different reasons first."""
+    ranked: list[tuple[int, int]] = []
+    seen: Counter[str] = Counter()
+    for index, view in enumerate(views):
+        if getattr(view, "image", None) is not None:
+            ranked.append((seen[view.reason], index))
+            seen[view.reason] += 1
+    pictures = []
+    for _, index in sorted(ranked)[:count]:
+        view = views[index]
+        image: NDArray[Any] = getattr(view, "image")  # noqa: B009
+        small, _ = shrunk(as_bytes_image(image), _REJECTED_WIDTH)
+        text = plain(f"{view.magnification:g}×: {view.reason} ({view.name})")
+        src = data_uri("jpeg", jpeg_of(small, _JPEG_QUALITY))
+        alt = f"Rejected image, {text}"
+        pictures.append(Picture(src, alt, text, small.shape[1], small.shape[0]))
+    return pictures

@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 import numpy as np
 
 from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.evaluate import rms_by_magnification
-from semcal_ros.report.field_figures import empty_share, tilts_deg
-from semcal_ros.report.numbers import plain
+from semcal_ros.report.cells import all_corners, cells_of, empty_share, filled_shares
+from semcal_ros.report.coverage_figures import tilts_deg
+from semcal_ros.report.error_figures import normalised_residuals
+from semcal_ros.report.examples import UnusedView
+from semcal_ros.report.geometry import field_lattice, shape_sigma_px
+from semcal_ros.report.numbers import format_magnification, plain, view_rows
 
-__all__ = ["findings"]
+__all__ = ["findings", "pattern_px"]
 
 _EMPTY_SHARE = 0.05
 _SMALL_TILT_DEG = 5.0
 # Predicting a magnification from the others is a little worse than fitting it; this much worse
 # means that the functions between the magnifications miss something.
 _HELD_OUT_RATIO = 1.5
+_FILLED_SHARE = 0.5
+_REJECTED_SHARE = 1.0 / 3.0
+# A view whose corners fit this much worse than they should.
+_VIEW_RATIO = 3.0
+# Mean squares of the cells' mean residuals over those of chance, and their size in px, beyond which
+# they are a pattern.
+_PATTERN_RATIO = 3.0
+_PATTERN_PX = 0.02
+# Beyond this predicted error, between two calibrated magnifications or at one, more images help.
+_SIGMA_PX = 2.0
+_PATTERN_CELLS = 8
+_MIN_IN_CELL = 5
+_NAMED = 5
 
 
 def _sentence(text: str) -> str:
@@ -23,12 +44,42 @@ def _sentence(text: str) -> str:
     return clean[:1].upper() + clean[1:].rstrip(".") + "."
 
 
-def findings(result: CalibrationResult) -> list[str]:
+def _listed(items: Sequence[str]) -> str:
+    more = len(items) - _NAMED
+    return ", ".join(items[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def findings(result: CalibrationResult, rejected: Sequence[UnusedView] = ()) -> list[str]:
     """The warnings of the calibration, then what an expert would see in the report's pictures."""
-    found = [*result.warnings, *_field(result), *_held_out(result)]
+    found = [
+        *result.warnings,
+        *_views(result, rejected),
+        *_field(result),
+        *_held_out(result),
+        *_pattern(result),
+        *_predicted(result),
+    ]
     if not result.fit.converged:
         found.append("the poses of some views did not settle; their residuals may be too large")
     return [_sentence(text) for text in dict.fromkeys(found)]
+
+
+def _views(result: CalibrationResult, rejected: Sequence[UnusedView]) -> list[str]:
+    found = []
+    total = len(rejected) + len(result.views)
+    if len(rejected) > _REJECTED_SHARE * total:
+        reason, count = Counter(r.reason for r in rejected).most_common(1)[0]
+        found.append(
+            f"{len(rejected)} of {total} views were rejected, {count} of them for this reason: "
+            f"{reason}"
+        )
+    bad = [f"{r.name} ({r.magnification})" for r in view_rows(result) if r.ratio > _VIEW_RATIO]
+    if bad:
+        found.append(
+            f"the corners of {_listed(bad)} fit more than {_VIEW_RATIO:g} times worse than their "
+            "own uncertainty: look at these images, and leave them out if something is wrong"
+        )
+    return found
 
 
 def _field(result: CalibrationResult) -> list[str]:
@@ -38,6 +89,14 @@ def _field(result: CalibrationResult) -> list[str]:
         found.append(
             f"{100.0 * empty:.0f} % of the image field has no corner in any view: "
             "the distortion there is extrapolated; let the grid fill the image"
+        )
+    shares = filled_shares(result)
+    poor = [f"{g:g}×" for g, share in shares.items() if share < _FILLED_SHARE]
+    # All of them: that is the sentence before, or a very coarse grid.
+    if 0 < len(poor) < len(shares):
+        found.append(
+            f"at {_listed(poor)} the corners reach less than half of the image field: the "
+            "distortion there comes from other magnifications; let the grid fill the image"
         )
     largest = float(np.max(tilts_deg(result)[0]))
     if largest < _SMALL_TILT_DEG:
@@ -61,5 +120,63 @@ def _held_out(result: CalibrationResult) -> list[str]:
         return [
             f"the images at {', '.join(worse)} are predicted badly from the other magnifications: "
             "take images at more magnifications around there"
+        ]
+    return []
+
+
+def pattern_px(result: CalibrationResult) -> tuple[float, float]:
+    """Size in px of a pattern in the residuals over the field, and its ratio to chance.
+
+    The ratio compares the squares of the cells' weighted mean residuals with what independent
+    corners of the same spread would give; 1 is pure chance.
+    """
+    xy, residuals = all_corners(result)
+    weights = np.concatenate([v.sigma_px for v in result.views]) ** -2.0
+    cells = cells_of(result, xy, _PATTERN_CELLS)
+    size = cells.columns * cells.rows
+    enough = cells.counts >= _MIN_IN_CELL
+    if not np.any(enough):
+        return 0.0, 1.0
+    total = np.bincount(cells.index, weights, size)[enough]
+    sums = np.stack(
+        [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
+    )
+    # The median does not see outliers; 0.6745 is that of a normal distribution.
+    spread = float(np.median(np.abs(normalised_residuals(result)))) / 0.6745
+    chance = spread**2 / total
+    squares = np.sum((sums / total[:, None]) ** 2, axis=1)
+    excess = float(np.mean(squares - 2.0 * chance))
+    if not np.all(chance > 0.0):
+        return 0.0, 1.0
+    return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / (2.0 * chance)))
+
+
+def _pattern(result: CalibrationResult) -> list[str]:
+    size, ratio = pattern_px(result)
+    if ratio > _PATTERN_RATIO and size > _PATTERN_PX:
+        return [
+            f"the residuals have a pattern over the field of {size:.2f} px RMS, more than chance "
+            "explains: the scan has a distortion that the model does not describe"
+        ]
+    return []
+
+
+def _predicted(result: CalibrationResult) -> list[str]:
+    """The gap between calibrated magnifications in which positions are least certain."""
+    model = result.model
+    low, high = model.magnification_range
+    lattice = field_lattice(*model.image_size, 5)
+    try:
+        worst = {
+            float(g): float(np.nanmax(shape_sigma_px(model.at(float(g)), lattice)))
+            for g in np.clip(np.geomspace(low, high, 41 if high > low else 1), low, high)
+        }
+    except (InvalidValueError, ValueError):
+        return []
+    g = max(worst, key=lambda x: worst[x])
+    if worst[g] > _SIGMA_PX:
+        return [
+            f"around {format_magnification(g, 2)} positions at the edge of the image are uncertain "
+            f"by {worst[g]:.1f} px relative to its centre: take more images there, tilted in different directions"
         ]
     return []

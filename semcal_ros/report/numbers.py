@@ -15,15 +15,19 @@ from semcal_ros.core.evaluate import rms_by_magnification
 __all__ = [
     "PAPER_RMS_PX",
     "MagnificationRow",
+    "ViewRow",
     "facts",
+    "fitted_inner_px",
     "format_length",
+    "format_magnification",
     "format_px",
     "held_out_px",
     "magnification_rows",
     "plain",
+    "view_rows",
 ]
 
-# Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: abstract and section 4.2.
+# Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
 PAPER_RMS_PX = (0.9, 1.45)
 
 _METHODS = {
@@ -50,6 +54,11 @@ def format_length(length_m: float, sigma_m: float | None = None) -> str:
     sigma = factor * sigma_m
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
     return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+
+def format_magnification(g: float, digits: int = 4) -> str:
+    """A magnification with so many digits, never with an exponent."""
+    return f"{float(f'{g:.{digits}g}'):.10g}×"
 
 
 def format_px(value: float | None) -> str:
@@ -115,6 +124,48 @@ def held_out_px(result: CalibrationResult) -> float | None:
     return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
 
 
+def fitted_inner_px(result: CalibrationResult) -> float | None:
+    """As :func:`held_out_px` for the fitted errors of the same magnifications."""
+    rms = rms_by_magnification(result.fit)
+    inner = [rms[g] for g in result.model.magnifications[1:-1] if g in result.held_out_rms_px]
+    return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """How well one view fits.
+
+    Attributes
+    ----------
+    ratio
+        RMS error over what the 1-sigma of the corners predicts.
+    """
+
+    name: str
+    magnification: str
+    corners: int
+    rms: str
+    ratio: float
+
+
+def view_rows(result: CalibrationResult) -> list[ViewRow]:
+    """All views, those first whose corners fit worst for their uncertainty."""
+    rows = []
+    for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
+        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        expected = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
+        rows.append(
+            ViewRow(
+                plain(view.name) or "(no name)",
+                f"{view.magnification:g}×",
+                len(residuals),
+                format_px(rms),
+                rms / expected,
+            )
+        )
+    return sorted(rows, key=lambda r: -r.ratio)
+
+
 def facts(result: CalibrationResult) -> list[tuple[str, str]]:
     """How the calibration was computed, as (name, value) pairs."""
     model = result.model
@@ -126,6 +177,11 @@ def facts(result: CalibrationResult) -> list[tuple[str, str]]:
         ("Display width of the magnification", f"{1e3 * model.display_width_m:g} mm"),
         ("Poses of the report's residuals", "settled" if result.fit.converged else "not settled"),
     ]
+    squares = statistics.get("squares_m")
+    if squares:
+        pairs.append(("Squares of the grid", ", ".join(f"{1e6 * s:g} µm" for s in squares)))
+    if statistics.get("scale_over_nominal"):
+        pairs.append(("Observed scale over nominal", f"{statistics['scale_over_nominal']:.4f}"))
     fit = statistics.get("fit", {})
     if isinstance(fit, Mapping):
         pairs += _fit_facts(fit)

@@ -7,18 +7,27 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import (
+    FixedLocator,
+    FuncFormatter,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+)
 from numpy.typing import NDArray
 
 __all__ = [
     "ACCENT",
     "INK",
+    "LIGHT_MAP",
     "MUTED",
     "OURS",
     "REFERENCE",
     "SECOND",
     "field_axes",
+    "labelled_contours",
     "legend",
     "log_axis_y",
     "log_ticks",
@@ -36,6 +45,8 @@ OURS = "#0b5fa5"
 SECOND = "#b4441a"
 ACCENT = "#3a7d34"
 REFERENCE = "#7a4f9a"
+# From white to a blue on which dark numbers can still be read.
+LIGHT_MAP = LinearSegmentedColormap.from_list("light", ["#ffffff", "#d3e4f3", "#8fbfe0"])
 _GRID = "#dde2e8"
 _TEXT_PT = 9.0
 
@@ -115,3 +126,20 @@ def nice_factor(length_px: float, target_px: float) -> float:
     ratio = max(target_px / length_px, 1e-3)
     power = 10.0 ** np.floor(np.log10(ratio))
     return float(power * max(s for s in (1.0, 2.0, 5.0) if s * power <= ratio * (1.0 + 1e-9)))
+
+
+def labelled_contours(
+    axes: Axes, x: Array, y: Array, table: Array, top: float, *, lines: int = 6
+) -> None:
+    """Contours at round values up to ``top`` with their numbers, so that no colour has to be read."""
+    known = table[np.isfinite(table)]
+    if not known.size or float(np.ptp(known)) <= 1e-12 * max(abs(top), 1.0):
+        return
+    low, high = float(known.min()), float(known.max())
+    levels = [v for v in MaxNLocator(lines).tick_values(0.0, top) if low < v < high and v > 0.0]
+    if not levels:
+        return
+    drawn = axes.contour(
+        x, y, np.ma.masked_invalid(table), levels=levels, colors=INK, linewidths=0.8
+    )
+    axes.clabel(drawn, fontsize=_TEXT_PT - 1.5, fmt="%g", colors=INK)

@@ -91,6 +91,15 @@ class NodeProcess:
         self._log.close()
 
 
+def ended(name: str, parameters: Mapping[str, Any] | None = None) -> tuple[int, str]:
+    """Exit status and output of an executable that ends by itself."""
+    process = NodeProcess(name, parameters)
+    try:
+        return process.wait(), process.output
+    finally:
+        process.close()
+
+
 @contextmanager
 def running(
     name: str, parameters: Mapping[str, Any] | None = None, *arguments: str

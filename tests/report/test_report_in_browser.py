@@ -22,69 +22,104 @@ BROWSER = next(
     ),
     None,
 )
-# A window of the browser cannot be as narrow as a telephone, but a frame in it can. The page
-# forbids scripts of its own, so the surrounding page looks into it.
+# A window of the browser cannot be as narrow as a telephone, but a frame in it can. The pages
+# forbid scripts of their own, so the surrounding page looks into them, with all that folds unfolded.
 FRAME = """<!DOCTYPE html>
-<iframe width="{width}" height="900" style="border:0" srcdoc="{page}"></iframe>
+{frames}
 <script>addEventListener('load', () => {{
-  const inside = document.querySelector('iframe').contentDocument;
-  const root = inside.documentElement;
-  document.body.dataset.probe = [root.clientWidth, root.scrollWidth,
-    [...inside.images].filter(i => i.naturalWidth > 0).length].join(' ');
+  document.body.dataset.probe = [...document.querySelectorAll('iframe')].map(frame => {{
+    const inside = frame.contentDocument, root = inside.documentElement;
+    inside.querySelectorAll('details').forEach(d => {{ d.open = true; }});
+    const pictures = [...inside.images];
+    const wide = [...pictures, ...inside.querySelectorAll('svg, p, h1, h2, h3, dl, nav')]
+      .filter(e => e.getBoundingClientRect().right > root.clientWidth + 0.5);
+    const words = [...inside.querySelectorAll('p, td, th, figcaption, li, dt, dd, a')]
+      .filter(e => e.textContent.trim() && parseFloat(frame.contentWindow.getComputedStyle(e).fontSize) < 12);
+    return [root.clientWidth, root.scrollWidth, pictures.length,
+      pictures.filter(i => i.naturalWidth > 0).length, wide.length, words.length].join(' ');
+  }}).join(',');
 }})</script>"""
+WIDTHS = (1280, 390)
 
 
 def opened(path: Path, profile: Path) -> tuple[str, str]:
     """The page's DOM after loading and what the browser logged."""
     assert BROWSER is not None
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    # Without any network: every host name is unknown.
+    options += ["--host-resolver-rules=MAP * ~NOTFOUND"]
     options += ["--enable-logging=stderr", "--v=0", f"--user-data-dir={profile}"]
     command = [BROWSER, *options, "--window-size=1400,900", "--dump-dom", path.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     return done.stdout, done.stderr
 
 
-def calibration_text() -> str:
+def long_words_text() -> str:
     """The calibration page with long words everywhere, without the time that its figures take."""
     long_word = "frame_" + "0123456789" * 12
+    row = {"label": long_word, "here": "0.050 px", "paper": "1.45 px (median, section 4.1.3)"}
+    view = {"name": long_word, "magnification": "100×", "corners": 1, "rms": "0.1 px", "ratio": 1.0}
     return render(
         "calibration.html.j2",
         {
             "title": long_word,
             "summary": [("Held-out error", "0.050 px", "RMS; paper: 0.9 to 1.45 px")] * 6,
             "warnings": [long_word],
-            "overlays": [],
+            "paper": [row],
+            "worst_views": [view],
             **dict.fromkeys(
                 ("coverage", "errors", "residuals", "pixel_size", "distortion", "parameters"), ()
             ),
+            **dict.fromkeys(("overlays", "more_overlays", "rejected_images"), ()),
+            **dict.fromkeys(("predicted", "residual_field", "rows", "images"), ()),
+            "refused_corners": 0,
             "rejected": [(long_word, "100×", long_word)],
-            "rows": [],
+            "rejected_count": 1,
             "facts": [("Priors", long_word)],
-            "images": [],
         },
     )
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("kind", ["calibration", "correction"])
-def test_page_fits_the_window_without_console_errors(tmp_path: Path, kind: str, width: int) -> None:
-    page = tmp_path / "page.html"
-    pictures = 0
-    if kind == "calibration":
-        page.write_text(calibration_text(), encoding="utf-8")
+@pytest.mark.parametrize("kind", ["calibration", "long words", "correction"])
+def test_page_fits_the_window_without_console_errors(
+    tmp_path: Path, kind: str, request: pytest.FixtureRequest
+) -> None:
+    if kind == "long words":
+        text = long_words_text()
+        pictures = 0
+    elif kind == "calibration":
+        text = request.getfixturevalue("page_path").read_text(encoding="utf-8")
+        pictures = text.count("<img ")
+        assert pictures > 20
     else:
         rows = [DemoRow("with drift and distortion correction", 0.11, (0.9, 1.45))]
-        correction_report(rows, [("after", np.zeros((600, 640), np.uint8))], page)
+        page = correction_report(
+            rows, [("after", np.zeros((600, 640), np.uint8))], tmp_path / "page.html"
+        )
+        text = page.read_text(encoding="utf-8")
         pictures = 2
-    text = page.read_text(encoding="utf-8")
+    frames = "\n".join(
+        f'<iframe width="{width}" height="900" style="border:0" srcdoc="{html.escape(text)}"></iframe>'
+        for width in WIDTHS
+    )
     frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(width=width, page=html.escape(text)), encoding="utf-8")
+    frame.write_text(FRAME.format(frames=frames), encoding="utf-8")
     dom, log = opened(frame, tmp_path / "profile")
     assert "CONSOLE" not in log
-    match = re.search(r'data-probe="(\d+) (\d+) (\d+)"', dom)
+    match = re.search(r'data-probe="([\d ,]+)"', dom)
     assert match is not None
-    inner, scroll, loaded = (int(x) for x in match.groups())
-    assert inner == width
-    assert scroll <= inner
-    assert loaded == pictures
+    for width, probe in zip(WIDTHS, match[1].split(","), strict=True):
+        inner, scroll, found, loaded, wide, small = (int(x) for x in probe.split())
+        assert inner == width
+        assert scroll <= inner
+        assert found == loaded == pictures
+        assert wide == 0
+        assert small == 0
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+def test_the_browser_would_report_a_broken_page(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text("<!DOCTYPE html><img src='https://example.invalid/a.png'><script>x.y</script>")
+    assert "CONSOLE" in opened(page, tmp_path / "profile")[1]

@@ -1,0 +1,66 @@
+"""The image field in cells, with the corners of all views in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibrate import CalibrationResult
+
+__all__ = ["Cells", "all_corners", "cells_of", "empty_share", "filled_shares"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A lattice of nearly square cells over the field, with the cell of every corner."""
+
+    columns: int
+    rows: int
+    index: NDArray[np.intp]
+    centres: Array
+
+    @property
+    def counts(self) -> NDArray[np.intp]:
+        """(columns * rows,) number of corners in each cell."""
+        return np.bincount(self.index, minlength=self.columns * self.rows)
+
+
+def empty_share(result: CalibrationResult, across: int = 12) -> float:
+    """Share of the field, in cells of which ``across`` are side by side, without any corner."""
+    counts = cells_of(result, np.concatenate([v.image_xy for v in result.views]), across).counts
+    return float(np.mean(counts == 0))
+
+
+def cells_of(result: CalibrationResult, xy: Array, across: int) -> Cells:
+    """The field in cells, ``across`` of them side by side, with the cell of each pixel ``xy``."""
+    width, height = result.model.image_size
+    rows = max(1, round(across * height / width))
+    size = np.array([width / across, height / rows])
+    ij = np.floor((xy + 0.5) / size).astype(np.intp)
+    ij = np.clip(ij, 0, [across - 1, rows - 1])
+    j, i = np.mgrid[0:rows, 0:across]
+    centres = (np.stack([i.ravel(), j.ravel()], axis=1) + 0.5) * size - 0.5
+    return Cells(across, rows, ij[:, 1] * across + ij[:, 0], centres)
+
+
+def filled_shares(result: CalibrationResult, across: int = 6) -> dict[float, float]:
+    """At each magnification, the share of the field's cells, ``across`` in a row, with a corner."""
+    xy: dict[float, list[Array]] = {}
+    for view in result.views:
+        xy.setdefault(float(view.magnification), []).append(view.image_xy)
+    return {
+        g: float(np.mean(cells_of(result, np.concatenate(own), across).counts > 0))
+        for g, own in sorted(xy.items())
+    }
+
+
+def all_corners(result: CalibrationResult) -> tuple[Array, Array]:
+    """All corners (n, 2) with their residuals (n, 2), px."""
+    return (
+        np.concatenate([v.image_xy for v in result.views]),
+        np.concatenate(result.fit.residuals_px),
+    )

@@ -1,0 +1,85 @@
+"""Curves against the magnification: sampling, intervals, marks."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.model import CalibrationModel
+from semcal_ros.report.style import SECOND
+
+__all__ = ["cameras_around", "curve", "marks_of_magnifications", "sampled_cameras", "wide_enough"]
+
+Array = NDArray[np.float64]
+
+_SAMPLES = 81
+
+
+def sampled_cameras(model: CalibrationModel) -> list[ScanCamera]:
+    """Cameras over the calibrated range, evenly in log g; one if the range is a single value."""
+    low, high = model.magnification_range
+    count = _SAMPLES if high > low else 1
+    return [model.at(float(g)) for g in np.clip(np.geomspace(low, high, count), low, high)]
+
+
+def cameras_around(model: CalibrationModel, beyond: float, count: int) -> list[ScanCamera]:
+    """Cameras from the factor ``beyond`` below the calibrated range to as much above it.
+
+    Magnifications at which the calibration has no camera are left out.
+    """
+    low, high = model.magnification_range
+    tried = (_camera(model, float(g)) for g in np.geomspace(low / beyond, high * beyond, count))
+    return [camera for camera in tried if camera is not None]
+
+
+def _camera(model: CalibrationModel, g: float) -> ScanCamera | None:
+    try:
+        return model.at(g)
+    except InvalidValueError:
+        return None
+
+
+def marks_of_magnifications(axes: Axes, model: CalibrationModel) -> None:
+    """Short marks on the x axis where images were taken."""
+    g = np.array(model.magnifications)
+    axes.plot(
+        g,
+        np.zeros(len(g)),
+        "|",
+        color=SECOND,
+        markersize=7,
+        markeredgewidth=1.2,
+        transform=axes.get_xaxis_transform(),
+        clip_on=False,
+        zorder=5,
+    )
+
+
+def curve(
+    axes: Axes,
+    g: Array,
+    values: Array,
+    half_widths: Array,
+    color: str,
+    label: str = "",
+    style: str = "-",
+) -> None:
+    """Line with its interval, or a point with a bar where there is one magnification only."""
+    if len(g) == 1:
+        axes.errorbar(
+            g, values, yerr=half_widths, fmt="o", color=color, capsize=4, label=label or None
+        )
+        return
+    low, high = values - half_widths, values + half_widths
+    axes.fill_between(g, low, high, color=color, alpha=0.25, linewidth=0)
+    axes.plot(g, values, style, color=color, linewidth=1.4, label=label or None)
+
+
+def wide_enough(axes: Axes, values: Array, half_widths: Array) -> None:
+    """Limits with room, also for a constant that is exactly known."""
+    low, high = float(np.min(values - half_widths)), float(np.max(values + half_widths))
+    room = max(0.12 * (high - low), 1e-4 * max(abs(low), abs(high)), 1e-6)
+    axes.set_ylim(low - room, high + room)

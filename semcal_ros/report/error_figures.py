@@ -1,0 +1,139 @@
+"""Errors against the magnification, beside what the paper reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.evaluate import rms_by_magnification
+from semcal_ros.report.encode import Picture, picture_of_figure
+from semcal_ros.report.numbers import PAPER_RMS_PX
+from semcal_ros.report.style import (
+    ACCENT,
+    INK,
+    MUTED,
+    OURS,
+    REFERENCE,
+    SECOND,
+    legend,
+    log_axis_y,
+    magnification_axis,
+    new_figure,
+    tidy,
+)
+
+__all__ = ["normalised_residuals", "residual_histogram", "rms_picture"]
+
+Array = NDArray[np.float64]
+
+_HISTOGRAM_LIMIT = 5.0
+
+
+def rms_picture(result: CalibrationResult, straight: Mapping[float, float]) -> Picture:
+    """RMS and held-out RMS at each magnification, with what the paper reports.
+
+    ``straight`` is the error without correction of the distortion.
+    """
+    rms = rms_by_magnification(result.fit)
+    g = np.array(list(rms))
+    values = np.array(list(rms.values()))
+    held = np.array([result.held_out_rms_px.get(float(x), np.nan) for x in g])
+    uncorrected = np.array([straight.get(float(x), np.nan) for x in g])
+    noise = _expected(result, g)
+    figure = new_figure(4.6, 3.9)
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="magnification", ylabel="RMS error (px)")
+    for value, style in zip(PAPER_RMS_PX, ("--", "-."), strict=True):
+        axes.axhline(
+            value, color=REFERENCE, linestyle=style, linewidth=1.2, label=f"paper: {value:g} px"
+        )
+    axes.plot(
+        g, uncorrected, "^:", color=MUTED, markersize=4, linewidth=1.0, label="distortion left in"
+    )
+    axes.plot(g, values, "o-", color=OURS, markersize=4, linewidth=1.2, label="all views fitted")
+    axes.plot(g, noise, "_", color=ACCENT, markersize=9, markeredgewidth=1.6, label="corner noise")
+    _plot_held_out(axes, g, held)
+    magnification_axis(axes, g[0], g[-1])
+    shown = np.concatenate([values, held, uncorrected, noise, PAPER_RMS_PX])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
+    legend(axes, loc="upper center", ncols=2)
+    return picture_of_figure(
+        figure,
+        f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px, "
+        f"beside the paper's {PAPER_RMS_PX[0]:g} and {PAPER_RMS_PX[1]:g} px.",
+        "The paper's figure 13. Held out: the images of this magnification, judged by a "
+        "calibration from all other magnifications. Hollow: the lowest and highest one, which are "
+        "extrapolated in this test. Corner noise: what the uncertainty of the corners alone "
+        "explains.",
+    )
+
+
+def _expected(result: CalibrationResult, g: Array) -> Array:
+    """(G,) RMS error that the 1-sigma of the corners alone would give, px."""
+    variances: dict[float, list[Array]] = {float(x): [] for x in g}
+    for view in result.views:
+        variances[float(view.magnification)].append(view.sigma_px**2)
+    return np.array([np.sqrt(2.0 * np.mean(np.concatenate(v))) for v in variances.values()])
+
+
+def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:
+    if len(g) < 2 or not np.any(np.isfinite(held)):
+        return
+    inner = np.isfinite(held)
+    inner[[0, -1]] = False
+    ends = np.isfinite(held) & ~inner
+    axes.plot(g[inner], held[inner], "s", color=SECOND, markersize=4.5, label="held out")
+    axes.plot(
+        g[ends],
+        held[ends],
+        "s",
+        color=SECOND,
+        markersize=5,
+        markerfacecolor="none",
+        label="held out, extrapolated",
+    )
+
+
+def normalised_residuals(result: CalibrationResult) -> Array:
+    """(n, 2) residuals over the 1-sigma of their corners."""
+    sigma = np.concatenate([v.sigma_px for v in result.views])
+    return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
+
+
+def residual_histogram(result: CalibrationResult) -> Picture:
+    """Residuals over their 1-sigma, beside the normal distribution."""
+    values = normalised_residuals(result).ravel()
+    beyond = float(np.mean(np.abs(values) > 3.0))
+    spread = float(np.sqrt(np.mean(values**2)))
+    limit = _HISTOGRAM_LIMIT
+    figure = new_figure(4.6, 3.2)
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="residual over its predicted 1-sigma", ylabel="share per unit")
+    edges = np.linspace(-limit, limit, 51)
+    density = np.histogram(np.clip(values, -limit, limit), edges)[0] / (
+        len(values) * np.diff(edges)
+    )
+    axes.stairs(density, edges, fill=True, color=OURS, alpha=0.45, label="residuals")
+    x = np.linspace(-limit, limit, 201)
+    axes.plot(
+        x,
+        np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi),
+        "--",
+        color=INK,
+        linewidth=1.3,
+        label="normal distribution",
+    )
+    axes.set_xlim(-limit, limit)
+    legend(axes, loc="upper left")
+    text = f"spread {spread:.2f}; {100.0 * beyond:.1f} % beyond 3 (normal: 0.3 %)"
+    return picture_of_figure(
+        figure,
+        f"Histogram of residuals over their predicted 1-sigma: {text}.",
+        f"Residuals over the predicted uncertainty of their corners: {text}. Wider than the dashed "
+        "line: the corners are worse than they claim, or the model misses something.",
+    )

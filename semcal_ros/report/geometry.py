@@ -1,0 +1,133 @@
+"""What the report computes from a calibration: predicted errors, and errors without distortion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.projection import ProjectionJacobians, project_points_with_jacobians
+
+__all__ = [
+    "aligned_sigma_px",
+    "displacement_field",
+    "field_lattice",
+    "rms_without_distortion",
+    "shape_sigma_px",
+    "without_residual_field",
+]
+
+Array = NDArray[np.float64]
+
+# How far a pose may move when the distortion is left out: what a view cannot see must not run away.
+_TURN_RAD = 0.1
+_HEIGHT_M = 1e-4
+
+
+def field_lattice(width: int, height: int, across: int) -> Array:
+    """(n, 2) pixels on a regular lattice from edge to edge of the field, row by row."""
+    down = max(2, round(across * height / width))
+    x, y = np.meshgrid(np.linspace(0, width - 1, across), np.linspace(0, height - 1, down))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def displacement_field(camera: ScanCamera, across: int = 13) -> tuple[Array, Array]:
+    """Ideal pixels on a lattice over the field with their displacement; NaN where there is none."""
+    xy = field_lattice(camera.width, camera.height, across)
+    return xy, camera.distort(xy) - xy
+
+
+def without_residual_field(camera: ScanCamera) -> ScanCamera:
+    """The camera with its parametric distortion alone."""
+    if getattr(camera, "residual", None) is None:
+        return camera
+    changes: dict[str, Any] = {"residual": None}
+    return replace(camera, **changes)
+
+
+def _jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
+    return project_points_with_jacobians(camera.parameters, points, camera.norm_px)
+
+
+def _larger_sigma(difference: Array, covariance: Array) -> Array:
+    """(n,) 1-sigma along the worse axis from (n, 2, 10) derivatives; NaN where they are not known."""
+    spread = np.einsum("nip,pq,njq->nij", difference, covariance, difference)
+    known = np.all(np.isfinite(spread), axis=(1, 2))
+    out = np.full(len(difference), np.nan)
+    out[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(spread[known])[:, -1], 0.0))
+    return out
+
+
+def shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
+    """(n,) predicted 1-sigma, px, of positions relative to the image centre, worse axis.
+
+    The points lie in the reference plane and are seen at ideal pixels ``xy``. A common shift of the
+    image drops out: it trades off against the position of the specimen, which no measurement inside
+    of one image needs.
+    """
+    if camera.covariance is None:
+        return np.zeros(len(xy))
+    centre = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
+    points = camera.sem_from_ideal(np.concatenate([centre, xy]))
+    jacobian = _jacobians(camera, points).d_parameters
+    return _larger_sigma(jacobian[1:] - jacobian[:1], camera.covariance)
+
+
+def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
+    """(n,) as :func:`shape_sigma_px`, after a shift, a turn and a scale that fit best over ``xy``.
+
+    This is what stays when the pose of a flat specimen is fitted to the image, so it is the part
+    of the predicted error that reprojection errors can show.
+    """
+    if camera.covariance is None:
+        return np.zeros(len(xy))
+    points = camera.sem_from_ideal(xy)
+    jacobians = _jacobians(camera, points)
+    known = np.all(np.isfinite(jacobians.d_parameters), axis=(1, 2))
+    if not np.any(known):
+        return np.full(len(xy), np.nan)
+    x, y = (points[known, :2] - points[known, :2].mean(axis=0)).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    moves = np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
+    columns = (jacobians.d_xyz[known][:, :, :2] @ moves).reshape(-1, 4)
+    basis = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+    rows = jacobians.d_parameters[known].reshape(-1, 10)
+    left = (rows - basis @ (basis.T @ rows)).reshape(-1, 2, 10)
+    out = np.full(len(xy), np.nan)
+    out[known] = _larger_sigma(left, camera.covariance)
+    return out
+
+
+def rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
+    """RMS error in px at each magnification if the distortion were not corrected.
+
+    The poses are fitted again, linearly about those of the result.
+    """
+    squares: dict[float, list[Array]] = {}
+    pull = np.diag([1.0 / _TURN_RAD] * 3 + [0.0, 0.0, 1.0 / _HEIGHT_M])
+    poses = zip(result.fit.rotations, result.fit.translations_m, strict=True)
+    for view, (rotation, translation) in zip(result.views, poses, strict=True):
+        camera = without_residual_field(result.model.at(view.magnification))
+        straight = replace(camera, xi_r=0.0, xi_t=0.0)
+        turned = view.board_xy_m @ rotation[:, :2].T
+        points = turned + translation
+        jacobian = _jacobians(straight, points).d_xyz
+        x, y, z = turned.T
+        o = np.zeros_like(x)
+        turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
+        columns = np.concatenate([jacobian @ turns, jacobian], axis=2).reshape(-1, 6)
+        error = (view.image_xy - straight.project_ideal(points)).ravel()
+        known = np.isfinite(error) & np.all(np.isfinite(columns), axis=1)
+        normal = columns[known].T @ columns[known] + pull.T @ pull
+        unit = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        right = unit * (columns[known].T @ error[known])
+        step = unit * np.linalg.lstsq(normal * np.outer(unit, unit), right, rcond=None)[0]
+        squares.setdefault(float(view.magnification), []).append(
+            (error[known] - columns[known] @ step) ** 2
+        )
+    # Two components per corner.
+    return {g: float(np.sqrt(2.0 * np.mean(np.concatenate(s)))) for g, s in sorted(squares.items())}

@@ -1,0 +1,69 @@
+"""What the paper reports, beside what a calibration found.
+
+Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.report.numbers import PAPER_RMS_PX, format_px, held_out_px
+
+__all__ = ["PaperRow", "paper_rows", "typical_px"]
+
+# Section 4.1.3, medians: after the correction of drift but not of distortion.
+_PAPER_STRAIGHT_PX = 3.0
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One kind of error, here and in the paper."""
+
+    label: str
+    here: str
+    paper: str
+
+
+def typical_px(errors: Mapping[float, float]) -> float | None:
+    """Median over the magnifications, px, or None."""
+    values = [v for v in errors.values() if not np.isnan(v)]
+    return float(np.median(values)) if values else None
+
+
+def paper_rows(
+    result: CalibrationResult, rms: Mapping[float, float], straight: Mapping[float, float]
+) -> list[PaperRow]:
+    """Errors of the calibration with the paper's figures for the same.
+
+    Parameters
+    ----------
+    rms, straight
+        Error in px at each magnification, with correction of the distortion and without.
+    """
+    abstract, section = PAPER_RMS_PX
+    return [
+        PaperRow(
+            "Distortion left in, median over the magnifications",
+            format_px(typical_px(straight)),
+            f"{_PAPER_STRAIGHT_PX:g} px (median, section 4.1.3)",
+        ),
+        PaperRow(
+            "Distortion corrected, median over the magnifications",
+            format_px(typical_px(rms)),
+            f"{section:g} px (median, section 4.1.3)",
+        ),
+        PaperRow(
+            "Distortion corrected, all corners",
+            format_px(result.fit.rms_px()),
+            f"{abstract:g} px (abstract and figure 13)",
+        ),
+        PaperRow(
+            "Magnifications left out of the calibration, RMS without the outermost two",
+            format_px(held_out_px(result)),
+            "not reported",
+        ),
+    ]

@@ -1,0 +1,182 @@
+"""Each camera parameter against the magnification, grouped like the paper's figures 10 to 12."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.projection import PARAMETER_NAMES
+from semcal_ros.report.curves import (
+    curve,
+    marks_of_magnifications,
+    sampled_cameras,
+    wide_enough,
+)
+from semcal_ros.report.encode import Picture, picture_of_figure
+from semcal_ros.report.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
+
+__all__ = ["ParameterGroup", "focal_length_px", "parameter_groups"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters that belong together.
+
+    Attributes
+    ----------
+    title, text
+        Heading, and a sentence below it.
+    pictures
+        One picture for each parameter.
+    """
+
+    title: str
+    text: str
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One parameter as a reader sees it: ``factor * value - offset`` in ``unit``."""
+
+    name: str
+    title: str
+    unit: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+_FOCAL = _Panel("f", "Focal length, m / ρ", "10³ px", 1e-3)
+_NO_FOCAL = "It is not shown here: somewhere ρ is not positive, which is no perspective."
+
+_GROUPS = (
+    (
+        "Centre of the distortion",
+        "The paper's figure 10.",
+        (
+            _Panel("ex", "Distortion centre, column", "px"),
+            _Panel("ey", "Distortion centre, row", "px"),
+        ),
+    ),
+    (
+        "Strength of the distortion",
+        "The paper's figure 11. At half the image width from the centre, 10⁻³ is a displacement of "
+        "0.05 % of the image width for the radial part.",
+        (
+            _Panel("xi_r", "Radial distortion", "10⁻³", 1e3),
+            _Panel("xi_t", "Tangential distortion", "10⁻³", 1e3),
+        ),
+    ),
+    (
+        "Projection",
+        "The paper's figure 12: focal length, aspect ratio and skew. The focal length is the scale "
+        "m over the inverse distance ρ of the scan pivot.",
+        (
+            _FOCAL,
+            _Panel("aspect", "Aspect ratio minus 1", "10⁻³", 1e3, 1e3),
+            _Panel("skew", "Skew ratio", "10⁻³", 1e3),
+        ),
+    ),
+    (
+        "Scale, principal point and scan pivot",
+        "Not among the paper's figures: what the focal length consists of, and the principal "
+        "point, which is one for all magnifications where a magnification alone cannot show it.",
+        (
+            _Panel("m", "Scale, deviation from nominal", "%", 100.0, 100.0),
+            _Panel("rho", "Inverse distance of the scan pivot", "1/m"),
+            _Panel("px", "Principal point, column", "px"),
+            _Panel("py", "Principal point, row", "px"),
+        ),
+    ),
+)
+
+
+def focal_length_px(camera: ScanCamera) -> tuple[float, float]:
+    """Focal length m / rho and its 1-sigma, px; infinite for a parallel projection."""
+    if camera.rho <= 0.0:
+        return float("inf"), float("inf")
+    f = camera.m / camera.rho
+    if camera.covariance is None:
+        return f, 0.0
+    gradient = np.zeros(len(PARAMETER_NAMES))
+    gradient[PARAMETER_NAMES.index("m")] = 1.0 / camera.rho
+    gradient[PARAMETER_NAMES.index("rho")] = -f / camera.rho
+    return f, float(np.sqrt(max(gradient @ camera.covariance @ gradient, 0.0)))
+
+
+def _values_and_sigmas(
+    model: CalibrationModel, cameras: list[ScanCamera], name: str
+) -> tuple[Array, Array]:
+    """(G,) values of a parameter and their 1-sigma, the scale relative to nominal."""
+    if name == "f":
+        pairs = np.array([focal_length_px(c) for c in cameras])
+        return pairs[:, 0], pairs[:, 1]
+    k = PARAMETER_NAMES.index(name)
+    values = np.array([c.parameters[k] for c in cameras])
+    variances = np.array([0.0 if c.covariance is None else c.covariance[k, k] for c in cameras])
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
+    if name == "m":
+        nominal = np.array([model.nominal_px_per_m(c.magnification) for c in cameras])
+        return values / nominal, sigmas / nominal
+    return values, sigmas
+
+
+def parameter_groups(model: CalibrationModel) -> list[ParameterGroup]:
+    """Each camera parameter against the magnification with its 1-sigma band."""
+    cameras = sampled_cameras(model)
+    g = np.array([c.magnification for c in cameras])
+    groups = []
+    for title, text, panels in _GROUPS:
+        pictures = []
+        for panel in panels:
+            values, sigmas = _values_and_sigmas(model, cameras, panel.name)
+            if np.all(np.isfinite(values)):
+                values, sigmas = panel.factor * values - panel.offset, panel.factor * sigmas
+                pictures.append(_picture(model, panel, g, values, sigmas))
+            else:
+                text = f"{text} {_NO_FOCAL}"
+        groups.append(ParameterGroup(title, text, tuple(pictures)))
+    return groups
+
+
+def _picture(
+    model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
+) -> Picture:
+    figure = new_figure(4.0, 2.4)
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="magnification", ylabel=panel.unit)
+    curve(axes, g, values, sigmas, OURS)
+    magnification_axis(axes, g[0], g[-1])
+    if panel is _FOCAL:
+        log_axis_y(axes, 0.7 * float(values.min()), 1.4 * float(values.max()))
+    else:
+        wide_enough(axes, values, sigmas)
+        axes.ticklabel_format(axis="y", useOffset=False)
+    marks_of_magnifications(axes, model)
+    first, last = (_with_sigma(values[k], sigmas[k]) for k in (0, -1))
+    if len(g) > 1 and np.ptp(values) <= 1e-9 * np.abs(values).max():
+        ends = f"{first} at every magnification"
+    elif len(g) > 1:
+        ends = f"{first} at {g[0]:g}× to {last} at {g[-1]:g}×"
+    else:
+        ends = f"{first} at {g[0]:g}×"
+    return picture_of_figure(
+        figure,
+        f"{panel.title} against magnification: {ends}, in {panel.unit}; "
+        f"largest 1-sigma {sigmas.max():.2g}.",
+        f"{panel.title} ({panel.unit}): {ends}.",
+    )
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """A value with two digits of its 1-sigma, such as ``230.54 ± 0.31``."""
+    if not (np.isfinite(sigma) and sigma > 0.0):
+        return f"{value:.4g}"
+    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"

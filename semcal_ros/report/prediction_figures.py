@@ -1,0 +1,221 @@
+"""The predicted error over field and magnification."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.model import CalibrationModel
+from semcal_ros.report.curves import cameras_around, marks_of_magnifications, sampled_cameras
+from semcal_ros.report.encode import Picture, picture_of_figure
+from semcal_ros.report.geometry import aligned_sigma_px, field_lattice, shape_sigma_px
+from semcal_ros.report.numbers import format_magnification
+from semcal_ros.report.style import (
+    ACCENT,
+    INK,
+    LIGHT_MAP,
+    OURS,
+    SECOND,
+    field_axes,
+    labelled_contours,
+    legend,
+    log_axis_y,
+    magnification_axis,
+    new_figure,
+    tidy,
+)
+
+__all__ = ["prediction_pictures"]
+
+Array = NDArray[np.float64]
+
+# The map goes on to this factor outside of the calibrated range, to show what extrapolation costs.
+_BEYOND = 1.5
+_COLUMNS = 61
+_RINGS = 24
+_DIRECTIONS = 32
+_ACROSS = 17
+
+
+def prediction_pictures(model: CalibrationModel) -> list[Picture]:
+    """Map over distance and magnification, maps over the field, and curves.
+
+    Empty for a calibration without uncertainty.
+    """
+    cameras = sampled_cameras(model)
+    if any(c.covariance is None for c in cameras):
+        return []
+    lattice = field_lattice(*model.image_size, 9)
+    shape = np.stack([shape_sigma_px(c, lattice) for c in cameras])
+    worst = cameras[int(np.nanargmax(np.nanmax(shape, axis=1)))] if _any(shape) else cameras[0]
+    pictures = [_fields_picture(model, worst), _curves(model, cameras, lattice, shape)]
+    return [_map_picture(model), *pictures] if len(cameras) > 1 else pictures
+
+
+def _any(values: Array) -> bool:
+    return bool(np.any(np.isfinite(values)))
+
+
+# -- map ------------------------------------------------------------------------------------------
+
+
+def _map_picture(model: CalibrationModel) -> Picture:
+    """Largest predicted error at each distance from the image centre, at each magnification."""
+    cameras = cameras_around(model, _BEYOND, _COLUMNS)
+    g = np.array([c.magnification for c in cameras])
+    radii, points, ring = _rings(model)
+    table = np.full((len(radii), len(cameras)), np.nan)
+    for column, camera in enumerate(cameras):
+        sigma = np.nan_to_num(shape_sigma_px(camera, points), nan=np.inf)
+        largest = np.zeros(len(radii))
+        np.maximum.at(largest, ring, sigma)
+        table[:, column] = np.where(np.isfinite(largest), largest, np.nan)
+    low, high = model.magnification_range
+    inside = table[:, (g >= low) & (g <= high)]
+    top = float(np.nanmax(inside)) if _any(inside) else 1.0
+    figure = new_figure(4.6, 3.6)
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="magnification", ylabel="distance from the image centre (px)")
+    axes.grid(False)
+    axes.pcolormesh(
+        g,
+        radii,
+        table,
+        cmap=LIGHT_MAP,
+        vmin=0.0,
+        vmax=1.3 * top,
+        shading="gouraud",
+        rasterized=True,
+    )
+    magnification_axis(axes, g[0], g[-1])
+    axes.set_ylim(0.0, float(radii[-1]))
+    labelled_contours(axes, g, radii, table, 1.2 * top, lines=8)
+    for edge in (low, high):
+        axes.axvline(edge, color=INK, linewidth=1.2, linestyle="--")
+    for start, end in ((g[0], low), (high, g[-1])):
+        axes.axvspan(start, end, facecolor="none", edgecolor=INK, hatch="///", alpha=0.18)
+    marks_of_magnifications(axes, model)
+    ends = [_ends(table, g, x) for x in (low / _BEYOND, high * _BEYOND)]
+    return picture_of_figure(
+        figure,
+        "Map of the predicted error over magnification and distance from the image centre: at "
+        f"most {top:.2g} px in the calibrated range.",
+        "Predicted 1-sigma error (px, numbers on the lines) of positions relative to the image "
+        f"centre, the worst direction at each distance: at most {top:.2g} px in the calibrated "
+        f"range. Hatched: extrapolated, up to {max(ends):.2g} px.",
+    )
+
+
+def _ends(table: Array, g: Array, x: float) -> float:
+    column = table[:, int(np.argmin(np.abs(np.log(g / x))))]
+    return float(np.nanmax(column)) if _any(column) else float("inf")
+
+
+def _rings(model: CalibrationModel) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Radii (px), points of the field on circles of these radii, and the circle of each point."""
+    width, height = model.image_size
+    centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    radii = np.linspace(0.0, float(np.hypot(*centre)), _RINGS)
+    # The corners of the field are among the directions, so that the last circle is not empty.
+    angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
+    diagonal = float(np.arctan2(centre[1], centre[0]))
+    angles = np.unique([*angles, diagonal, np.pi - diagonal, np.pi + diagonal, -diagonal])
+    offsets = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring = np.repeat(np.arange(len(radii)), len(angles))
+    flat = offsets.reshape(-1, 2)
+    inside = np.all(np.abs(flat) <= centre * (1.0 + 1e-9), axis=1)
+    return radii, flat[inside] + centre, ring[inside]
+
+
+# -- fields ---------------------------------------------------------------------------------------
+
+
+def _fields_picture(model: CalibrationModel, worst: ScanCamera) -> Picture:
+    """Predicted error over the field at the ends, in the middle, and where it is largest."""
+    low, high = model.magnification_range
+    chosen = {c.magnification: c for c in (model.at(low), worst, model.at(high))}
+    if high > low:
+        middle = model.at(float(np.sqrt(low * high)))
+        chosen[middle.magnification] = middle
+    cameras = [chosen[g] for g in sorted(chosen)]
+    width, height = model.image_size
+    lattice = field_lattice(width, height, _ACROSS)
+    down = len(lattice) // _ACROSS
+    tables = [shape_sigma_px(c, lattice).reshape(down, _ACROSS) for c in cameras]
+    top = max((float(np.nanmax(t)) for t in tables if _any(t)), default=1.0)
+    columns = 1 if len(cameras) == 1 else 2
+    rows = -(-len(cameras) // columns)
+    figure = new_figure(4.6, 0.4 + rows * (0.45 + 3.9 / columns * min(height / width, 1.6)))
+    x, y = lattice[:_ACROSS, 0], lattice[::_ACROSS, 1]
+    for k, (camera, table) in enumerate(zip(cameras, tables, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        _field(axes, x, y, table, top)
+        axes.set_title(format_magnification(camera.magnification), fontsize=9, color=INK)
+        if k % columns:
+            axes.set_ylabel("")
+        if k < len(cameras) - columns:
+            axes.set_xlabel("")
+    peaks = ", ".join(
+        f"{np.nanmax(t):.2g} px at {format_magnification(c.magnification)}"
+        for c, t in zip(cameras, tables, strict=True)
+        if _any(t)
+    )
+    return picture_of_figure(
+        figure,
+        f"Maps of the predicted error over the field at {len(cameras)} magnifications; "
+        f"largest: {peaks}.",
+        f"Predicted 1-sigma error (px) relative to the image centre over the field. Largest: {peaks}.",
+    )
+
+
+def _field(axes: Axes, x: Array, y: Array, table: Array, top: float) -> None:
+    field_axes(axes, round(float(x[-1])) + 1, round(float(y[-1])) + 1)
+    axes.grid(False)
+    axes.pcolormesh(
+        x, y, table, cmap=LIGHT_MAP, vmin=0.0, vmax=1.3 * top, shading="gouraud", rasterized=True
+    )
+    labelled_contours(axes, x, y, table, float(np.nanmax(table)) if _any(table) else top, lines=4)
+
+
+# -- curves ---------------------------------------------------------------------------------------
+
+
+def _curves(
+    model: CalibrationModel, cameras: list[ScanCamera], lattice: Array, shape: Array
+) -> Picture:
+    """Predicted error against the magnification, with and without what a fitted pose absorbs."""
+    g = np.array([c.magnification for c in cameras])
+    aligned = np.stack([aligned_sigma_px(c, lattice) for c in cameras])
+    total = max(float(np.nanmax(c.project_sigma(c.sem_from_ideal(lattice)))) for c in cameras)
+    figure = new_figure(4.6, 3.6)
+    axes = figure.add_subplot()
+    tidy(axes, xlabel="magnification", ylabel="predicted 1-sigma (px)")
+    mark = "o" if len(g) == 1 else ""
+    shown = []
+    for values, color, line, label in (
+        (np.nanmax(shape, axis=1), SECOND, "-", "relative to the centre, worst point"),
+        (np.sqrt(np.nanmean(shape**2, axis=1)), ACCENT, "--", "relative to the centre, RMS"),
+        (np.nanmax(aligned, axis=1), OURS, "-.", "pose fitted, worst point"),
+        (np.sqrt(np.nanmean(aligned**2, axis=1)), INK, ":", "pose fitted, RMS"),
+    ):
+        axes.plot(g, values, mark + line, color=color, linewidth=1.5, label=label)
+        shown.append(values)
+    positive = np.concatenate(shown)
+    positive = positive[np.isfinite(positive) & (positive > 0.0)]
+    magnification_axis(axes, g[0], g[-1])
+    if positive.size:
+        log_axis_y(axes, 0.6 * float(positive.min()), 8.0 * float(positive.max()))
+    marks_of_magnifications(axes, model)
+    legend(axes, loc="upper center", ncols=1)
+    worst, left = float(np.nanmax(shape)), float(np.nanmax(aligned))
+    return picture_of_figure(
+        figure,
+        f"Predicted error of positions relative to the image centre, at most {worst:.2g} px over "
+        f"field and range; {left:.2g} px after the pose is fitted.",
+        f"At most {worst:.2g} px relative to the image centre: this contains the scale, which "
+        "errors of the fit do not show, because a wrong scale and a wrong height of the grid look "
+        f"alike. With shift, turn and scale fitted, {left:.2g} px are left. A shift that is common "
+        f"to the whole image brings the error of an absolute position to {total:.2g} px.",
+    )

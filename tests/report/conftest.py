@@ -1,0 +1,51 @@
+"""One calibration and one page for all tests of the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_samples import (
+    DISPLAY_M,
+    HOSTILE,
+    SIZE,
+    Unused,
+    UnusedWithImage,
+    found_of,
+    grid_view,
+)
+
+from semcal_ros.core.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.report import calibration_report
+
+
+@pytest.fixture(scope="session")
+def result() -> CalibrationResult:
+    rng = np.random.default_rng(7)
+    views = [
+        grid_view(g, tilt, 90.0 * k + 20.0, rng)
+        for g in (100.0, 400.0, 1500.0, 5000.0)
+        for k, tilt in enumerate((2.0, 25.0, 32.0, 28.0))
+    ]
+    return calibrate_views(views, image_size=(SIZE, SIZE), display_width_m=DISPLAY_M)
+
+
+@pytest.fixture(scope="session")
+def page_path(result: CalibrationResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    path.write_text("an older report")
+    written = calibration_report(
+        result,
+        path,
+        detections=[found_of(v) for v in result.views],
+        rejected=[
+            Unused(HOSTILE, 300.0, f"no grid {HOSTILE}"),
+            Unused("b\x00\ud800", 400.0, "blurred"),
+            UnusedWithImage("frame 9", 400.0, "blank", np.full((SIZE, SIZE), 90, dtype=np.uint16)),
+        ],
+        images=[("Setup", np.zeros((40, 60, 3), dtype=np.uint8))],
+        title=f"Microscope {HOSTILE}",
+    )
+    assert written == path
+    return path
