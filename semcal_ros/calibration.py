@@ -212,6 +212,7 @@ def _function_from(data: Mapping[str, Any]) -> ContinuousFunction:
         np.array(data["coefficients"], dtype=np.float64),
         (float(low), float(high)),
         np.array(data.get("shape", []), dtype=np.float64),
+        np.array(data.get("breaks", []), dtype=np.float64),
     )
 
 
@@ -223,6 +224,8 @@ def _function_to(function: ContinuousFunction) -> dict[str, Any]:
     }
     if len(function.shape):
         out["shape"] = function.shape.tolist()
+    if len(function.breaks):
+        out["breaks"] = function.breaks.tolist()
     return out
 
 

@@ -192,6 +192,7 @@ def calibrate_found(
     squares_m: Sequence[float],
     method: str = "joint",
     options: MethodOptions | None = None,
+    breakpoints: Sequence[float] = (),
 ) -> RecordingCalibration:
     """Calibrate from images whose corners have been found."""
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
@@ -201,6 +202,7 @@ def calibrate_found(
         display_width_m=display_width_m,
         method=method,
         options=options,
+        breakpoints=breakpoints,
     )
     factor = collected.assignment.scale_factor
     warnings = list(result.warnings)
@@ -227,6 +229,7 @@ def calibrate_recording(
     *,
     method: str = "joint",
     options: MethodOptions | None = None,
+    breakpoints: Sequence[float] = (),
     on_progress: Progress | None = None,
 ) -> RecordingCalibration:
     """Calibrate from a recording: a bag, or a folder of SEM TIFF files.
@@ -247,6 +250,7 @@ def calibrate_recording(
         squares_m=config.squares_m,
         method=method,
         options=options,
+        breakpoints=breakpoints,
     )
 
 
@@ -258,6 +262,7 @@ def calibrate(
     squares_m: Sequence[float] | None = None,
     method: str = "joint",
     options: MethodOptions | None = None,
+    breakpoints: Sequence[float] = (),
 ) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
 
@@ -272,6 +277,8 @@ def calibrate(
         Replace the values of ``config``.
     method
         ``"joint"``, ``"pda"`` or ``"discrete"``.
+    options, breakpoints
+        As for :func:`~semcal_ros.core.calibrate.calibrate_views`.
 
     Examples
     --------
@@ -290,7 +297,9 @@ def calibrate(
     if squares_m is not None:
         chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
     if isinstance(source, (str, os.PathLike)):
-        done = calibrate_recording(Path(source), chosen, method=method, options=options)
+        done = calibrate_recording(
+            Path(source), chosen, method=method, options=options, breakpoints=breakpoints
+        )
         return done.calibration
     frames = (
         (f"image {i}", to_gray(np.asarray(image)), checked_magnification(g))
@@ -304,4 +313,5 @@ def calibrate(
         squares_m=chosen.squares_m,
         method=method,
         options=options,
+        breakpoints=breakpoints,
     ).calibration

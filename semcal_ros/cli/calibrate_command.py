@@ -14,6 +14,15 @@ from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_view
 __all__ = ["command"]
 
 
+def _magnifications(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is no list such as 1000,5000") from None
+
+
 @click.command("calibrate")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
@@ -25,6 +34,12 @@ __all__ = ["command"]
 @click.option(
     "--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE."
 )
+@click.option(
+    "--breakpoints",
+    callback=_magnifications,
+    metavar="G,G,...",
+    help="joint: where the microscope switches its scan range, so that the scale jumps.",
+)
 @click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
 @click.option("--report", type=click.Path(path_type=Path), help="Also write an HTML report.")
 def command(
@@ -34,6 +49,7 @@ def command(
     method: str,
     pda_order: int,
     legendre: int | None,
+    breakpoints: tuple[float, ...],
     tau: float | None,
     report: Path | None,
 ) -> None:
@@ -61,6 +77,7 @@ def command(
             squares_m=microscope.squares_m,
             method=method,
             options=MethodOptions(pda_order, legendre, tau),
+            breakpoints=breakpoints,
         )
     done.calibration.save(output)
     _tell(done, notes)

@@ -16,6 +16,7 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.joint import JointFit, fit_joint
+from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
 from semcal_ros.core.pda import pda_functions
 from semcal_ros.core.problem import (
@@ -132,6 +133,7 @@ def calibrate_views(
     method: str = "joint",
     priors: Priors | None = None,
     options: MethodOptions | None = None,
+    breakpoints: Sequence[float] = (),
 ) -> CalibrationResult:
     """Calibrate the microscope from views of a planar grid.
 
@@ -151,6 +153,9 @@ def calibrate_views(
         Weak prior knowledge; the defaults suit any SEM.
     options
         Options of the paper's methods.
+    breakpoints
+        Magnifications at which the microscope switches its scan range, so that scale, aspect and skew jump; only
+        ``"joint"`` knows them. A jump that the views ask for elsewhere is reported as a warning.
 
     Raises
     ------
@@ -161,7 +166,8 @@ def calibrate_views(
     """
     ordered = _checked(views, method)
     magnifications = np.unique([v.magnification for v in ordered])
-    setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors())
+    breaks = _checked_breakpoints(breakpoints, magnifications, method)
+    setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
     chosen = options or MethodOptions()
     fitted = _fit_joint(setup) if method == "joint" else _fit_discrete(setup, method, chosen)
 
@@ -173,6 +179,21 @@ def calibrate_views(
     return CalibrationResult(
         replace(model, statistics=statistics), ordered, poses, held_out, warnings
     )
+
+
+def _checked_breakpoints(
+    breakpoints: Sequence[float], magnifications: Array, method: str
+) -> tuple[float, ...]:
+    low, high = magnifications[0], magnifications[-1]
+    breaks = tuple(sorted({float(b) for b in breakpoints}))
+    if breaks and method != "joint":
+        raise InvalidValueError(f"breakpoints with method {method}", expected='method "joint"')
+    if not all(low < b <= high for b in breaks):
+        raise InvalidValueError(
+            f"breakpoints {', '.join(f'{b:g}' for b in breaks)}",
+            expected=f"magnifications above {low:g} and up to {high:g}",
+        )
+    return breaks
 
 
 def _model(setup: Setup, functions: Functions, covariance: Array, method: str) -> CalibrationModel:
@@ -198,6 +219,13 @@ def _fit_joint(setup: Setup) -> _Fitted:
             f"residuals are {np.sqrt(factor):.1f} times what the uncertainty of the corners explains: the functions "
             "do not follow the microscope everywhere; record more magnifications"
         )
+    jump = likely_jump(setup, fit.problem, fit.result)
+    if jump is not None:
+        warnings.append(
+            f"the scale seems to jump by {100.0 * jump.relative:.2g} +- {100.0 * jump.sigma:.1g} % between "
+            f"magnifications {jump.below:g} and {jump.above:g}: if the microscope switches its scan range there, "
+            "calibrate with this breakpoint"
+        )
     if not fit.settled:
         warnings.append("the choice of the number of coefficients did not settle")
     details = {
@@ -206,7 +234,8 @@ def _fit_joint(setup: Setup) -> _Fitted:
         "reason": fit.result.reason,
         "selection_rounds": fit.rounds,
         "variance_factor": factor,
-        "coefficients": {name: [f.kind, f.size] for name, f in fit.functions.items()},
+        "coefficients": {name: [f.kind, f.smooth_size] for name, f in fit.functions.items()},
+        "breakpoints": list(setup.breakpoints),
     }
     return _Fitted(
         fit.functions,

@@ -115,6 +115,7 @@ def fit_discrete(setup: Setup, *, tau_px: float | None = None) -> DiscreteFit:
             setup,
             views=tuple(v for v in setup.views if v.magnification == g),
             magnifications=np.array([g]),
+            breakpoints=(),
         )
         centre, problem, result = _fit_one(own, tau_px)
         centres.append(centre)

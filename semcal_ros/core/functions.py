@@ -80,12 +80,16 @@ class ContinuousFunction:
         (lowest, highest) magnification for which the function was determined.
     shape
         Knots (magnifications) of ``"linear_log"``, weights w_0 ... w_(k-1) of ``"ode"``, empty otherwise.
+    breaks
+        Magnifications at which a polynomial jumps, because the microscope switches its scan range there; each
+        belongs to the range above it. The last coefficients are the sizes of the jumps.
     """
 
     kind: str
     coefficients: Array
     g_range: tuple[float, float]
     shape: Array = field(default_factory=lambda: np.empty(0))
+    breaks: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -99,6 +103,7 @@ class ContinuousFunction:
             raise InvalidValueError(
                 f"coefficients {self.coefficients!r}", expected="a vector of finite numbers"
             )
+        self._check_breaks()
         shaped = self.kind in ("linear_log", "ode")
         if self.size < 1 or (shaped and len(self.shape) != self.size):
             raise InvalidValueError(
@@ -110,24 +115,41 @@ class ContinuousFunction:
         ):
             raise InvalidValueError("knots out of order", expected="increasing magnifications")
 
+    def _check_breaks(self) -> None:
+        low, high = self.g_range
+        inside = np.all((self.breaks > low) & (self.breaks <= high))
+        if not (inside and np.all(np.diff(self.breaks) > 0)):
+            raise InvalidValueError(
+                f"breakpoints {self.breaks.tolist()}",
+                expected=f"increasing magnifications between {low:g} and {high:g}",
+            )
+        if len(self.breaks) and (self.kind in ("linear_log", "ode") or self.smooth_size < 1):
+            raise InvalidValueError(
+                f"breakpoints in a function of kind {self.kind} with {self.size} coefficients",
+                expected="a polynomial with a coefficient of its own",
+            )
+
     @property
     def size(self) -> int:
         """Number of coefficients."""
         return len(self.coefficients)
 
+    @property
+    def smooth_size(self) -> int:
+        """Number of coefficients without the jumps."""
+        return len(self.coefficients) - len(self.breaks)
+
     def basis(self, g: float) -> Array:
         """(size,) row such that ``value = basis(g) @ coefficients``; tangential in log g out of range."""
         low, high = self.g_range
         edge = min(max(g, low), high)
-        row = basis_row(self.kind, self.size, edge, self.g_range, self.shape)
-        if edge == g or high == low:
-            return row
-        step = 1e-4 * np.log(high / low) * (1.0 if g < low else -1.0)
-        inner = basis_row(
-            self.kind, self.size, edge * float(np.exp(step)), self.g_range, self.shape
-        )
-        tangent = (inner - row) / step
-        return np.asarray(row + tangent * np.log(g / edge), dtype=np.float64)
+        row = basis_row(self.kind, self.smooth_size, edge, self.g_range, self.shape)
+        if edge != g and high > low:
+            step = 1e-4 * np.log(high / low) * (1.0 if g < low else -1.0)
+            inside = edge * float(np.exp(step))
+            inner = basis_row(self.kind, self.smooth_size, inside, self.g_range, self.shape)
+            row = row + (inner - row) / step * np.log(g / edge)
+        return np.concatenate([row, (g >= self.breaks).astype(np.float64)])
 
     def __call__(self, g: float) -> float:
         """Value at the magnification ``g``."""

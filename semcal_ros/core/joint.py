@@ -68,9 +68,10 @@ def enriched(
     """Functions of other kinds and sizes through the values of the given ones, by least squares."""
     out: dict[str, ContinuousFunction] = {}
     for name, function in functions.items():
-        kind, size = sizes.get(name, (function.kind, function.size))
-        blank = ContinuousFunction(kind, np.zeros(size), function.g_range)
-        grid = np.geomspace(*function.g_range, 64)
+        kind, size = sizes.get(name, (function.kind, function.smooth_size))
+        zeros = np.zeros(size + len(function.breaks))
+        blank = ContinuousFunction(kind, zeros, function.g_range, breaks=function.breaks)
+        grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
         basis = np.stack([blank.basis(float(g)) for g in grid])
         values = np.array([function(float(g)) for g in grid])
         out[name] = replace(blank, coefficients=np.linalg.lstsq(basis, values, rcond=None)[0])
@@ -121,7 +122,7 @@ def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
     uncertainty of the calibration.
     """
     sizes = {
-        name: (functions[name].kind, max(functions[name].size + _RESERVE, _LEAST_SIZE))
+        name: (functions[name].kind, max(functions[name].smooth_size + _RESERVE, _LEAST_SIZE))
         for name in _SMOOTH
     }
     return (

@@ -32,6 +32,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Functions = Mapping[str, ContinuousFunction]
 
+_JUMPING = ("scale", "aspect", "skew")
 _MAX_TURNS = 5
 _POSE_ITERATIONS = 12
 
@@ -50,6 +51,8 @@ class Priors:
         Distortion about zero.
     aspect_sigma, skew_sigma, scale_sigma
         About 1, 0 and the nominal scale.
+    scale_jump, aspect_jump, skew_jump
+        1-sigma of the jump at a breakpoint.
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
         1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, k times over. A few times
         what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a magnification.
@@ -73,6 +76,9 @@ class Priors:
     xi_r_change: float = 0.02
     xi_t_change: float = 0.005
     centre_change_fraction: float = 0.02
+    scale_jump: float = 0.03
+    aspect_jump: float = 0.01
+    skew_jump: float = 0.005
     height_sigma_m: float = 1e-4
 
 
@@ -85,6 +91,7 @@ class Setup:
     image_size: tuple[int, int]
     display_width_m: float
     priors: Priors
+    breakpoints: tuple[float, ...] = ()
 
     @property
     def norm_px(self) -> float:
@@ -114,18 +121,24 @@ class Setup:
             "ey": centre,
         }.get(name, self.prior_of(name)[1])
 
-    def coefficient_priors(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
-        """(size,) means and sigmas of the coefficients of a camera parameter's function.
+    def breaks_of(self, name: str) -> Array:
+        """Breakpoints of a camera parameter: the amplifiers of the scan change scale, aspect and skew."""
+        return np.array(self.breakpoints if name in _JUMPING else (), dtype=np.float64)
 
-        The constant of a polynomial has the parameter's own prior, the others say how it changes; all values of a
-        table have the parameter's own.
+    def coefficient_priors(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
+        """Means and sigmas of the coefficients of a camera parameter's function, ``size`` without its jumps.
+
+        The constant of a polynomial has the parameter's own prior, the others say how it changes, and the last ones
+        how it jumps; all values of a table have the parameter's own.
         """
         mean, sigma = self.prior_of(name)
         if kind == "linear_log":
             return np.full(size, mean), np.full(size, sigma)
-        order = np.arange(1, size)
-        sigmas = np.concatenate([[sigma], self.change_prior_of(name) / order])
-        return np.concatenate([[mean], np.zeros(size - 1)]), sigmas
+        p, order, jumps = self.priors, np.arange(1, size), len(self.breaks_of(name))
+        jump = {"scale": p.scale_jump, "aspect": p.aspect_jump, "skew": p.skew_jump}.get(name, 0.0)
+        change = self.change_prior_of(name) / order
+        sigmas = [np.array([sigma]), change, np.full(jumps, jump)]
+        return np.concatenate([[mean], np.zeros(size - 1 + jumps)]), np.concatenate(sigmas)
 
     def prior_of(self, name: str) -> tuple[float, float]:
         """(mean, sigma) of a camera parameter."""
@@ -172,7 +185,7 @@ def build_problem(
 def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
     """(K,) means and sigmas of all coefficients, as in :meth:`Setup.coefficient_priors`."""
     parts = [
-        setup.coefficient_priors(name, functions[name].kind, functions[name].size)
+        setup.coefficient_priors(name, functions[name].kind, functions[name].smooth_size)
         for name in FUNCTION_NAMES
     ]
     return np.concatenate([m for m, _ in parts]), np.concatenate([s for _, s in parts])
@@ -190,13 +203,16 @@ def with_coefficients(functions: Functions, theta: Array) -> dict[str, Continuou
 
 
 def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, ContinuousFunction]:
-    """Functions that do not depend on the magnification."""
+    """Functions that do not depend on the magnification, but for the jumps."""
     g_range = (float(setup.magnifications[0]), float(setup.magnifications[-1]))
     return {
         name: ContinuousFunction(
             "chebyshev_log",
-            np.array([values.get(name, setup.prior_of(name)[0])], dtype=np.float64),
+            np.array(
+                [values.get(name, setup.prior_of(name)[0]), *np.zeros(len(setup.breaks_of(name)))]
+            ),
             g_range,
+            breaks=setup.breaks_of(name),
         )
         for name in FUNCTION_NAMES
     }

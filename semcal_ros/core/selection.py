@@ -68,7 +68,9 @@ class _Candidates:
     def _rows(self, name: str, kind: str, size: int) -> Array:
         key = (name, kind, size)
         if key not in self.rows:
-            blank = ContinuousFunction(kind, np.zeros(size), self.base[name].g_range)
+            breaks = self.setup.breaks_of(name)
+            zeros = np.zeros(size + len(breaks))
+            blank = ContinuousFunction(kind, zeros, self.base[name].g_range, breaks=breaks)
             rows = np.stack([blank.basis(float(g)) for g in self.setup.magnifications])
             if name == "scale":
                 rows = rows * self.setup.nominal_px_per_m(self.setup.magnifications)[:, None]
@@ -128,7 +130,7 @@ def select_functions(
     """
     candidates = _Candidates(summary, setup, functions)
     limit = min(_MAX_SIZE, len(setup.magnifications) - 1)
-    sizes = {name: (functions[name].kind, functions[name].size) for name in FUNCTION_NAMES}
+    sizes = {name: (functions[name].kind, functions[name].smooth_size) for name in FUNCTION_NAMES}
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
     while True:
         score = candidates.score(sizes)
