@@ -9,6 +9,7 @@ calibration.py            joint, pda and discrete calibration beside cv2.calibra
                           magnifications that none of them saw; the corner finder beside OpenCV's
 drift.py                  registration beside phase correlation, ECC and, where it is installed,
                           scikit-image, and the Cramer-Rao bound
+coverage.py               how often the stated uncertainty of a calibration holds the truth
 rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
 live.py                   the node stream_corrector over DDS beside a process that only relays
 ========================  ==========================================================================
@@ -35,7 +36,7 @@ import cv2
 import numpy as np
 import scipy
 
-PARTS = ("calibration", "drift", "rectify", "live")
+PARTS = ("calibration", "coverage", "drift", "rectify", "live")
 
 
 def main() -> int:

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
-_RESERVE, _LEAST_SIZE = 1, 4
+_RESERVE, _LEAST_SIZE = 2, 5
 _HEIGHT_UPDATES = 3
 # For what only has to be near: signs of tilts, poses, moderately flexible functions.
 _ENOUGH_CORNERS = 60

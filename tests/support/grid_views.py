@@ -51,8 +51,12 @@ def grid_views(
     height_sigma_m: float = 40e-6,
     square_px: float = 40.0,
     seed: int = 0,
+    flat_height_sigma_m: float = 0.0,
 ) -> list[GridView]:
-    """``views`` random poses per magnification, the first untilted, tilts up to 40 degrees."""
+    """``views`` random poses per magnification, the first untilted, tilts up to 40 degrees.
+
+    The heights have the sigma ``height_sigma_m``, those of the untilted views ``flat_height_sigma_m``.
+    """
     rng = np.random.default_rng(seed)
     # A generator of its own: the poses of a seed are the same with and without noise.
     noise_rng = np.random.default_rng(seed + 1_000_000)
@@ -65,7 +69,9 @@ def grid_views(
             turn = rotations_from_vectors(np.array([[0.0, 0.0, rng.uniform(-0.6, 0.6)]]))[0]
             lean = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
             centre = rng.uniform(-0.5, 0.5, size=2) * square_px / camera.m
-            translation = np.array([*centre, 0.0 if k == 0 else rng.normal() * height_sigma_m])
+            # Without a height of its own, the first view draws no number, so that seeds keep their poses.
+            sigma = flat_height_sigma_m if k == 0 else height_sigma_m
+            translation = np.array([*centre, rng.normal() * sigma if sigma > 0.0 else 0.0])
             out.append(
                 grid_view(
                     camera,
