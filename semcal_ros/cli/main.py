@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 
 import click
@@ -56,13 +57,16 @@ def _semcal() -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command; returns its exit status (0, or 2 for bad input)."""
+    given = sys.argv[1:] if args is None else args
     try:
-        _semcal(args=args, prog_name="semcal", standalone_mode=False)
+        _semcal(args=given or ["--help"], prog_name="semcal", standalone_mode=False)
     except click.exceptions.Exit as stop:
         return stop.exit_code
+    except click.UsageError as error:
+        command = error.ctx.command_path if error.ctx is not None else "semcal"
+        return _refuse(f"{_one_line(error)}; see {command} --help")
     except click.ClickException as error:
-        error.show()
-        return 2
+        return _refuse(_one_line(error))
     except SemcalError as error:
         return _refuse(str(error))
     except BrokenPipeError:
@@ -73,6 +77,10 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, click.Abort):
         return 130
     return 0
+
+
+def _one_line(error: click.ClickException) -> str:
+    return " ".join(error.format_message().split()).rstrip(".")
 
 
 def _refuse(reason: str) -> int:

@@ -173,6 +173,12 @@ def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     assert "magnification" in refused(capsys, "at", cal, "nan")
     assert "magnification" in refused(capsys, "at", cal, "--", "-3")
     assert "greater than 0" in refused(capsys, "at", cal, "0")
+    assert "'abc' is not a valid float; see semcal at --help" in refused(capsys, "at", cal, "abc")
+    assert "no such" in refused(capsys, "fly").lower()
+    assert "1000,5000" in refused(
+        capsys, "calibrate", folder / "grid", "-o", tmp_path / "c.yaml", "--breakpoints", "a,b"
+    )
+    assert "missing" in refused(capsys, "rectify", folder / "grid").lower()
     assert "not valid YAML" in refused(capsys, "at", _file(tmp_path / "a.yaml", "a: [1"), 100)
     assert "not a calibration" in refused(capsys, "at", _file(tmp_path / "b.yaml", "a: 1"), 100)
     newer = cal.read_text().replace("version: 1", "version: 2")
