@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import pytest
-from corner_boards import Board
+from corner_boards import Board, position_bound
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -105,37 +106,102 @@ def test_spacing_is_that_without_foreshortening(tilt: float) -> None:
     assert detect(board).spacing_px == pytest.approx(36.0, rel=3e-3)
 
 
-def cramer_rao_sigma(board: Board, picture: Array, xy: Array) -> Array:
-    """(n,) bound for corners at ``xy`` if only position and edge directions were unknown.
+BOUND_BOARDS = {
+    "10 px, blur 2": Board(
+        10.0, turn_deg=33.0, electrons=300.0, blur_px=2.0, width=300, height=300
+    ),
+    "10 px, tilt 50, blur 2": Board(
+        10.0,
+        tilt_deg=50.0,
+        axis_deg=20.0,
+        turn_deg=60.0,
+        electrons=300.0,
+        blur_px=2.0,
+        width=300,
+        height=300,
+    ),
+    "12 px, blur 2, 25 electrons": Board(
+        12.0, turn_deg=71.0, electrons=25.0, blur_px=2.0, width=300, height=300
+    ),
+    "16 px, tilt 50, blur 1": Board(
+        16.0,
+        tilt_deg=50.0,
+        axis_deg=80.0,
+        turn_deg=15.0,
+        electrons=100.0,
+        blur_px=1.0,
+        width=300,
+        height=300,
+    ),
+    "25 px, 25 electrons": Board(
+        25.0, turn_deg=20.0, electrons=25.0, blur_px=0.6, width=300, height=300
+    ),
+    "40 px, blur 1": Board(40.0, turn_deg=43.0, electrons=100.0, blur_px=1.0),
+    "80 px, tilt 50, blur 1": Board(
+        80.0, tilt_deg=50.0, axis_deg=10.0, turn_deg=50.0, electrons=100.0, blur_px=1.0
+    ),
+    "130 px, blur 1": Board(130.0, turn_deg=25.0, electrons=100.0, blur_px=1.0),
+}
 
-    The information is that of the Poisson counts in a window of half a square around each corner,
-    with the derivative of the noise-free picture taken from the rendered board itself, by shifting
-    it; nothing of the finder is used. Moving the picture in the window moves the corner; directions
-    do not correlate with it in a symmetric window.
-    """
-    variance = picture / board.electrons
-    by_y, by_x = np.gradient(picture)
-    half = int(board.square_px * 0.5 / np.sqrt(2.0))
-    sigmas = []
-    for x, y in np.round(xy).astype(int):
-        rows, columns = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
-        gradient = np.stack([by_x[rows, columns].ravel(), by_y[rows, columns].ravel()])
-        information = (gradient / variance[rows, columns].ravel()) @ gradient.T
-        sigmas.append(np.sqrt(np.trace(np.linalg.inv(information)) / 2.0))
-    return np.array(sigmas)
 
-
-@pytest.mark.parametrize("turn", [43.0, 37.0])
-def test_error_is_near_the_cramer_rao_bound(turn: float) -> None:
-    # Turned by about 45 degrees, the axis-parallel square window of the bound lies inside of the
-    # cell around the corner.
-    board = Board(40.0, turn_deg=turn, electrons=100.0, blur_px=1.0)
+@pytest.mark.parametrize("board", BOUND_BOARDS.values(), ids=BOUND_BOARDS.keys())
+def test_error_is_near_the_cramer_rao_bound(board: Board) -> None:
     detection = detect(board, np.float64)
-    inside = np.all((detection.xy > 25) & (detection.xy < 486), axis=1)
-    # Both windows hold the same length of the edges: half a square each way.
-    bound = cramer_rao_sigma(board, board.clean(), detection.xy[inside])
-    rms = np.sqrt(np.mean(errors(board, detection)[inside] ** 2))
-    assert rms < 1.3 * np.sqrt(np.mean(bound**2))
+    ij, xy = board.corners(margin=0.5 * board.square_px)
+    bound = np.linalg.inv(position_bound(board, ij))
+    distance, nearest = cKDTree(detection.xy).query(xy)
+    seen = distance < 1.5
+    assert seen.mean() > 0.99
+    error = detection.xy[nearest[seen]] - xy[seen]
+    ratio = np.sqrt(np.einsum("ni,nij,nj->n", error, bound[seen], error).mean() / 2.0)
+    # 1 is perfect; 15 % are for what else has to be fitted, the rest for the scatter of few corners.
+    assert ratio < 1.15 + 3.0 / np.sqrt(4.0 * len(error))
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0])
+def test_edges_along_the_axes_of_the_image(turn: float) -> None:
+    # Directions of the edges are at the cut of the arcus tangens.
+    board = Board(14.0, turn_deg=turn, electrons=100.0)
+    detection = detect(board)
+    assert found(board, detection) > 0.99
+    # The samples of the rendering move edges along them by up to 1/16 px, all corners alike.
+    error = errors(board, detection)
+    error -= error.mean(axis=0)
+    # The finder's sigmas are true to some 5 %; 1300 corners tell them to 2 %.
+    assert (error / detection.sigma_px[:, None]).std() < 1.15
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_wide_bright_squares_do_not_move_corners_at_the_border(inverted: bool) -> None:
+    board = Board(115.0, turn_deg=7.0, tilt_deg=15.0, electrons=100.0, blur_px=1.5, growth_px=0.9)
+    picture = board.render(np.random.default_rng(0))
+    detection = find_lattice(255 - picture if inverted else picture)
+    assert detection.accepted
+    error = errors(board, detection)
+    centred = np.abs(detection.xy - board.centre).max(axis=1)
+    border = centred > 256.0 - 0.35 * 115.0
+    assert border.sum() >= 4
+    # One-sided windows see the edges displaced by 0.9 px: unmodelled, that is over ten sigmas.
+    assert np.abs(error[border] / detection.sigma_px[border, None]).max() < 4.5
+
+
+@pytest.mark.parametrize("square", [13.0, 30.0, 100.0])
+def test_charging_gradients(square: float) -> None:
+    board = Board(square, turn_deg=28.0, tilt_deg=25.0, electrons=100.0)
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[0.0:512.0, 0.0:512.0]
+    field = np.ones((512, 512))
+    for _ in range(6):
+        cx, cy, width = rng.uniform(0, 512), rng.uniform(0, 512), rng.uniform(60, 120)
+        bump = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2.0 * width**2))
+        field += rng.uniform(-0.4, 0.8) * bump
+    counts = rng.poisson(board.clean(4) * field * board.electrons) / board.electrons
+    detection = find_lattice(np.clip(counts * 80.0, 0, 255).astype(np.uint8))
+    assert found(board, detection) > 0.98
+    score = errors(board, detection) / detection.sigma_px[:, None]
+    # As for even light, but that the gradients are not the straight ones of the model.
+    assert score.std() < 1.2 + 3.0 / np.sqrt(4.0 * len(score))
+    assert np.abs(score).max() < 6.0
 
 
 def test_noise_free_board_is_found_to_a_hundredth() -> None:
@@ -173,18 +239,31 @@ def test_bounded_board_gives_its_inner_corners_and_no_others() -> None:
     assert np.abs(errors(board, detection)).max() < 0.2
 
 
-def test_debris_and_missing_squares_do_not_make_false_corners() -> None:
-    board = Board(40.0, turn_deg=25.0, electrons=100.0, tilt_deg=20.0)
+@pytest.mark.parametrize("square", [15.0, 40.0, 90.0])
+def test_debris_and_missing_squares_do_not_make_false_corners(square: float) -> None:
+    board = Board(square, turn_deg=25.0, electrons=100.0, tilt_deg=20.0)
     rng = np.random.default_rng(3)
     picture = board.render(rng)
     y, x = np.mgrid[0:512, 0:512]
+    cells = np.floor(board.board_from_image(np.column_stack([x.ravel(), y.ravel()]))).astype(int)
+    cells -= cells.min(axis=0)
+    missing = rng.random(cells.max(axis=0) + 1) < 0.05
+    spoilt = missing[cells[:, 0], cells[:, 1]].reshape(512, 512)
+    picture[spoilt] = rng.poisson(35.0, int(spoilt.sum()))
     for _ in range(12):
         cx, cy, radius = rng.uniform(0, 512), rng.uniform(0, 512), rng.uniform(6, 20)
-        picture[(x - cx) ** 2 + (y - cy) ** 2 < radius**2] = rng.integers(10, 150)
+        grain = (x - cx) ** 2 + (y - cy) ** 2 < radius**2
+        picture[grain] = rng.integers(10, 150)
+        spoilt |= grain
     detection = find_lattice(picture)
     assert detection.accepted
-    # Debris hides some corners; the others are found, and none is off by half a pixel.
-    assert found(board, detection) > 0.75
+    # Corners with nothing near them are found, and none is off by half a pixel.
+    near = round(0.5 * square)
+    clear = cv2.dilate(spoilt.astype(np.uint8), np.ones((near, near), np.uint8)) == 0
+    truth = board.corners(margin=5.0)[1]
+    column, row = np.rint(truth).astype(int).T
+    truth = truth[clear[row, column]]
+    assert np.mean(cKDTree(detection.xy).query(truth)[0] < 0.5) > 0.9
     assert np.abs(errors(board, detection)).max() < 0.5
     index_map(board, detection)
 

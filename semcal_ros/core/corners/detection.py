@@ -17,11 +17,14 @@ __all__ = ["LatticeDetection", "find_lattice"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Image = NDArray[np.float32]
 
 SCALES_PX = (2.5, 1.5, 4.2, 7.0)
 MINIMUM_CORNERS = 12
 # A lattice that fills this part of the image is not going to be beaten at another scale.
 FILLED = 0.6
+# Debris and missing squares may spoil so many corners without another scale being better.
+CONVINCING = 0.6
 
 
 def _no_covariance() -> Array:
@@ -101,31 +104,58 @@ def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection
     scaled, reason = screen_image(grey)
     if reason:
         return _refused(reason, size)
-    best: RefinedCorners | None = None
-    for scale in SCALES_PX:
-        lattice = grow_best_lattice(find_saddles(scaled, scale), size)
-        if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
-            continue
-        refined = refine_lattice(scaled, lattice)
-        if refined is None:
-            continue
-        if best is None or len(refined.ij) * refined.quality > len(best.ij) * best.quality:
-            best = refined
-        if _filled(lattice, size) > FILLED and best.quality > 0.8:
-            break
+    best = _best_corners(scaled, size)
     if best is None:
         return _refused("no chess lattice: no regular pattern of saddle points", size)
-    if best.quality < 0.5:
+    corners, filled = best
+    if corners.quality < 0.5:
         return _refused(
-            f"no chess lattice: only {round(100 * best.quality)} % of the expected corners"
+            f"no chess lattice: only {round(100 * corners.quality)} % of the expected corners"
             " look like corners",
             size,
         )
-    if len(best.ij) < MINIMUM_CORNERS:
+    if len(corners.ij) < MINIMUM_CORNERS and filled < FILLED / 2.0:
         return _refused(
-            f"too few corners: {len(best.ij)} found, at least {MINIMUM_CORNERS} needed", size
+            f"no chess lattice: only {len(corners.ij)} regular corners, in"
+            f" {max(1, round(100 * filled))} % of the image",
+            size,
         )
-    return _accepted(best, size)
+    if len(corners.ij) < MINIMUM_CORNERS:
+        return _refused(
+            f"too few corners: {len(corners.ij)} found, at least {MINIMUM_CORNERS} needed", size
+        )
+    return _accepted(corners, size)
+
+
+def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, float] | None:
+    """The best corners of all scales, and the part of the image that their lattice covers."""
+    candidates: list[tuple[float, Lattice]] = []
+    best: tuple[RefinedCorners, float] | None = None
+    for scale in SCALES_PX:
+        lattice = grow_best_lattice(find_saddles(image, scale), size)
+        if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
+            continue
+        filled = _filled(lattice, size)
+        if filled <= FILLED:
+            candidates.append((filled, lattice))
+            continue
+        best = _better(best, refine_lattice(image, lattice), filled)
+        if best is not None and best[0].quality > CONVINCING:
+            return best
+    for filled, lattice in candidates:
+        best = _better(best, refine_lattice(image, lattice), filled)
+    return best
+
+
+def _better(
+    best: tuple[RefinedCorners, float] | None, other: RefinedCorners | None, filled: float
+) -> tuple[RefinedCorners, float] | None:
+    """The one with more corners that are worth more."""
+    if other is None:
+        return best
+    if best is None or len(other.ij) * other.quality > len(best[0].ij) * best[0].quality:
+        return other, filled
+    return best
 
 
 def _filled(lattice: Lattice, size: tuple[int, int]) -> float:

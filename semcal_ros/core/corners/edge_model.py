@@ -1,31 +1,54 @@
 """Grey values around a chess corner: two blurred, curved edges that cross.
 
-    I(x) = b0 + b . x + (a0 + a . x) S(d1) S(d2)
+    I(x) = b0 + b . x + (a0 + a . x) S(d1) S(d2) + g1 B(d1) + g2 B(d2)
     S(d) = sum_k (-1)^k erf((d - k h) / (sqrt(2) w)),  k = -1, 0, 1
+    B(d) = sum_k n(d - k h)
 
 with ``d1`` and ``d2`` the distances from the edges along i and j, ``h`` the distance of the next
-parallel edge and ``w`` the blur. The edges bend as the local lattice map says, but for a small
-correction that large squares can determine; a plane and a gradient of the contrast take shading.
+parallel edge, ``w`` the blur and ``n`` the derivative of the blurred step. The edges bend as the
+local lattice map says, but for a small correction that large squares can determine; a plane and a
+gradient of the contrast take shading. ``g / a0`` is how far the edges lie outside of the bright
+squares: a slope of the specimen, or the bright rim that an electron microscope shows at every step.
+It moves the two halves of an edge to opposite sides and matters where only one half is in view.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = ["LINEAR", "NONLINEAR", "EdgeGeometry", "evaluate"]
+__all__ = [
+    "ANGLES",
+    "BRIGHTNESS",
+    "CONTRAST",
+    "GRADIENTS",
+    "GROWTH",
+    "LINEAR",
+    "LOG_BLUR",
+    "NONLINEAR",
+    "SAGITTAS",
+    "EdgeGeometry",
+    "evaluate",
+]
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 # x, y, direction of the edge along i and of that along j, log blur, extra sagitta of the two edges
-# over half a square; then b0, bx, by, a0, ax, ay.
+# over half a square; then b0, bx, by, a0, ax, ay, g1, g2.
 NONLINEAR = 7
-LINEAR = 6
+LINEAR = 8
+ANGLES = slice(2, 4)
+LOG_BLUR = 4
+SAGITTAS = slice(5, 7)
+BRIGHTNESS, CONTRAST = 7, 10
+# bx, by and ax, ay
+GRADIENTS = (slice(8, 10), slice(11, 13))
+GROWTH = slice(13, 15)
 
 
 @dataclass(frozen=True)
@@ -47,6 +70,10 @@ class EdgeGeometry:
     curvature_1: Array
     curvature_2: Array
     length: Array
+
+    def select(self, rows: slice) -> EdgeGeometry:
+        """A slice of the corners."""
+        return EdgeGeometry(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
     def from_map(cls, axes: Array, bend: Array) -> EdgeGeometry:
@@ -87,21 +114,27 @@ def _erf_and_bell(z: Single) -> tuple[Single, Single]:
     return np.copysign(np.float32(1.0) - tail, z), bell
 
 
-def _profile(distance: Single, spacing: Single, blur: Single) -> tuple[Single, Single, Single]:
-    """S, dS/dd and dS/dlog(w)."""
+def _profile(
+    distance: Single, spacing: Single, blur: Single
+) -> tuple[Single, Single, Single, Single]:
+    """S, dS/dd, dS/dlog(w) and B."""
     scale = np.float32(np.sqrt(2.0 / np.pi)) / blur
     value, slope = _erf_and_bell(distance / blur)
     slope *= scale
     by_blur = -distance * slope
-    if float((spacing / blur).min()) < NEIGHBOUR_BLURS:
-        for side in (spacing, -spacing):
-            other = distance - side
-            step, bell = _erf_and_bell(other / blur)
-            bell *= scale
-            value -= step
-            slope -= bell
-            by_blur += other * bell
-    return value, slope, by_blur
+    if float((spacing / blur).min()) >= NEIGHBOUR_BLURS:
+        return value, slope, by_blur, slope
+    bump = slope.copy()
+    for side in (spacing, -spacing):
+        other = distance - side
+        step, bell = _erf_and_bell(other / blur)
+        bell *= scale
+        value -= step
+        slope -= bell
+        bump += bell
+        other *= bell
+        by_blur += other
+    return value, slope, by_blur, bump
 
 
 def evaluate(
@@ -112,7 +145,7 @@ def evaluate(
     Returns
     -------
     jacobian
-        (n, 13, p) derivatives; with ``linear`` None only the (n, 6, p) linear ones.
+        (n, 15, p) derivatives; with ``linear`` None only the (n, 8, p) linear ones.
     model
         (n, p) grey values; zeros where ``linear`` is None.
     """
@@ -131,37 +164,48 @@ def evaluate(
     along_1, off_1 = cos_1 * x + sin_1 * y, cos_1 * y - sin_1 * x
     along_2, off_2 = cos_2 * x + sin_2 * y, sin_2 * x - cos_2 * y
     half = np.float32(0.5)
-    edge_1, slope_1, blur_1 = _profile(
+    edge_1, slope_1, blur_1, bump_1 = _profile(
         off_1 - half * bend_1 * along_1 * along_1, column(geometry.spacing_1), blur
     )
-    edge_2, slope_2, blur_2 = _profile(
+    edge_2, slope_2, blur_2, bump_2 = _profile(
         off_2 - half * bend_2 * along_2 * along_2, column(geometry.spacing_2), blur
     )
     length = column(geometry.length)
     u, v = windows.x / length, windows.y / length
-    product = edge_1 * edge_2
     n, pixels = windows.x.shape
     free = NONLINEAR if linear is not None else 0
     jacobian = np.empty((n, free + LINEAR, pixels), dtype=np.float32)
-    jacobian[:, free] = 1.0
-    jacobian[:, free + 1], jacobian[:, free + 2] = u, v
-    jacobian[:, free + 3] = product
-    np.multiply(u, product, out=jacobian[:, free + 4])
-    np.multiply(v, product, out=jacobian[:, free + 5])
+    j = jacobian.transpose(1, 0, 2)
+    j[free], j[free + 1], j[free + 2] = 1.0, u, v
+    product = np.multiply(edge_1, edge_2, out=j[free + 3])
+    np.multiply(u, product, out=j[free + 4])
+    np.multiply(v, product, out=j[free + 5])
+    j[free + 6], j[free + 7] = bump_1, bump_2
     if linear is None:
         return jacobian, np.zeros_like(windows.x)
-    b0, bx, by, a0, ax, ay = (column(c) for c in linear.T)
-    contrast = a0 + ax * u + ay * v
-    model = b0 + bx * u + by * v + contrast * product
-    by_1, by_2 = contrast * slope_1 * edge_2, contrast * slope_2 * edge_1
-    pull_1, pull_2 = bend_1 * along_1, bend_2 * along_2
-    one = np.float32(1.0)
-    jacobian[:, 0] = by_1 * (sin_1 + pull_1 * cos_1) + by_2 * (pull_2 * cos_2 - sin_2)
-    jacobian[:, 1] = by_1 * (pull_1 * sin_1 - cos_1) + by_2 * (cos_2 + pull_2 * sin_2)
-    jacobian[:, 2] = -by_1 * along_1 * (one + bend_1 * off_1)
-    jacobian[:, 3] = by_2 * along_2 * (one + bend_2 * off_2)
-    jacobian[:, 4] = contrast * (blur_1 * edge_2 + blur_2 * edge_1)
-    arm = one / (length * length)
-    jacobian[:, 5] = -by_1 * (along_1 * along_1 * arm)
-    jacobian[:, 6] = -by_2 * (along_2 * along_2 * arm)
+    model = (linear.astype(np.float32)[:, None, :] @ jacobian[:, free:])[:, 0]
+    a0, ax, ay = (column(c) for c in linear.T[3:6])
+    contrast = ax * u
+    contrast += ay * v
+    contrast += a0
+    by_1, by_2 = slope_1 * edge_2, slope_2 * edge_1
+    by_1 *= contrast
+    by_2 *= contrast
+    np.multiply(by_1, along_1, out=j[2])
+    np.multiply(by_2, along_2, out=j[3])
+    np.add(by_1 * sin_1, bend_1 * cos_1 * j[2], out=j[0])
+    j[0] += bend_2 * cos_2 * j[3]
+    j[0] -= by_2 * sin_2
+    np.subtract(by_2 * cos_2, by_1 * cos_1, out=j[1])
+    j[1] += bend_1 * sin_1 * j[2]
+    j[1] += bend_2 * sin_2 * j[3]
+    arm = np.float32(-1.0) / (length * length)
+    np.multiply(j[2], along_1 * arm, out=j[5])
+    np.multiply(j[3], along_2 * arm, out=j[6])
+    j[2] *= np.float32(-1.0) - bend_1 * off_1
+    j[3] *= np.float32(1.0) + bend_2 * off_2
+    blur_1 *= edge_2
+    blur_2 *= edge_1
+    blur_1 += blur_2
+    np.multiply(contrast, blur_1, out=j[4])
     return jacobian, model

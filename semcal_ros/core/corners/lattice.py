@@ -167,8 +167,10 @@ class _Growth:
         self._used[members] = True
 
     def _advance(self, frontier: Indices) -> Indices:
-        cells = np.unique((frontier[:, None] + STEPS[None]).reshape(-1, 2), axis=0)
         side = self._member.shape[0]
+        near = (frontier[:, None] + STEPS[None]).reshape(-1, 2)
+        keys = np.unique(near[:, 0] * side + near[:, 1])
+        cells: Indices = np.stack([keys // side, keys % side], axis=1)
         inside = np.all((cells >= 1) & (cells < side - 1), axis=1)
         cells = cells[inside]
         # A second look, with more neighbours known, finds what the first prediction missed.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,13 @@ class LocalMaps:
             self.leverage[keep],
         )
 
+    @staticmethod
+    def join(parts: Sequence[LocalMaps]) -> LocalMaps:
+        """All maps of several sets."""
+        return LocalMaps(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(LocalMaps))
+        )
+
 
 def fit_local_maps(
     cells: Indices, ij: Indices, xy: Array, *, leave_out_self: bool = True
@@ -91,30 +99,36 @@ def fit_local_maps(
         weight = np.where((u == 0) & (v == 0), 0.0, weight)
 
     lookup, low = _dense(ij, cells, reach)
-    near = cells[:, None, :] - low + np.stack([u, v], axis=1).astype(np.int64)[None]
-    member = lookup[near[..., 0], near[..., 1]]
+    side = lookup.shape[1]
+    steps = (u * side + v).astype(np.int64)
+    member = lookup.ravel()[((cells - low) @ np.array([side, 1]))[:, None] + steps]
     known = member >= 0
-    w = np.where(known, weight[None], 0.0)
+    # Most cells have the same neighbours, and the fit is linear in their positions.
+    code, which = np.unique(known @ (1 << np.arange(len(u), dtype=np.int64)), return_inverse=True)
+    patterns = ((code[:, None] >> np.arange(len(u))) & 1).astype(np.float64) * weight
+    total = np.maximum(patterns.sum(axis=1, keepdims=True), 1e-12)
     # Positions relative to the neighbours' mean keep the ridge off the zeroth order and the numbers
     # small.
-    mean = (w[:, :, None] * xy[member]).sum(axis=1) / np.maximum(w.sum(axis=1), 1e-12)[:, None]
-    target = xy[member] - mean[:, None]
-    pairs = (basis[:, :, None] * basis[:, None, :]).reshape(len(u), -1)
-    terms = basis.shape[1]
-    normal = (w @ pairs).reshape(-1, terms, terms)
-    normal += np.diag(ridge) + 1e-9 * np.eye(terms)
-    right = basis.T @ (w[:, :, None] * target)
-    inverse = np.linalg.inv(normal)
-    solution = inverse @ right
-    spread = ((w * w) @ pairs).reshape(-1, terms, terms)
-    leverage = np.einsum("na,nab,nb->n", inverse[:, 0], spread, inverse[:, 0])
+    average = (patterns / total)[which]
+    mean = (average[:, None] @ xy[member])[:, 0]
+    solver = _solvers(patterns, basis, np.array(ridge))
+    solution = solver[which] @ (xy[member] - mean[:, None])
     return LocalMaps(
         solution[:, 0] + mean,
         solution[:, 1:3],
         solution[:, [3, 5]],
-        known.sum(axis=1).astype(np.float64) - (known[:, len(u) // 2] if leave_out_self else 0.0),
-        np.maximum(leverage, 0.0),
+        (patterns > 0).sum(axis=1).astype(np.float64)[which],
+        (solver[:, 0] ** 2).sum(axis=1)[which],
     )
+
+
+def _solvers(patterns: Array, basis: Array, ridge: Array) -> Array:
+    """(k, terms, m) maps from values to coefficients for each row of weights in (k, m)."""
+    terms = basis.shape[1]
+    pairs = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    normal = (patterns @ pairs).reshape(-1, terms, terms)
+    normal += np.diag(ridge + 1e-9)
+    return np.asarray(np.linalg.inv(normal) @ (basis.T * patterns[:, None, :]), dtype=np.float64)
 
 
 def _dense(ij: Indices, cells: Indices, reach: int) -> tuple[Indices, Indices]:

@@ -2,45 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.corners.edge_model import (
+    ANGLES,
+    BRIGHTNESS,
+    CONTRAST,
     LINEAR,
+    LOG_BLUR,
     NONLINEAR,
     EdgeGeometry,
     evaluate,
 )
-from semcal_ros.core.corners.local_map import LocalMaps
-from semcal_ros.core.corners.window import PixelWindows, gather_windows
+from semcal_ros.core.corners.priors import Prior
+from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = ["CornerFit", "NoiseModel", "fit_corners", "fit_noise"]
+__all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 BLUR_MIN_PX = 0.28
-BAND_MIN_PX = 4.0
-BAND_BLURS = 3.5
-BLOCK_PIXELS = 30000.0
-ANGLE_PRIOR = 0.03
-LOG_BLUR_FIRST_PRIOR = 0.5
-LOG_BLUR_PRIOR = 0.15
-# What a quadratic or cubic map through few, one-sided neighbours misses of a strong distortion
-# grows as the third power.
-SAGITTA_PRIOR_PX = 0.5
-LARGE_SQUARE_PX = 130.0
-# Shading over half a square, relative to the contrast of the image.
-GRADIENT_PRIOR = 0.15
+BAND_MIN_PX = 3.0
+BAND_BLURS = 3.0
+LEAST_OF_FLOOR = 0.25
+# Large enough to hide what a call costs, small enough to keep the arrays in a cache.
+BLOCK_PIXELS = 24000
 # For the first pass, which knows no noise yet.
 ASSUMED_VARIANCE = 0.02
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of a pixel: ``floor + slope * max(value - dark, 0)`` of its grey value."""
+    """Variance of a pixel: ``floor + slope * (value - dark)`` of its grey value.
+
+    ``dark`` is the mean of the darker pixels, so that half of them lie below it; the variance never
+    falls below a part of the floor.
+    """
 
     floor: float
     slope: float
@@ -48,8 +50,10 @@ class NoiseModel:
 
     def variance(self, value: Single) -> Single:
         """Variance at the grey values ``value``, same shape."""
-        above = np.maximum(value - np.float32(self.dark), np.float32(0.0))
-        return np.asarray(np.float32(self.floor) + np.float32(self.slope) * above, dtype=np.float32)
+        variance = np.float32(self.slope) * (value - np.float32(self.dark))
+        variance += np.float32(self.floor)
+        least = np.float32(LEAST_OF_FLOOR * self.floor)
+        return np.asarray(np.maximum(variance, least), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,10 @@ class CornerFit:
         (n, 2, 2) covariance of the positions, px^2, for the noise model given (unit noise without
         one).
     nonlinear, linear
-        (n, 7) and (n, 6) parameters of :mod:`semcal_ros.core.corners.edge_model`, positions
+        (n, 7) and (n, 8) parameters of :mod:`semcal_ros.core.corners.edge_model`, positions
         relative to the window.
+    normal
+        (n, 15, 15) normal matrices, the prior's share included.
     chi2
         (n,) weighted squared residuals per degree of freedom.
     freedom
@@ -83,6 +89,7 @@ class CornerFit:
     covariance: Array
     nonlinear: Array
     linear: Array
+    normal: Array
     chi2: Array
     freedom: Array
     shift_px: Array
@@ -95,14 +102,26 @@ class CornerFit:
         return CornerFit(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @property
+    def parameters(self) -> Array:
+        """(n, 15) nonlinear and linear parameters."""
+        return np.column_stack([self.nonlinear, self.linear])
+
+    @staticmethod
+    def join(parts: Sequence[CornerFit]) -> CornerFit:
+        """All fits of several sets."""
+        return CornerFit(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CornerFit))
+        )
+
+    @property
     def angles(self) -> Array:
         """(n, 2) directions of the edges along i and along j, rad."""
-        return self.nonlinear[:, 2:4]
+        return self.nonlinear[:, ANGLES]
 
     @property
     def blur_px(self) -> Array:
         """(n,) standard deviation of the blur, px."""
-        return np.asarray(np.exp(self.nonlinear[:, 4]), dtype=np.float64)
+        return np.asarray(np.exp(self.nonlinear[:, LOG_BLUR]), dtype=np.float64)
 
     @property
     def contrast(self) -> Array:
@@ -110,11 +129,33 @@ class CornerFit:
         return self.linear[:, 3]
 
 
+def rough_start(windows: PixelWindows, prior: Prior, sign: Array) -> Array:
+    """(n, 15) parameters to begin with: the prior's, and the mean and scatter of the pixels.
+
+    Parameters
+    ----------
+    sign
+        (n,) expected sign of the contrast.
+    """
+    count = np.maximum(windows.valid.sum(axis=1), 1.0)
+    mean = windows.value.sum(axis=1) / count
+    square = np.einsum("np,np->n", windows.value, windows.value) / count
+    start = prior.mean.copy()
+    start[:, BRIGHTNESS] = mean
+    start[:, CONTRAST] = sign * np.sqrt(np.maximum(square - mean * mean, 1e-6))
+    return start
+
+
+def band_px(blur_px: float) -> float:
+    """Half-width of the band of pixels along an edge that tell where it is."""
+    return max(BAND_MIN_PX, BAND_BLURS * blur_px + 1.0)
+
+
 def fit_corners(
-    image: Single,
-    maps: LocalMaps,
+    windows: PixelWindows,
+    geometry: EdgeGeometry,
     start: Array | None,
-    blur_px: float,
+    prior: Prior,
     *,
     noise: NoiseModel | None,
     iterations: int,
@@ -123,79 +164,79 @@ def fit_corners(
 
     Parameters
     ----------
-    image
-        (h, w) float32.
-    maps
-        Where the corners are expected, and first directions and the curvature of their edges.
+    windows
+        Pixels of the corners.
+    geometry
+        What the lattice says about them.
     start
-        (n, 2) first positions in the image, or None for those of the maps.
-    blur_px
-        First blur; the band of pixels used along the edges follows from it.
+        (n, 15) first parameters, or None for the prior's.
+    prior
+        Prior of the parameters.
     noise
         Noise for the weights; None for equal weights.
     iterations
         Number of steps.
     """
-    band = max(BAND_MIN_PX, BAND_BLURS * blur_px + 1.0)
-    reach = 1.0 + np.abs(maps.axes).sum(axis=1).max()
-    # Blocks whose arrays stay in the processor's cache.
-    block = max(1, int(BLOCK_PIXELS / reach**2))
+    block = max(1, BLOCK_PIXELS // windows.x.shape[1])
     parts = []
-    for first in range(0, len(maps.xy), block):
+    for first in range(0, max(1, len(windows.origin)), block):
         rows = slice(first, first + block)
-        windows = gather_windows(image, maps.xy[rows], maps.axes[rows], maps.bend[rows], band)
-        begin = None if start is None else start[rows]
-        parts.append(
-            _fit_block(windows, maps.axes[rows], maps.bend[rows], begin, blur_px, noise, iterations)
-        )
-    return CornerFit(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CornerFit))
-    )
+        part, shape = windows.select(rows), geometry.select(rows)
+        expected = Prior(prior.mean[rows], prior.deviation[rows])
+        if start is None:
+            nonlinear = expected.mean[:, :NONLINEAR].copy()
+            linear = _solve_linear(part, shape, nonlinear, expected)
+        else:
+            nonlinear, linear = start[rows, :NONLINEAR].copy(), start[rows, NONLINEAR:].copy()
+        parts.append(_fit_block(part, shape, nonlinear, linear, expected, noise, iterations))
+    return CornerFit.join(parts)
 
 
 def _fit_block(
     windows: PixelWindows,
-    axes: Array,
-    bend: Array,
-    start: Array | None,
-    blur_px: float,
+    geometry: EdgeGeometry,
+    nonlinear: Array,
+    linear: Array,
+    prior: Prior,
     noise: NoiseModel | None,
     iterations: int,
 ) -> CornerFit:
-    geometry = EdgeGeometry.from_map(axes, bend)
-    n = len(windows.origin)
-    nonlinear = np.zeros((n, NONLINEAR))
-    if start is not None:
-        nonlinear[:, :2] = start - windows.origin
-    nonlinear[:, 2:4] = np.arctan2(axes[:, :, 1], axes[:, :, 0])
-    nonlinear[:, 4] = np.log(blur_px)
     shortest = np.minimum(geometry.spacing_1, geometry.spacing_2)
-    limits = np.tile([0.0, 0.0, 0.15, 0.15, 0.5, 1.0, 1.0], (n, 1))
+    limits = np.tile([0.0, 0.0, 0.15, 0.15, 0.5, 1.0, 1.0], (len(shortest), 1))
     limits[:, :2] = 0.2 * shortest[:, None]
-    prior = _prior_information(geometry, noise)
-    expected = np.column_stack([nonlinear, np.zeros((n, LINEAR))])
     blur_limits = np.log(BLUR_MIN_PX), np.log(np.maximum(0.35 * shortest, 0.5))
-    linear = _solve_linear(windows, geometry, nonlinear)
+    known = (1.0 if noise is not None else ASSUMED_VARIANCE) / prior.deviation**2
+    axes = np.zeros((len(shortest), NONLINEAR + LINEAR, 2))
+    axes[:, :2] = np.eye(2)
     for _ in range(iterations):
-        # Statistics are those before the last step, which is tiny where the fit has settled.
+        # Levels and variances are those before the last step, which is tiny where the fit has
+        # settled.
         jacobian, model = evaluate(windows, geometry, nonlinear, linear)
         weight = windows.valid if noise is None else windows.valid / noise.variance(model)
         residual = windows.value - model
         normal, right = _normal_equations(jacobian, residual, weight)
-        normal += prior[:, :, None] * np.eye(NONLINEAR + LINEAR)
-        right += prior * (expected - np.column_stack([nonlinear, linear]))
-        step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        np.einsum("nii->ni", normal)[...] += known
+        pull = known * (prior.mean - np.column_stack([nonlinear, linear]))
+        right += pull
+        solution = np.linalg.solve(normal, np.concatenate([right[:, :, None], axes], axis=2))
+        step = solution[:, :, 0]
         nonlinear = nonlinear + np.clip(step[:, :NONLINEAR], -limits, limits)
-        nonlinear[:, 4] = np.clip(nonlinear[:, 4], *blur_limits)
+        nonlinear[:, LOG_BLUR] = np.clip(nonlinear[:, LOG_BLUR], *blur_limits)
         linear = linear + step[:, NONLINEAR:]
-    freedom = np.maximum(windows.valid.sum(axis=1, dtype=np.float64) - NONLINEAR - LINEAR, 1.0)
-    chi2 = np.einsum("np,np,np->n", weight, residual, residual).astype(np.float64) / freedom
+    # A parameter that the prior holds costs no degree of freedom.
+    fitted = np.sum(1.0 - known / np.einsum("nii->ni", normal), axis=1)
+    freedom = np.maximum(windows.valid.sum(axis=1, dtype=np.float64) - fitted, 1.0)
+    chi2 = np.einsum("np,np,np->n", weight, residual, residual).astype(np.float64)
+    # The last step changes it as the normal equations, without the prior's share, promise.
+    change = np.einsum("na,na->n", step, right - 2.0 * pull + known * step)
+    chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
     level, variance = _statistics(windows, residual, model, freedom)
     return CornerFit(
         windows.origin + nonlinear[:, :2],
-        np.asarray(np.linalg.inv(normal)[:, :2, :2], dtype=np.float64),
+        solution[:, :2, 1:],
         nonlinear,
         linear,
+        normal,
         chi2,
         freedom,
         np.linalg.norm(step[:, :2], axis=1),
@@ -203,23 +244,6 @@ def _fit_block(
         level,
         variance,
     )
-
-
-def _prior_information(geometry: EdgeGeometry, noise: NoiseModel | None) -> Array:
-    """(n, 13) inverse variances of weak priors, from the lattice, of the nuisance parameters.
-
-    They matter only for small or blurred squares, which leave little for each corner to tell by
-    itself.
-    """
-    deviation = np.full((len(geometry.length), NONLINEAR + LINEAR), np.inf)
-    deviation[:, 2:4] = ANGLE_PRIOR
-    deviation[:, 4] = LOG_BLUR_PRIOR if noise is not None else LOG_BLUR_FIRST_PRIOR
-    sagitta = SAGITTA_PRIOR_PX * (2.0 * geometry.length / LARGE_SQUARE_PX) ** 3 + 0.002
-    deviation[:, 5:7] = sagitta[:, None]
-    for column in (1, 2, 4, 5):
-        deviation[:, NONLINEAR + column] = GRADIENT_PRIOR
-    unit = 1.0 if noise is not None else ASSUMED_VARIANCE
-    return np.asarray(unit / deviation**2, dtype=np.float64)
 
 
 def fit_noise(fit: CornerFit) -> NoiseModel:
@@ -266,7 +290,12 @@ def _normal_equations(jacobian: Single, residual: Single, weight: Single) -> tup
     return normal, right
 
 
-def _solve_linear(windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array) -> Array:
+def _solve_linear(
+    windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, prior: Prior
+) -> Array:
     jacobian, _ = evaluate(windows, geometry, nonlinear, None)
     normal, right = _normal_equations(jacobian, windows.value, windows.valid)
+    known = ASSUMED_VARIANCE / prior.deviation[:, NONLINEAR:] ** 2
+    np.einsum("nii->ni", normal)[...] += known
+    right += known * prior.mean[:, NONLINEAR:]
     return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)

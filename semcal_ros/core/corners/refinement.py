@@ -7,9 +7,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.corners.checks import (
+    CORNERS_MIN,
+    MARGIN_PX,
+    Fitted,
+    credible,
+    inflation,
+    parity_of,
+    smooth,
+    undisturbed,
+)
+from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.refine import CornerFit, NoiseModel, fit_corners, fit_noise
+from semcal_ros.core.corners.priors import (
+    Learnt,
+    learn,
+    loose_prior,
+    smooth_levels,
+)
+from semcal_ros.core.corners.refine import (
+    ASSUMED_VARIANCE,
+    NoiseModel,
+    band_px,
+    fit_corners,
+    fit_noise,
+    rough_start,
+)
+from semcal_ros.core.corners.window import gather_windows
 
 __all__ = ["RefinedCorners", "refine_lattice"]
 
@@ -18,22 +43,15 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Single = NDArray[np.float32]
 
-# Corners nearer to the frame than this are not fitted: less than half of their window is in the
-# image.
-MARGIN_PX = 2.0
 FIRST_BLUR_PX = 1.0
-CONTRAST_MIN = 0.3
-COVERAGE_MIN = 0.3
-ANGLE_MAX = 0.2
-CHI2_MAX = 4.0
-CHI2_EXCESS = 0.5
-CHI2_SIGMAS = 6.0
-MISFIT_MAX = 0.12
-# A local map does not follow a strong distortion exactly; its error is a small part of a square.
-MISS_SIGMAS = 5.0
-MISS_PART = 0.005
 GROW_ROUNDS = 4
-CORNERS_MIN = 6
+# Corners that teach what the image is like, and the part of them that must look like corners.
+SAMPLE = 40
+HOPELESS = 0.25
+# Corners that teach again, when noise and blur are known.
+SECOND_SAMPLE = 160
+# Corners nearer to the frame than this part of a square, besides the margin, may fail.
+RIM_PART = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,29 +81,24 @@ class RefinedCorners:
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """Cells with their local maps, fits, and which of them are credible."""
+class _Knowledge:
+    """What the first fits taught about the image."""
 
-    cells: Indices
-    maps: LocalMaps
-    fit: CornerFit
-    good: Mask
+    noise: NoiseModel
+    learnt: Learnt
+    sign: float
 
-
-@dataclass(frozen=True)
-class _Known:
-    """Credible corners so far."""
-
-    cells: Indices
-    xy: Array
-    blur_px: float
-
-    def select(self, keep: Mask) -> _Known:
-        return _Known(self.cells[keep], self.xy[keep], self.blur_px)
+    @property
+    def blur_px(self) -> float:
+        return float(np.exp(self.learnt.common[LOG_BLUR]))
 
 
 def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
     """Fit all corners of a lattice, drop bad ones, look for missed ones; None if under six remain.
+
+    A sample of the corners teaches noise, blur and what varies how much over the image; with this
+    all corners are fitted, then missed ones beside them, then all again with the shading and the
+    bends that the neighbours show.
 
     Parameters
     ----------
@@ -94,36 +107,70 @@ def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
     lattice
         Grown from saddle points.
     """
-    grown = _plausible(lattice)
+    grown = _plausible(_shuffled(lattice))
     if len(grown.ij) < CORNERS_MIN:
         return None
     maps = fit_local_maps(grown.ij, grown.ij, grown.xy, leave_out_self=False)
-    usable = maps.usable
-    if usable.sum() < CORNERS_MIN:
+    grown, maps = grown.select(maps.usable), maps.select(maps.usable)
+    if len(grown.ij) < CORNERS_MIN:
         return None
-    grown, maps = grown.select(usable), maps.select(usable)
-    first = _fit(image, grown.ij, maps, None, None, FIRST_BLUR_PX, iterations=3)
-    count = int(first.good.sum())
-    if count < CORNERS_MIN:
+    few = np.arange(len(grown.ij)) < SAMPLE
+    first = _first_fit(image, grown.ij[few], maps.select(few))
+    if first.good.sum() < CORNERS_MIN:
         return None
-    noise = fit_noise(first.fit.select(first.good))
-    known = _fill(image, _credible_corners(first))
-    maps = fit_local_maps(known.cells, known.cells, known.xy, leave_out_self=False)
-    known, maps = known.select(maps.usable), maps.select(maps.usable)
-    if len(known.cells) < CORNERS_MIN:
+    part = _quality(first, image)
+    if part < HOPELESS:
+        return _result(first, first.good, part)
+    knowledge = _learn(first)
+    maps = _better_maps(grown, first)
+    grown, maps = grown.select(maps.usable), maps.select(maps.usable)
+    if len(grown.ij) < CORNERS_MIN:
         return None
-    last = _fit(image, known.cells, maps, known.xy, noise, known.blur_px, iterations=2)
-    keep = last.good & _undisturbed(last)
-    keep &= _smooth(replace(last, good=keep))
-    if keep.sum() < CORNERS_MIN:
+    second = _fit(image, grown.ij, maps, knowledge, iterations=2)
+    part = _quality(second, image)
+    if second.good.sum() < CORNERS_MIN:
         return None
-    fit = last.fit
+    known = _fill(image, second.select(second.good), knowledge)
+    last = _last_fit(image, known, knowledge)
+    if last is None:
+        return None
+    keep = last.good & undisturbed(last)
+    keep &= smooth(replace(last, good=keep))
+    return _result(last, keep, part) if keep.sum() >= CORNERS_MIN else None
+
+
+def _quality(fitted: Fitted, image: Single) -> float:
+    """Part of the corners that passed, of those expected well inside of the image."""
+    size = np.array([image.shape[1], image.shape[0]])
+    slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
+    expected = np.all((fitted.maps.xy >= slack) & (fitted.maps.xy <= size - 1 - slack), axis=1)
+    return float(fitted.good[expected].mean()) if np.any(expected) else 0.0
+
+
+def _better_maps(grown: Lattice, first: Fitted) -> LocalMaps:
+    """Local maps with what was fitted in place of the saddle points."""
+    count = len(first.cells)
+    xy = np.concatenate([first.fit.xy, grown.xy[count:]])
+    known = np.concatenate([first.good, np.ones(len(xy) - count, dtype=bool)])
+    return fit_local_maps(grown.ij, grown.ij[known], xy[known], leave_out_self=False)
+
+
+def _shuffled(lattice: Lattice) -> Lattice:
+    """The lattice in random but fixed order, so that its first corners are a fair sample."""
+    order = np.random.default_rng(0).permutation(len(lattice.ij))
+    return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
+
+
+def _result(fitted: Fitted, keep: Mask, quality: float) -> RefinedCorners:
+    fit = fitted.fit
+    order = np.lexsort(fitted.cells[keep].T[::-1])
+    covariance = fit.covariance[keep] * inflation(fit, keep)[keep, None, None]
     return RefinedCorners(
-        known.cells[keep],
-        fit.xy[keep],
-        fit.covariance[keep] * _inflation(fit, keep)[keep, None, None],
+        fitted.cells[keep][order],
+        fit.xy[keep][order],
+        covariance[order],
         float(np.median(fit.blur_px[keep])),
-        count / len(grown.ij),
+        quality,
         int(len(keep) - keep.sum()),
     )
 
@@ -137,57 +184,76 @@ def _plausible(lattice: Lattice) -> Lattice:
     return lattice.select(keep)
 
 
+def _first_fit(image: Single, cells: Indices, maps: LocalMaps) -> Fitted:
+    """Fit with equal weights and loose priors."""
+    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = loose_prior(maps, geometry, FIRST_BLUR_PX)
+    fit = fit_corners(windows, geometry, None, prior, noise=None, iterations=3)
+    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
+
+
+def _learn(first: Fitted) -> _Knowledge:
+    good = first.select(first.good)
+    geometry = EdgeGeometry.from_map(good.maps.axes, good.maps.bend)
+    learnt = learn(
+        good.fit.parameters,
+        good.fit.normal,
+        loose_prior(good.maps, geometry, FIRST_BLUR_PX),
+        ASSUMED_VARIANCE,
+        float(np.median(good.fit.chi2)),
+    )
+    sign = float(np.sign(np.median(good.fit.contrast * parity_of(good.cells))))
+    return _Knowledge(fit_noise(good.fit), learnt, sign)
+
+
+def _relearn(known: Fitted, knowledge: _Knowledge) -> _Knowledge:
+    """What the second fits teach beyond the first, which knew neither blur nor noise."""
+    few = known.select(np.arange(len(known.cells)) < SECOND_SAMPLE)
+    geometry = EdgeGeometry.from_map(few.maps.axes, few.maps.bend)
+    prior = knowledge.learnt.prior(few.maps, geometry)
+    noise = float(np.median(few.fit.chi2))
+    again = learn(few.fit.parameters, few.fit.normal, prior, 1.0, noise)
+    return replace(knowledge, learnt=replace(again, spread=again.spread * knowledge.learnt.spread))
+
+
 def _fit(
-    image: Single,
-    cells: Indices,
-    maps: LocalMaps,
-    start: Array | None,
-    noise: NoiseModel | None,
-    blur_px: float,
-    *,
-    iterations: int,
-) -> _Fitted:
+    image: Single, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
+) -> Fitted:
     """Fit all cells from their local maps and judge each fit on its own."""
-    fit = fit_corners(image, maps, start, blur_px, noise=noise, iterations=iterations)
-    return _Fitted(cells, maps, fit, _credible(cells, maps, fit, image))
+    band = band_px(knowledge.blur_px)
+    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band)
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = knowledge.learnt.prior(maps, geometry)
+    start = rough_start(windows, prior, knowledge.sign * parity_of(cells))
+    fit = fit_corners(windows, geometry, start, prior, noise=knowledge.noise, iterations=iterations)
+    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
 
 
-def _credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Single) -> Mask:
-    """Fits that settled near the prediction, with the right sign of contrast."""
-    norm = np.linalg.norm(maps.axes, axis=2)
-    spacing = np.abs(np.linalg.det(maps.axes)) / norm.max(axis=1)
-    expected = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
-    turn = np.abs(np.angle(np.exp(1j * (fit.angles - expected)))).max(axis=1)
-    moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
-    parity = np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)
-    signed = fit.contrast * parity
-    limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
-    settled = (
-        np.all((fit.xy >= MARGIN_PX) & (fit.xy <= limit), axis=1)
-        & (fit.coverage > COVERAGE_MIN)
-        & (moved < 0.25 * spacing)
-        & (turn < ANGLE_MAX)
-        & (fit.shift_px < 0.05 + 0.01 * spacing)
+def _last_fit(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted | None:
+    """Fit once more, with maps and levels through the corners themselves."""
+    maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
+    known, maps = known.select(maps.usable), maps.select(maps.usable)
+    if len(known.cells) < CORNERS_MIN:
+        return None
+    knowledge = _relearn(known, knowledge)
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = smooth_levels(
+        knowledge.learnt.prior(maps, geometry), known.cells, known.fit.linear, maps
     )
-    if not np.any(settled):
-        return np.zeros(len(cells), dtype=np.bool_)
-    typical = float(np.median(signed[settled]))
-    judged = settled & (signed * np.sign(typical) > CONTRAST_MIN * abs(typical))
-    if not np.any(judged):
-        return np.zeros(len(cells), dtype=np.bool_)
-    usual = CHI2_MAX * float(np.median(fit.chi2[judged]))
-    small = fit.variance.mean(axis=1) < (MISFIT_MAX * fit.contrast) ** 2
-    return np.asarray(judged & ((fit.chi2 < usual) | small), dtype=np.bool_)
-
-
-def _credible_corners(fitted: _Fitted) -> _Known:
-    good = fitted.good
-    return _Known(
-        fitted.cells[good], fitted.fit.xy[good], float(np.median(fitted.fit.blur_px[good]))
+    fit = fit_corners(
+        known.windows,
+        geometry,
+        known.fit.parameters,
+        prior.near(known.fit.parameters),
+        noise=knowledge.noise,
+        iterations=1,
     )
+    good = credible(known.cells, maps, fit, image)
+    return Fitted(known.cells, maps, known.windows, fit, good)
 
 
-def _fill(image: Single, known: _Known) -> _Known:
+def _fill(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted:
     """Fit free cells next to good corners, round by round, as long as that finds more."""
     limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
     tried = _keys(known.cells)
@@ -196,64 +262,20 @@ def _fill(image: Single, known: _Known) -> _Known:
         near = near[~np.isin(_keys(near), tried)]
         if not len(near):
             break
-        maps = fit_local_maps(near, known.cells, known.xy)
+        maps = fit_local_maps(near, known.cells, known.fit.xy)
         inside = np.all((maps.xy >= MARGIN_PX) & (maps.xy <= limit), axis=1)
         inside &= maps.usable
         near = near[inside]
         if not len(near):
             break
         tried = np.concatenate([tried, _keys(near)])
-        fitted = _fit(image, near, maps.select(inside), None, None, known.blur_px, iterations=4)
+        fitted = _fit(image, near, maps.select(inside), knowledge, iterations=4)
         if not np.any(fitted.good):
             break
-        found = _credible_corners(fitted)
-        known = _Known(
-            np.concatenate([known.cells, found.cells]),
-            np.concatenate([known.xy, found.xy]),
-            known.blur_px,
-        )
+        known = Fitted.join(known, fitted.select(fitted.good))
     return known
 
 
 def _keys(cells: Indices) -> Indices:
     """One number per cell; indices stay far below 2^20."""
     return np.asarray(cells[:, 0] * (1 << 21) + cells[:, 1], dtype=np.int64)
-
-
-def _undisturbed(fitted: _Fitted) -> Mask:
-    """Corners whose pixels the model explains: no debris, no border of the board.
-
-    In a picture with little noise the model's own shortcomings are significant everywhere, so that
-    the excess must also be a visible part of the contrast.
-    """
-    fit = fitted.fit
-    if not np.any(fitted.good):
-        return fitted.good
-    pooled = float(np.median(fit.chi2[fitted.good]))
-    significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
-    surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
-    return np.asarray(~(significant & (surplus > (MISFIT_MAX * fit.contrast) ** 2)))
-
-
-def _smooth(fitted: _Fitted) -> Mask:
-    """Corners that agree with what their neighbours predict."""
-    good = fitted.good
-    if good.sum() < CORNERS_MIN:
-        return np.zeros(len(good), dtype=bool)
-    cells, xy = fitted.cells[good], fitted.fit.xy[good]
-    maps = fit_local_maps(fitted.cells, cells, xy)
-    miss = np.linalg.norm(fitted.fit.xy - maps.xy, axis=1) / np.sqrt(1.0 + maps.leverage)
-    # The median of a length in the plane is 1.18 standard deviations per axis.
-    typical = float(np.median(miss[good])) / 1.18
-    pooled = float(np.median(fitted.fit.chi2[good]))
-    own = np.sqrt(pooled * np.trace(fitted.fit.covariance, axis1=1, axis2=2) / 2.0)
-    spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)
-    tolerance = MISS_SIGMAS * np.maximum(typical, own) + MISS_PART * spacing
-    return np.asarray((miss < tolerance) & maps.usable, dtype=np.bool_)
-
-
-def _inflation(fit: CornerFit, keep: Mask) -> Array:
-    """Factor on the covariances: the pooled misfit, or a corner's own if that is far larger."""
-    pooled = float(np.median(fit.chi2[keep]))
-    significant = pooled * (1.0 + 3.0 * np.sqrt(2.0 / fit.freedom))
-    return np.where(fit.chi2 > significant, fit.chi2, pooled)

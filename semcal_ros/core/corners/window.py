@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ Single = NDArray[np.float32]
 # Windows of neighbouring corners just touch, so that no pixel is used twice and the errors are
 # independent.
 HALF_WIDTH = 0.5
+# Boxes around corners are searched for their pixels so many at a time, to stay in the cache.
+BLOCK_PIXELS = 60000.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,33 @@ class PixelWindows:
     origin: Array
     coverage: Array
 
+    def select(self, keep: NDArray[np.bool_] | slice) -> PixelWindows:
+        """The windows where ``keep`` is true, or a slice of them without a copy."""
+        return PixelWindows(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    @staticmethod
+    def join(parts: Sequence[PixelWindows]) -> PixelWindows:
+        """All windows of several sets, padded alike."""
+        pixels = max(part.x.shape[1] for part in parts)
+
+        def padded(name: str) -> Single:
+            out = np.zeros((sum(len(part.x) for part in parts), pixels), dtype=np.float32)
+            first = 0
+            for part in parts:
+                values = getattr(part, name)
+                out[first : first + len(values), : values.shape[1]] = values
+                first += len(values)
+            return out
+
+        return PixelWindows(
+            padded("x"),
+            padded("y"),
+            padded("value"),
+            padded("valid"),
+            np.concatenate([part.origin for part in parts]),
+            np.concatenate([part.coverage for part in parts]),
+        )
+
 
 def gather_windows(
     image: Single, origin: Array, axes: Array, bend: Array, band_px: float
@@ -60,49 +90,72 @@ def gather_windows(
         Half-width of the bands along the edges. Pixels farther from both edges do not tell where
         the corner is.
     """
+    reach = int(np.ceil(HALF_WIDTH * np.abs(axes).sum(axis=1).max(initial=0.0))) + 1
+    block = max(1, int(BLOCK_PIXELS / (2 * reach + 1) ** 2))
+    parts = []
+    for first in range(0, max(1, len(origin)), block):
+        rows = slice(first, first + block)
+        parts.append(_gather_block(image, origin[rows], axes[rows], bend[rows], band_px, reach))
+    return PixelWindows.join(parts)
+
+
+def _gather_block(
+    image: Single, origin: Array, axes: Array, bend: Array, band_px: float, reach: int
+) -> PixelWindows:
     height, width = image.shape
     start = np.floor(origin + 0.5).astype(np.int64)
     shift = (start - origin).astype(np.float32)
     inverse = np.linalg.inv(axes.transpose(0, 2, 1)).astype(np.float32)
-    reach = int(np.ceil(HALF_WIDTH * np.abs(axes).sum(axis=1).max())) + 1
     span = np.arange(-reach, reach + 1)
-    grid_y, grid_x = (g.ravel() for g in np.meshgrid(span, span, indexing="ij"))
-    x = grid_x.astype(np.float32)[None] + shift[:, :1]
-    y = grid_y.astype(np.float32)[None] + shift[:, 1:]
-    u = np.abs(inverse[:, 0, :1] * x + inverse[:, 0, 1:] * y)
-    v = np.abs(inverse[:, 1, :1] * x + inverse[:, 1, 1:] * y)
-    inside = np.maximum(u, v) <= HALF_WIDTH
-    area = np.maximum(inside.sum(axis=1), 1)
+    along = span.astype(np.float32)
+    x, y = along[None, None, :] + shift[:, :1, None], along[None, :, None] + shift[:, 1:, None]
+    u = np.abs(inverse[:, 0, 0, None, None] * x + inverse[:, 0, 1, None, None] * y)
+    v = np.abs(inverse[:, 1, 0, None, None] * x + inverse[:, 1, 1, None, None] * y)
+    inside = np.maximum(u, v) <= np.float32(HALF_WIDTH)
+    area = np.maximum(np.count_nonzero(inside, axis=(1, 2)), 1)
+    columns, rows = start[:, :1] + span, start[:, 1:] + span
+    inside &= ((columns >= 0) & (columns < width))[:, None, :]
+    inside &= ((rows >= 0) & (rows < height))[:, :, None]
+    coverage = np.count_nonzero(inside, axis=(1, 2)) / area
     cell = np.abs(np.linalg.det(axes))
     # u = 0 is the edge along j; a step of 1 in u moves cell / |axis j| px away from it.
-    height_u = (cell / np.linalg.norm(axes[:, 1], axis=1)).astype(np.float32)
-    height_v = (cell / np.linalg.norm(axes[:, 0], axis=1)).astype(np.float32)
-    sag = 0.13 * np.linalg.norm(bend, axis=2).max(axis=1)
-    band = (band_px + sag).astype(np.float32)
-    columns = start[:, :1] + grid_x
-    rows = start[:, 1:] + grid_y
-    inside &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    coverage = inside.sum(axis=1) / area
-    inside &= (u * height_u[:, None] <= band[:, None]) | (v * height_v[:, None] <= band[:, None])
+    band = band_px + 0.13 * np.linalg.norm(bend, axis=2).max(axis=1)
+    limit_u = (band * np.linalg.norm(axes[:, 1], axis=1) / cell).astype(np.float32)
+    limit_v = (band * np.linalg.norm(axes[:, 0], axis=1) / cell).astype(np.float32)
+    inside &= (u <= limit_u[:, None, None]) | (v <= limit_v[:, None, None])
+    return _packed(image, inside, start, shift, origin, coverage)
 
-    count = inside.sum(axis=1)
+
+def _packed(
+    image: Single,
+    inside: NDArray[np.bool_],
+    start: NDArray[np.int64],
+    shift: Single,
+    origin: Array,
+    coverage: Array,
+) -> PixelWindows:
+    """The pixels marked in boxes (n, s, s) around ``start``, side by side."""
+    side = inside.shape[1]
+    count = np.count_nonzero(inside, axis=(1, 2))
     pixels = max(1, int(count.max(initial=1)))
-    corner, cell_index = np.nonzero(inside)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    slot = np.arange(len(corner)) - first[corner]
+    corner, place = np.divmod(np.flatnonzero(inside), side * side)
+    row, column = np.divmod(place, side)
+    row -= side // 2
+    column -= side // 2
+    first = np.cumsum(count) - count
+    slot = np.arange(len(corner)) + (corner * pixels - first[corner])
 
-    flat = rows * width + columns
+    def spread(values: Single) -> Single:
+        out = np.zeros(len(origin) * pixels, dtype=np.float32)
+        out[slot] = values
+        return out.reshape(-1, pixels)
 
-    def pad(values: NDArray[np.float32]) -> Single:
-        out = np.zeros((len(origin), pixels), dtype=np.float32)
-        out[corner, slot] = values
-        return out
-
+    flat = (start[corner, 1] + row) * image.shape[1] + start[corner, 0] + column
     return PixelWindows(
-        pad(x[corner, cell_index]),
-        pad(y[corner, cell_index]),
-        pad(image.ravel()[flat[corner, cell_index]]),
-        pad(np.ones(len(corner), dtype=np.float32)),
+        spread(column.astype(np.float32) + shift[corner, 0]),
+        spread(row.astype(np.float32) + shift[corner, 1]),
+        spread(image.ravel()[flat]),
+        spread(np.ones(len(corner), dtype=np.float32)),
         origin,
         coverage,
     )

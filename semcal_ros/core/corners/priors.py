@@ -1,0 +1,200 @@
+"""What an image as a whole tells about the nuisance parameters of each of its corners.
+
+A single small or blurred corner hardly tells a gradient of the contrast or a bend of an edge from a
+shift of its own. How much such parameters vary over the image, though, is well determined by all
+corners together, so that their spread is learnt and used as a prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.edge_model import (
+    ANGLES,
+    GRADIENTS,
+    GROWTH,
+    LINEAR,
+    LOG_BLUR,
+    NONLINEAR,
+    SAGITTAS,
+    EdgeGeometry,
+)
+from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+
+__all__ = ["LARGE_SQUARE_PX", "Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+PARAMETERS = NONLINEAR + LINEAR
+ANGLE_PRIOR = 0.03
+LOG_BLUR_PRIOR = 0.5
+# What a quadratic or cubic map through few, one-sided neighbours misses of a strong distortion
+# grows as the third power.
+SAGITTA_PRIOR_PX = 0.5
+LARGE_SQUARE_PX = 130.0
+# Shading over half a square, relative to the contrast of the image.
+GRADIENT_PRIOR = 0.15
+GRADIENT_LEAST = 0.003
+# Growth of the bright squares times contrast, px.
+GROWTH_PRIOR = 0.3
+# Spreads that are tried, relative to the loose ones above, and how far the fit of the largest one
+# accepted may be behind the best: one standard deviation.
+SPREADS: Array = np.geomspace(0.02, 1.0, 14)
+LIKELIHOOD_LOSS = 0.5
+OUTLIER = 9.0
+GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)
+# Parameters with a value that is common to all corners of an image.
+COMMON = (LOG_BLUR, GROWTH.start, GROWTH.start + 1)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent normal priors of the parameters of n corners.
+
+    Attributes
+    ----------
+    mean, deviation
+        (n, 15); a deviation is infinite where nothing is known.
+    """
+
+    mean: Array
+    deviation: Array
+
+    def near(self, parameters: Array) -> Prior:
+        """The same with directions within half a turn of those of (n, 15) ``parameters``."""
+        mean = self.mean.copy()
+        turns = (parameters[:, ANGLES] - mean[:, ANGLES]) / (2.0 * np.pi)
+        mean[:, ANGLES] += 2.0 * np.pi * np.round(turns)
+        return Prior(mean, self.deviation)
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Common values and spreads of nuisance parameters.
+
+    Attributes
+    ----------
+    common
+        (15,) means; zero where a parameter has no common value.
+    spread
+        (15,) factors on the deviations of the loose prior.
+    """
+
+    common: Array
+    spread: Array
+
+    def prior(self, maps: LocalMaps, geometry: EdgeGeometry) -> Prior:
+        """Prior of corners whose local maps are given."""
+        loose = loose_prior(maps, geometry, 1.0)
+        mean = loose.mean + self.common
+        mean[:, LOG_BLUR] = self.common[LOG_BLUR]
+        return Prior(mean, loose.deviation * self.spread)
+
+
+def loose_prior(maps: LocalMaps, geometry: EdgeGeometry, blur_px: float) -> Prior:
+    """Prior before anything has been fitted: what is plausible for any image of a board."""
+    deviation = np.full((len(maps.xy), PARAMETERS), np.inf)
+    deviation[:, ANGLES] = ANGLE_PRIOR
+    deviation[:, LOG_BLUR] = LOG_BLUR_PRIOR
+    sagitta = SAGITTA_PRIOR_PX * (2.0 * geometry.length / LARGE_SQUARE_PX) ** 3 + 0.002
+    deviation[:, SAGITTAS] = sagitta[:, None]
+    for gradient in GRADIENTS:
+        deviation[:, gradient] = GRADIENT_PRIOR
+    deviation[:, GROWTH] = GROWTH_PRIOR
+    mean = np.zeros_like(deviation)
+    mean[:, ANGLES] = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
+    mean[:, LOG_BLUR] = np.log(blur_px)
+    return Prior(mean, deviation)
+
+
+def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: float) -> Learnt:
+    """Common values and spreads from the fits of some corners.
+
+    Parameters
+    ----------
+    parameters
+        (n, 15) fitted.
+    normal
+        (n, 15, 15) normal matrices, the prior's share included.
+    used
+        Prior of those fits.
+    unit
+        Variance that the prior was weighted with against the pixels.
+    noise
+        Variance of the residuals in the same measure.
+    """
+    information = 1.0 / np.einsum("nii->ni", np.linalg.inv(normal))
+    common, spread = np.zeros(PARAMETERS), np.ones(PARAMETERS)
+    for group in GROUPS:
+        deviation = used.deviation[:, group]
+        # What the pixels alone say: the prior is taken off again.
+        share = np.maximum(information[:, group] - unit / deviation**2, 1e-9)
+        own = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
+            information[:, group] / share
+        )
+        variance = noise / (share * deviation**2)
+        if group.start in COMMON:
+            common[group] = _weighted_median(own, 1.0 / (1.0 + variance))
+            centre = common[group]
+        else:
+            centre = used.mean[:, group]
+        spread[group] = _largest_spread(((own - centre) / deviation).ravel(), variance.ravel())
+    return Learnt(common, spread)
+
+
+def _weighted_median(values: Array, weights: Array) -> Array:
+    """(m,) weighted medians of the columns of (n, m)."""
+    order = np.argsort(values, axis=0)
+    total = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+    middle = (total < 0.5 * total[-1]).sum(axis=0)
+    picked = np.take_along_axis(order, middle[None], axis=0)
+    return np.asarray(np.take_along_axis(values, picked, axis=0)[0], dtype=np.float64)
+
+
+def _largest_spread(score: Array, variance: Array) -> float:
+    """The largest spread that scores with those variances of their own do not contradict."""
+    total = SPREADS[:, None] ** 2 + variance
+    # Corners under debris count no more than others at three standard deviations.
+    cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER)).sum(axis=1)
+    return float(SPREADS[np.nonzero(cost <= cost.min() + LIKELIHOOD_LOSS)[0][-1]])
+
+
+def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) -> Prior:
+    """The prior with gradients of brightness and contrast taken from the neighbours' levels.
+
+    Parameters
+    ----------
+    prior
+        Prior so far.
+    cells
+        (n, 2) lattice indices.
+    linear
+        (n, 8) fitted levels.
+    maps
+        Local maps of the same corners.
+    """
+    parity = np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)
+    levels = np.stack([linear[:, 0], linear[:, 3] * parity], axis=1)
+    smooth = fit_local_maps(cells, cells, levels, leave_out_self=False)
+    others = fit_local_maps(cells, cells, levels)
+    usable = (others.support >= 6) & (others.leverage < 1.0)
+    if usable.sum() < 6:
+        return prior
+    # Rows: x and y; columns: brightness, contrast.
+    slope = np.asarray(np.linalg.solve(maps.axes, smooth.axes))
+    slope[:, :, 1] *= parity[:, None]
+    slope *= 0.25 * np.linalg.norm(maps.axes, axis=2).sum(axis=1)[:, None, None]
+    miss = np.abs(levels - others.xy) / np.sqrt(1.0 + others.leverage)[:, None]
+    typical = np.median(miss[usable], axis=0) / 0.675
+    mean, deviation = prior.mean.copy(), prior.deviation.copy()
+    for level, gradient in enumerate(GRADIENTS):
+        limit = max(float(typical[level]), GRADIENT_LEAST)
+        # Where the levels are noisy, no gradient at all may be the better guess.
+        if limit < float(np.max(prior.deviation[:, gradient])):
+            mean[usable, gradient] = slope[usable, :, level]
+            deviation[usable, gradient] = limit
+    return Prior(mean, deviation)
