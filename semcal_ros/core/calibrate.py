@@ -140,8 +140,7 @@ def calibrate_views(
     Parameters
     ----------
     views
-        Views at one or more magnifications. Three per magnification with different tilts are enough for
-        ``"joint"`` when there are several magnifications.
+        Views at one or more magnifications; three per magnification with different tilts are enough.
     image_size
         (width, height) of the images, px.
     display_width_m
@@ -168,8 +167,8 @@ def calibrate_views(
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _checked_breakpoints(breakpoints, magnifications, method)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
-    chosen = options or MethodOptions()
-    fitted = _fit_joint(setup) if method == "joint" else _fit_discrete(setup, method, chosen)
+    options = options or MethodOptions()
+    fitted = _fit_joint(setup) if method == "joint" else _fit_discrete(setup, method, options)
 
     model = _model(setup, fitted.functions, fitted.covariance, method)
     poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses)
@@ -238,8 +237,8 @@ def _fit_joint(setup: Setup) -> _Fitted:
         "breakpoints": list(setup.breakpoints),
     }
     return _Fitted(
-        fit.functions,
-        fit.result.covariance * factor,
+        fit.padded,
+        fit.covariance * factor,
         lambda index: _joint_without(fit, index),
         fit.problem.height_sigma_m,
         (fit.result.state.rotations, fit.result.state.translations_m),

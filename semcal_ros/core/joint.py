@@ -47,11 +47,24 @@ _MAX_START_RHO = 200.0
 
 @dataclass(frozen=True)
 class JointFit:
-    """Outcome of :func:`fit_joint`."""
+    """Outcome of :func:`fit_joint`.
+
+    Attributes
+    ----------
+    functions, result, problem
+        The adjustment with the chosen number of coefficients.
+    padded, covariance
+        The same functions with some coefficients more, which are zero, and the covariance of all of them for unit
+        variance of the residuals.
+    rounds, settled
+        How the choice came about.
+    """
 
     functions: Functions
     result: BundleResult
     problem: Problem
+    padded: Functions
+    covariance: Array
     rounds: int
     settled: bool
 
@@ -116,20 +129,29 @@ def _started(setup: Setup) -> tuple[Functions, State, float]:
 
 
 def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
-    """The functions with some more coefficients than were chosen, held near zero by their priors.
+    """The functions with some more coefficients than were chosen, all zero."""
+    out = dict(functions)
+    low, high = functions["scale"].g_range
+    for name in _SMOOTH if low < high else ():
+        own = functions[name]
+        size = max(own.smooth_size + _RESERVE, _LEAST_SIZE)
+        smooth, jumps = np.split(own.coefficients, [own.smooth_size])
+        zeros = np.zeros(size - own.smooth_size)
+        out[name] = replace(own, coefficients=np.concatenate([smooth, zeros, jumps]))
+    return out
 
-    A coefficient that is left out counts as known to be zero. What the data do not tell about it belongs into the
-    uncertainty of the calibration.
+
+def _covariance_with_reserve(
+    setup: Setup, padded: Functions, result: BundleResult, height_sigma_m: float
+) -> Array:
+    """Covariance of the padded functions' coefficients.
+
+    A coefficient that was left out is not known to be zero: what the data do not tell about it is as uncertain as its
+    prior says.
     """
-    sizes = {
-        name: (functions[name].kind, max(functions[name].smooth_size + _RESERVE, _LEAST_SIZE))
-        for name in _SMOOTH
-    }
-    return (
-        enriched(functions, sizes)
-        if functions["scale"].g_range[0] < functions["scale"].g_range[1]
-        else dict(functions)
-    )
+    problem = build_problem(setup, padded, setup.views, height_sigma_m)
+    state = replace(result.state, theta=theta_of(padded))
+    return refine(problem, state, max_iterations=0).covariance
 
 
 def fit_joint(setup: Setup) -> JointFit:
@@ -158,11 +180,14 @@ def fit_joint(setup: Setup) -> JointFit:
         result = refine(
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
-    functions = _with_reserve(with_coefficients(functions, result.state.theta))
-    state, height = replace(result.state, theta=theta_of(functions)), _height_sigma(result)
-    turned, _ = resolve_mirrored_tilts(build_problem(thin, functions, thin.views, height), state)
+    functions = with_coefficients(functions, result.state.theta)
+    height = _height_sigma(result)
+    turned, _ = resolve_mirrored_tilts(
+        build_problem(thin, functions, thin.views, height), result.state
+    )
     problem = build_problem(setup, functions, setup.views, height)
     result = refine(problem, turned)
-    return JointFit(
-        with_coefficients(functions, result.state.theta), result, problem, rounds, settled
-    )
+    functions = with_coefficients(functions, result.state.theta)
+    padded = _with_reserve(functions)
+    covariance = _covariance_with_reserve(setup, padded, result, height)
+    return JointFit(functions, result, problem, padded, covariance, rounds, settled)

@@ -54,11 +54,9 @@ class Priors:
     scale_jump, aspect_jump, skew_jump
         1-sigma of the jump at a breakpoint.
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
-        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, k times over. A few times
-        what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a magnification.
-        What the data cannot tell of a change is uncertain by this much, and not taken for none.
-    height_sigma_m
-        Height of a view about the reference plane; re-estimated from the data.
+        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times k squared. A few
+        times what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a
+        magnification. What the data cannot tell of a change is uncertain by this much, and not taken for none.
     """
 
     centre_fraction: float = 0.08
@@ -136,7 +134,8 @@ class Setup:
             return np.full(size, mean), np.full(size, sigma)
         p, order, jumps = self.priors, np.arange(1, size), len(self.breaks_of(name))
         jump = {"scale": p.scale_jump, "aspect": p.aspect_jump, "skew": p.skew_jump}.get(name, 0.0)
-        change = self.change_prior_of(name) / order
+        # The coefficients of a smooth function fall quickly.
+        change = self.change_prior_of(name) / order**2
         sigmas = [np.array([sigma]), change, np.full(jumps, jump)]
         return np.concatenate([[mean], np.zeros(size - 1 + jumps)]), np.concatenate(sigmas)
 

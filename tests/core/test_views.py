@@ -52,7 +52,9 @@ def test_views_get_metres():
     views, assignment = views_from_detections(
         [detection], [1000.0], display_width_m=0.12, squares_m=SQUARES, names=["a"]
     )
-    np.testing.assert_allclose(views[0].board_xy_m, ij * 10e-6)
+    # The origin is the corner nearest to the middle of the image.
+    middle = ij[np.argmin(np.sum((detection.xy - 255.5) ** 2, axis=1))]
+    np.testing.assert_allclose(views[0].board_xy_m, (ij - middle) * 10e-6, atol=1e-18)
     assert views[0].name == "a"
     assert assignment.square_m.tolist() == pytest.approx([10e-6])
 
