@@ -15,18 +15,15 @@ from semcal_ros.core.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.joint import JointFit, fit_joint
+from semcal_ros.core.joint import fit_joint, without_magnification
 from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
 from semcal_ros.core.pda import pda_functions
 from semcal_ros.core.problem import (
     Priors,
     Setup,
-    theta_of,
     variance_factor,
-    with_coefficients,
 )
-from semcal_ros.core.reprojection import theta_system
 from semcal_ros.core.views import GridView
 
 __all__ = ["METHODS", "CalibrationResult", "MethodOptions", "calibrate_views"]
@@ -74,8 +71,8 @@ class CalibrationResult:
     fit
         Poses and residuals of these views under the model.
     held_out_rms_px
-        RMS reprojection error of each magnification's views under a calibration from all other magnifications.
-        The two outermost magnifications are extrapolated in this test.
+        RMS reprojection error of each magnification's views under a calibration from all others; the two outermost
+        ones are extrapolated.
     warnings
         Plain sentences about what the data could not determine.
     """
@@ -116,9 +113,9 @@ def _checked(views: Sequence[GridView], method: str) -> tuple[GridView, ...]:
             do="add tilted views",
         )
     for view in views:
-        if len(view.board_xy_m) < _MIN_CORNERS:
+        if (count := len(view.board_xy_m)) < _MIN_CORNERS:
             raise CalibrationError(
-                f"view {view.name} with {len(view.board_xy_m)} corners",
+                f"view {view.name} with {count} corners",
                 expected=f"at least {_MIN_CORNERS} in every view",
                 do="leave this view out",
             )
@@ -146,15 +143,15 @@ def calibrate_views(
     display_width_m
         Display width to which the magnifications refer, m.
     method
-        ``"joint"`` (one adjustment over everything), ``"discrete"`` (each magnification on its own, linear in
-        between) or ``"pda"`` (the paper's differential equations through the discrete results).
+        ``"joint"`` (one adjustment over everything), ``"discrete"`` (each magnification by itself, linear between) or
+        ``"pda"`` (the paper's differential equations through the discrete results).
     priors
         Weak prior knowledge; the defaults suit any SEM.
     options
-        Options of the paper's methods.
+        Of the paper's methods.
     breakpoints
-        Magnifications at which the microscope switches its scan range, so that scale, aspect and skew jump; only
-        ``"joint"`` knows them. A jump that the views ask for elsewhere is reported as a warning.
+        Magnifications at which the microscope switches its scan range, so that scale, aspect and skew jump (only
+        ``"joint"``). A jump that the views ask for elsewhere is reported as a warning.
 
     Raises
     ------
@@ -239,27 +236,12 @@ def _fit_joint(setup: Setup) -> _Fitted:
     return _Fitted(
         fit.padded,
         fit.covariance * factor,
-        lambda index: _joint_without(fit, index),
+        lambda index: without_magnification(fit, index),
         fit.problem.height_sigma_m,
         (fit.result.state.rotations, fit.result.state.translations_m),
         details,
         tuple(warnings),
     )
-
-
-def _joint_without(fit: JointFit, index: int) -> Functions:
-    """The joint solution without one magnification, by one Gauss-Newton step on the reduced equations.
-
-    At the optimum the poses of the other views follow linearly, so that one step is as good as a new adjustment.
-    """
-    information, gradient = fit.result.information.copy(), fit.result.gradient.copy()
-    information[index] = 0.0
-    gradient[index] = 0.0
-    theta = theta_of(fit.functions)
-    matrix, right = theta_system(fit.problem, theta, information, gradient)
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    step = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
-    return with_coefficients(fit.functions, theta + step)
 
 
 def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
@@ -350,10 +332,10 @@ def _predictor(
 
 def _data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
     """What the views do not determine beyond the priors."""
-    warnings = []
-    middle = model.at(float(np.sqrt(np.prod(model.magnification_range))))
-    assert middle.covariance is not None
-    sigma = np.sqrt(np.diag(middle.covariance))
+    warnings: list[str] = []
+    covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
+    assert covariance is not None
+    sigma = np.sqrt(np.diag(covariance))
     for index, name, label in (
         (3, "px", "principal point"),
         (5, "rho", "distance of the scan pivot"),

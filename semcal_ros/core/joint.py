@@ -25,11 +25,11 @@ from semcal_ros.core.problem import (
     theta_of,
     with_coefficients,
 )
-from semcal_ros.core.reprojection import Problem, State
+from semcal_ros.core.reprojection import Problem, State, scaled_solve, theta_system
 from semcal_ros.core.selection import Summary, select_functions
 from semcal_ros.core.views import GridView
 
-__all__ = ["JointFit", "fit_joint"]
+__all__ = ["JointFit", "fit_joint", "without_magnification"]
 
 Array = NDArray[np.float64]
 
@@ -191,3 +191,16 @@ def fit_joint(setup: Setup) -> JointFit:
     padded = _with_reserve(functions)
     covariance = _covariance_with_reserve(setup, padded, result, height)
     return JointFit(functions, result, problem, padded, covariance, rounds, settled)
+
+
+def without_magnification(fit: JointFit, index: int) -> Functions:
+    """The joint solution without one magnification, by one Gauss-Newton step on the reduced equations.
+
+    At the optimum the poses of the other views follow linearly, so that one step is as good as a new adjustment.
+    """
+    information, gradient = fit.result.information.copy(), fit.result.gradient.copy()
+    information[index] = 0.0
+    gradient[index] = 0.0
+    theta = theta_of(fit.functions)
+    matrix, right = theta_system(fit.problem, theta, information, gradient)
+    return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0))

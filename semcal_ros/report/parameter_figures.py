@@ -160,7 +160,8 @@ def _picture(
         axes.ticklabel_format(axis="y", useOffset=False)
     marks_of_magnifications(axes, model)
     first, last = (_with_sigma(values[k], sigmas[k]) for k in (0, -1))
-    if len(g) > 1 and np.ptp(values) <= 1e-9 * np.abs(values).max():
+    # What does not change may be known better at one end than at the other.
+    if len(g) > 1 and first == last and np.ptp(values) <= 1e-9 * np.abs(values).max():
         ends = f"{first} at every magnification"
     elif len(g) > 1:
         ends = f"{first} at {g[0]:g}× to {last} at {g[-1]:g}×"
