@@ -112,7 +112,7 @@ def find_views(
     Parameters
     ----------
     frames
-        Taken a few at a time, so a long recording is never in memory as a whole.
+        Taken a few at a time. Their images stay in the results, which a report shows.
     on_progress
         Called with 1 after each frame.
     processes

@@ -124,7 +124,11 @@ def refine(
     if not np.isfinite(cost):
         return _no_result(problem, state)
     if fixed_theta:
-        return _refine_poses(problem, state, costs, max_iterations, tolerance)
+        state, costs, iterations, reason = _refined_poses(
+            problem, state, costs, max_iterations, tolerance
+        )
+        cost = float(costs.sum()) + prior_cost(problem, state)
+        return _result(problem, state, cost, iterations, reason)
     damping, iterations, reason = _FIRST_DAMPING, 0, ""
     while not reason and iterations < max_iterations:
         iterations += 1
@@ -163,18 +167,21 @@ def _with_poses_that_follow(
         return trial, trial_costs
     part = part_of(problem, short)
     start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
-    own = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3).state
+    own, own_costs, _, _ = _refined_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
     rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
     rotations[short], translations[short] = own.rotations, own.translations_m
     trial = State(trial.theta, rotations, translations)
-    trial_costs[short] = view_costs(part, own)
+    trial_costs[short] = own_costs
     return trial, trial_costs
 
 
-def _refine_poses(
+def _refined_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
-) -> BundleResult:
-    """Levenberg-Marquardt on each view by itself, for all views at once."""
+) -> tuple[State, Array, int, str]:
+    """Levenberg-Marquardt on each view by itself, for all views at once.
+
+    Returns the state, the costs of the views, the number of iterations, and why they ended (empty at the limit).
+    """
     damping = np.full(len(costs), _FIRST_DAMPING)
     iterations, reason = 0, ""
     while not reason and iterations < max_iterations:
@@ -201,9 +208,7 @@ def _refine_poses(
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
             reason = "converged: relative decrease below the tolerance"
-    return _result(
-        problem, state, float(costs.sum()) + prior_cost(problem, state), iterations, reason
-    )
+    return state, costs, iterations, reason
 
 
 def _result(

@@ -51,6 +51,7 @@ def likely_jump(setup: Setup, problem: Problem, result: BundleResult) -> Jump | 
     scaled = matrix * np.outer(scale, scale)
     g = setup.magnifications
     nominal = setup.nominal_px_per_m(g)
+    variance = max(variance_factor(problem, result), 1.0)
     best, best_gain = None, _LEAST_GAIN
     for k in range(1, len(g)):
         if any(g[k - 1] < b <= g[k] for b in setup.breakpoints):
@@ -62,9 +63,9 @@ def likely_jump(setup: Setup, problem: Problem, result: BundleResult) -> Jump | 
         information = float(pull[:, 0] @ column) - cross @ solved[:, 0]
         information += setup.priors.scale_jump**-2.0
         gradient = float(result.gradient[:, 0] @ column) - cross @ solved[:, 1]
-        gain = 0.5 * gradient**2 / information / max(variance_factor(problem, result), 1.0)
+        gain = 0.5 * gradient**2 / information / variance
         if gain > best_gain:
-            sigma = float(np.sqrt(max(variance_factor(problem, result), 1.0) / information))
+            sigma = float(np.sqrt(variance / information))
             best_gain = gain
             best = Jump(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
     return best
