@@ -37,7 +37,7 @@ _FOLLOWING_STEPS = 6
 # A change of a view's half chi-square that is nothing.
 _NEGLIGIBLE = 1e-2
 # Relative decrease of the cost below which another step cannot matter to the result.
-_COST_TOLERANCE = 1e-9
+_COST_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)

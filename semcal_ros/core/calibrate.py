@@ -14,8 +14,9 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
+from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.joint import fit_joint, without_magnification
+from semcal_ros.core.joint import RESIDUAL_MODES, FittedField, fit_joint, without_magnification
 from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
 from semcal_ros.core.pda import pda_functions
@@ -26,7 +27,7 @@ from semcal_ros.core.problem import (
 )
 from semcal_ros.core.views import GridView
 
-__all__ = ["METHODS", "CalibrationResult", "MethodOptions", "calibrate_views"]
+__all__ = ["METHODS", "RESIDUAL_MODES", "CalibrationResult", "MethodOptions", "calibrate_views"]
 
 Array = NDArray[np.float64]
 Functions = Mapping[str, ContinuousFunction]
@@ -90,11 +91,12 @@ class _Fitted:
 
     functions: Functions
     covariance: Array
-    without: Callable[[int], Functions]
+    without: Callable[[int], tuple[Functions, ResidualField | None]]
     height_sigma_m: float
     poses: tuple[Array, Array] | None
     details: dict[str, Any]
     warnings: tuple[str, ...]
+    residual: ResidualField | None = None
 
 
 def _checked(views: Sequence[GridView], method: str) -> tuple[GridView, ...]:
@@ -131,6 +133,7 @@ def calibrate_views(
     priors: Priors | None = None,
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
+    residual: str = "auto",
 ) -> CalibrationResult:
     """Calibrate the microscope from views of a planar grid.
 
@@ -152,6 +155,9 @@ def calibrate_views(
     breakpoints
         Magnifications at which the microscope switches its scan range, so that scale, aspect and skew jump (only
         ``"joint"``). A jump that the views ask for elsewhere is reported as a warning.
+    residual
+        Whether a residual field describes what the distortion parameters cannot (only ``"joint"``): ``"on"``,
+        ``"off"``, or ``"auto"``, where cross-validation decides.
 
     Raises
     ------
@@ -165,9 +171,16 @@ def calibrate_views(
     breaks = _checked_breakpoints(breakpoints, magnifications, method)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
     options = options or MethodOptions()
-    fitted = _fit_joint(setup) if method == "joint" else _fit_discrete(setup, method, options)
+    if residual not in RESIDUAL_MODES:
+        raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
+    if method == "joint":
+        fitted = _fit_joint(setup, residual)
+    elif residual == "on":
+        raise InvalidValueError(f"a residual field with method {method}", expected='method "joint"')
+    else:
+        fitted = _fit_discrete(setup, method, options)
 
-    model = _model(setup, fitted.functions, fitted.covariance, method)
+    model = _model(setup, fitted.functions, fitted.covariance, method, fitted.residual)
     poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses)
     held_out = _held_out(setup, fitted, method)
     warnings = (*fitted.warnings, *_data_warnings(setup, model))
@@ -192,7 +205,13 @@ def _checked_breakpoints(
     return breaks
 
 
-def _model(setup: Setup, functions: Functions, covariance: Array, method: str) -> CalibrationModel:
+def _model(
+    setup: Setup,
+    functions: Functions,
+    covariance: Array,
+    method: str,
+    residual: ResidualField | None = None,
+) -> CalibrationModel:
     return CalibrationModel(
         functions=functions,
         covariance=covariance,
@@ -201,11 +220,12 @@ def _model(setup: Setup, functions: Functions, covariance: Array, method: str) -
         display_width_m=setup.display_width_m,
         magnifications=tuple(float(g) for g in setup.magnifications),
         method=method,
+        residual=residual,
     )
 
 
-def _fit_joint(setup: Setup) -> _Fitted:
-    fit = fit_joint(setup)
+def _fit_joint(setup: Setup, residual: str) -> _Fitted:
+    fit = fit_joint(setup, residual)
     factor = variance_factor(fit.problem, fit.result)
     warnings = []
     if not fit.result.converged:
@@ -232,6 +252,7 @@ def _fit_joint(setup: Setup) -> _Fitted:
         "variance_factor": factor,
         "coefficients": {name: [f.kind, f.smooth_size] for name, f in fit.functions.items()},
         "breakpoints": list(setup.breakpoints),
+        "residual_field": _about_field(fit.field),
     }
     return _Fitted(
         fit.padded,
@@ -241,7 +262,21 @@ def _fit_joint(setup: Setup) -> _Fitted:
         (fit.result.state.rotations, fit.result.state.translations_m),
         details,
         tuple(warnings),
+        None if fit.field is None else fit.field.field,
     )
+
+
+def _about_field(fitted: FittedField | None) -> dict[str, Any] | None:
+    if fitted is None:
+        return None
+    choice = fitted.choice
+    return {
+        "strength_px": choice.strength_px,
+        "held_out_gain": choice.gain,
+        "held_out_gain_sigma": choice.gain_sigma,
+        "worthwhile": choice.worthwhile,
+        "converged": fitted.settled,
+    }
 
 
 def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
@@ -280,7 +315,7 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
     return _Fitted(
         functions,
         covariance,
-        lambda index: functions_of(np.arange(count) != index)[0],
+        lambda index: (functions_of(np.arange(count) != index)[0], None),
         setup.priors.height_sigma_m,
         None,
         details,
@@ -311,8 +346,7 @@ def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
         own = [setup.views[i] for i in mine]
         starts = None if fitted.poses is None else (fitted.poses[0][mine], fitted.poses[1][mine])
         try:
-            functions = fitted.without(index)
-            camera_at = _predictor(setup, functions, index, method)
+            camera_at = _predictor(setup, *fitted.without(index), index, method)
             fit = fit_poses(own, camera_at, height_sigma_m=fitted.height_sigma_m, starts=starts)
         except (CalibrationError, InvalidValueError):
             # The method has no answer there: that is an infinite error, not a missing one.
@@ -323,11 +357,11 @@ def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
 
 
 def _predictor(
-    setup: Setup, functions: Functions, index: int, method: str
+    setup: Setup, functions: Functions, residual: ResidualField | None, index: int, method: str
 ) -> Callable[[float], ScanCamera]:
-    size = sum(f.size for f in functions.values())
+    size = sum(f.size for f in functions.values()) + (0 if residual is None else residual.size)
     rest = replace(setup, magnifications=np.delete(setup.magnifications, index))
-    return _model(rest, functions, np.zeros((size, size)), method).at
+    return _model(rest, functions, np.zeros((size, size)), method, residual).at
 
 
 def _data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:

@@ -13,9 +13,9 @@ from semcal_ros.core.distortion import (
     undistort_normalised,
 )
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.field import FieldSlice
 from semcal_ros.core.projection import (
     project_ideal_points,
-    project_points,
     project_points_with_jacobians,
 )
 
@@ -65,6 +65,8 @@ class ScanCamera:
         :data:`semcal_ros.core.projection.PARAMETER_NAMES`, or None where it is not known.
     in_range
         False when ``magnification`` lies outside of the calibrated range.
+    residual
+        What the distortion parameters do not describe (see :mod:`semcal_ros.core.field`), or None.
 
     Examples
     --------
@@ -91,6 +93,7 @@ class ScanCamera:
     height: int
     covariance: Array | None = None
     in_range: bool = True
+    residual: FieldSlice | None = None
 
     def __post_init__(self) -> None:
         values = np.append(self.parameters, [self.magnification, self.norm_px])
@@ -141,7 +144,7 @@ class ScanCamera:
 
     def project(self, xyz_m: ArrayLike) -> Array:
         """Raw (distorted) pixels (n, 2) of sem-frame points (n, 3) in m; NaN where there is none."""
-        return project_points(self.parameters, as_points(xyz_m, 3), self.norm_px)
+        return self.distort(self.project_ideal(xyz_m))
 
     def project_ideal(self, xyz_m: ArrayLike) -> Array:
         """Undistorted pixels (n, 2) of sem-frame points (n, 3) in m."""
@@ -155,17 +158,47 @@ class ScanCamera:
         InvalidValueError
             If the camera carries no covariance.
         """
-        if self.covariance is None:
+        covariance = self.joint_covariance
+        if covariance is None:
             raise InvalidValueError(
                 "a camera without covariance",
                 expected="a camera from Calibration.at(g)",
                 do="take the camera from a calibration",
             )
-        jacobian = project_points_with_jacobians(
-            self.parameters, as_points(xyz_m, 3), self.norm_px
-        ).d_parameters
-        variance = np.einsum("nip,pq,niq->ni", jacobian, self.covariance, jacobian)
+        jacobian = self.project_jacobian(xyz_m)
+        variance = np.einsum("nip,pq,niq->ni", jacobian, covariance, jacobian, optimize=True)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
+
+    def project_jacobian(self, xyz_m: ArrayLike) -> Array:
+        """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field.
+
+        To first order in the field, which is small and smooth; exact without one.
+        """
+        points = as_points(xyz_m, 3)
+        jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
+        if self.residual is None:
+            return jacobians.d_parameters
+        known = np.all(np.isfinite(jacobians.xy), axis=1)
+        field = np.full((len(points), 2, self.residual.coefficients.size), np.nan)
+        field[known] = 0.0
+        basis = self.residual.basis(self._normalised(self._with_residual(jacobians.xy[known])))
+        field[known, 0, 0::2] = field[known, 1, 1::2] = -self.norm_px * basis
+        return np.concatenate([jacobians.d_parameters, field], axis=2)
+
+    @property
+    def joint_covariance(self) -> Array | None:
+        """(10 + F, 10 + F) covariance of the parameters and of the coefficients of the residual field."""
+        field = self.residual
+        if self.covariance is None or field is None:
+            return self.covariance
+        if field.covariance is None or field.cross_covariance is None:
+            return None
+        return np.block(
+            [
+                [self.covariance, field.cross_covariance],
+                [field.cross_covariance.T, field.covariance],
+            ]
+        )
 
     def sem_from_ideal(self, xy: ArrayLike, z_m: float = 0.0) -> Array:
         """Sem-frame points (n, 3) in m at height ``z_m`` that are seen at undistorted pixels (n, 2)."""
@@ -185,10 +218,29 @@ class ScanCamera:
     def _centre(self) -> Array:
         return np.array([self.ex, self.ey])
 
+    def _normalised(self, xy: Array) -> Array:
+        """Pixels in half image widths from the middle of the image, as the residual field takes them."""
+        return (xy - 0.5 * np.array([self.width - 1.0, self.height - 1.0])) / self.norm_px
+
+    def without_residual(self, xy: ArrayLike) -> Array:
+        """Where raw pixels (n, 2) would lie if there were only the parametric distortion."""
+        points = as_points(xy, 2)
+        if self.residual is None:
+            return points
+        return points + self.norm_px * self.residual.displacement(self._normalised(points))
+
+    def _with_residual(self, xy: Array) -> Array:
+        """Inverse of :meth:`without_residual`."""
+        if self.residual is None:
+            return xy
+        q = self._normalised(xy)
+        return xy + self.norm_px * (self.residual.inverse(q) - q)
+
     def distort(self, xy: ArrayLike) -> Array:
         """Raw pixels (n, 2) of undistorted pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
         q = (as_points(xy, 2) - self._centre) / self.norm_px
-        return self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t)
+        parametric = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t)
+        return self._with_residual(parametric)
 
     def undistort(self, xy: ArrayLike) -> Array:
         """Undistorted pixels (n, 2) of raw pixels (n, 2).
@@ -199,7 +251,7 @@ class ScanCamera:
 
     def undistort_report(self, xy: ArrayLike) -> Undistortion:
         """As :meth:`undistort`, in normalised coordinates and with convergence flags and residuals."""
-        q_d = (as_points(xy, 2) - self._centre) / self.norm_px
+        q_d = (self.without_residual(xy) - self._centre) / self.norm_px
         return undistort_normalised(q_d, self.xi_r, self.xi_t)
 
     # -- matrices ---------------------------------------------------------------------------------
@@ -292,10 +344,14 @@ class ScanCamera:
         def y_resized(y: float) -> float:
             return (y + 0.5) * s - 0.5 + shift_y
 
-        covariance = self.covariance
+        factors = np.array([s, 1.0, 1.0, s, s, 1.0, 1.0, 1.0, s, s])
+        covariance, residual = self.covariance, self.residual
         if covariance is not None:
-            factors = np.array([s, 1.0, 1.0, s, s, 1.0, 1.0, 1.0, s, s])
             covariance = covariance * np.outer(factors, factors)
+        if residual is not None and residual.cross_covariance is not None:
+            residual = replace(
+                residual, cross_covariance=residual.cross_covariance * factors[:, None]
+            )
         return replace(
             self,
             m=self.m * s,
@@ -307,4 +363,5 @@ class ScanCamera:
             width=int(width),
             height=int(height),
             covariance=covariance,
+            residual=residual,
         )

@@ -84,14 +84,18 @@ def distort_jacobians(
     f = factor[:, None] * q + xi_tangential[..., None] * bracket
 
     growth = factor * factor / root  # d lambda / d(xi_r r2)
-    df_dq = 2.0 * (growth * xi_radial)[:, None, None] * q[:, :, None] * q[:, None, :]
-    df_dq = df_dq + 2.0 * xi_tangential[..., None, None] * q[:, None, :]
-    diagonal = factor[:, None] + 4.0 * xi_tangential[..., None] * q
-    df_dq[:, 0, 0] += diagonal[:, 0]
-    df_dq[:, 1, 1] += diagonal[:, 1]
-
-    df_dxi = np.stack([(growth * r2)[:, None] * q, bracket], axis=2)
-    return f, df_dq, df_dxi
+    x, y = q.T
+    along = 2.0 * growth * xi_radial
+    tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
+    # The points last in memory, as they are worked on; first in shape, as elsewhere.
+    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((2, 2, len(q)))
+    df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
+    df_dq[0, 1] = along * x * y + tangential_y
+    df_dq[1, 0] = along * x * y + tangential_x
+    df_dq[1, 1] = along * y * y + factor + 3.0 * tangential_y
+    df_dxi[:, 0] = growth * r2 * q.T
+    df_dxi[:, 1] = bracket.T
+    return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, -1, 0)
 
 
 def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:

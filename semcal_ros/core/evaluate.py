@@ -7,7 +7,7 @@ each other and against the poses.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class PoseFit:
     rotations, translations_m
         (V, 3, 3) and (V, 3): sem frame from grid.
     residuals_px
-        One (n, 2) array per view: observed minus projected pixels.
+        One (n, 2) array per view: observed minus projected pixels, the residual field taken off both.
     magnifications
         (V,) magnification of each view.
     converged
@@ -74,8 +74,12 @@ def fit_poses(
     magnifications = np.unique([v.magnification for v in views])
     cameras = [camera_at(float(g)) for g in magnifications]
     of_view = [cameras[int(np.searchsorted(magnifications, v.magnification))] for v in views]
+    corrected = [
+        replace(v, image_xy=c.without_residual(v.image_xy))
+        for v, c in zip(views, of_view, strict=True)
+    ]
     problem = make_problem(
-        views,
+        corrected,
         magnifications,
         np.stack([c.parameters for c in cameras])[:, :, None],
         norm_px=cameras[0].norm_px,

@@ -13,6 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.bundle import BundleResult, refine
+from semcal_ros.core.field import ResidualField
+from semcal_ros.core.field_fit import (
+    FieldChoice,
+    FieldSystem,
+    blank_field,
+    choose_field,
+    corrected,
+    field_system,
+    solve_field,
+)
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.initial import initial_values
 from semcal_ros.core.problem import (
@@ -23,16 +33,18 @@ from semcal_ros.core.problem import (
     constant_functions,
     resolve_mirrored_tilts,
     theta_of,
+    variance_factor,
     with_coefficients,
 )
 from semcal_ros.core.reprojection import Problem, State, scaled_solve, theta_system
 from semcal_ros.core.selection import Summary, select_functions
 from semcal_ros.core.views import GridView
 
-__all__ = ["JointFit", "fit_joint", "without_magnification"]
+__all__ = ["RESIDUAL_MODES", "FittedField", "JointFit", "fit_joint", "without_magnification"]
 
 Array = NDArray[np.float64]
 
+RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
 _RESERVE, _LEAST_SIZE = 2, 5
@@ -41,8 +53,33 @@ _HEIGHT_UPDATES = 3
 _ENOUGH_CORNERS = 60
 # Tolerance of the adjustments on the way; only the last one has to be exact.
 _COARSE = 1e-6
+_MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
+# Change of the corrections of all corners, RMS in px, that is none: a fiftieth of good corners' noise.
+_FIELD_SETTLED_PX = 1e-3
 # The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
 _MAX_START_RHO = 200.0
+
+
+@dataclass(frozen=True)
+class FittedField:
+    """The residual field of a :class:`JointFit`.
+
+    Attributes
+    ----------
+    field
+        The field itself.
+    choice
+        Its strength, and what cross-validation says.
+    system
+        The reduced system at the solution, from which magnifications can be left out.
+    settled
+        Whether camera and field stopped changing.
+    """
+
+    field: ResidualField
+    choice: FieldChoice
+    system: FieldSystem
+    settled: bool
 
 
 @dataclass(frozen=True)
@@ -54,10 +91,12 @@ class JointFit:
     functions, result, problem
         The adjustment with the chosen number of coefficients.
     padded, covariance
-        The same functions with some coefficients more, which are zero, and the covariance of all of them for unit
-        variance of the residuals.
+        The same functions with some coefficients more, which are zero, and the covariance of all of them, followed by
+        the coefficients of the field, for unit variance of the residuals.
     rounds, settled
         How the choice came about.
+    field
+        The residual field, or None.
     """
 
     functions: Functions
@@ -65,6 +104,18 @@ class JointFit:
     problem: Problem
     padded: Functions
     covariance: Array
+    rounds: int
+    settled: bool
+    field: FittedField | None
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """An adjustment on the way."""
+
+    functions: Functions
+    problem: Problem
+    result: BundleResult
     rounds: int
     settled: bool
 
@@ -96,12 +147,7 @@ def _thinned(view: GridView) -> GridView:
     if len(view.board_xy_m) <= _ENOUGH_CORNERS:
         return view
     keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
-    return replace(
-        view,
-        board_xy_m=view.board_xy_m[keep],
-        image_xy=view.image_xy[keep],
-        sigma_px=view.sigma_px[keep],
-    )
+    return view.chosen(keep)
 
 
 def _started(setup: Setup) -> tuple[Functions, State, float]:
@@ -142,32 +188,35 @@ def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
 
 
 def _covariance_with_reserve(
-    setup: Setup, padded: Functions, result: BundleResult, height_sigma_m: float
+    setup: Setup, padded: Functions, stage: _Stage, field: FittedField | None
 ) -> Array:
-    """Covariance of the padded functions' coefficients.
+    """Covariance of the padded functions' coefficients and of the field's.
 
     A coefficient that was left out is not known to be zero: what the data do not tell about it is as uncertain as its
     prior says.
     """
-    problem = build_problem(setup, padded, setup.views, height_sigma_m)
-    state = replace(result.state, theta=theta_of(padded))
-    return refine(problem, state, max_iterations=0).covariance
+    views = setup.views if field is None else corrected(setup, field.field).views
+    problem = build_problem(setup, padded, views, stage.problem.height_sigma_m)
+    state = replace(stage.result.state, theta=theta_of(padded))
+    result = refine(problem, state, max_iterations=0)
+    if field is None:
+        return result.covariance
+    system = field_system(setup, problem, result, field.field)
+    # The system is scaled to the variance that the residuals show.
+    return system.covariance(field.choice.prior) / variance_factor(stage.problem, stage.result)
 
 
-def fit_joint(setup: Setup) -> JointFit:
-    """Calibrate from nominal values alone.
-
-    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
-    both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
-    one magnification at a time, until the choice no longer changes.
-    """
-    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
-    functions, state, height = _started(thin)
-    problem = build_problem(setup, functions, setup.views, height)
-    result = refine(problem, state, tolerance=_COARSE)
-
+def _selected(
+    setup: Setup,
+    functions: Functions,
+    state: State,
+    height_sigma_m: float,
+    sizes: Mapping[str, tuple[str, int]] | None = None,
+) -> _Stage:
+    """Choose the number of coefficients of every function until the choice no longer changes."""
+    problem = build_problem(setup, functions, setup.views, height_sigma_m)
+    result = refine(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
     settled, rounds = len(setup.magnifications) < 3, 0
-    sizes: dict[str, tuple[str, int]] | None = None
     while rounds < _MAX_ROUNDS and not settled:
         rounds += 1
         chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
@@ -181,26 +230,103 @@ def fit_joint(setup: Setup) -> JointFit:
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
     functions = with_coefficients(functions, result.state.theta)
-    height = _height_sigma(result)
+    return _Stage(functions, problem, result, rounds, settled)
+
+
+def _finished(setup: Setup, stage: _Stage) -> _Stage:
+    """The exact adjustment with the chosen functions, all tilts having been tried both ways."""
+    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    height = _height_sigma(stage.result)
     turned, _ = resolve_mirrored_tilts(
-        build_problem(thin, functions, thin.views, height), result.state
+        build_problem(thin, stage.functions, thin.views, height), stage.result.state
     )
-    problem = build_problem(setup, functions, setup.views, height)
+    problem = build_problem(setup, stage.functions, setup.views, height)
     result = refine(problem, turned)
+    functions = with_coefficients(stage.functions, result.state.theta)
+    return replace(stage, functions=functions, problem=problem, result=result)
+
+
+def _with_field(setup: Setup, stage: _Stage, always: bool) -> tuple[_Stage, FittedField | None]:
+    """Camera and residual field, or the stage as it is where the field is not worthwhile.
+
+    Each turn solves for both together, and then adjusts poses and camera to observations that the field has corrected.
+    In the first turns the strength of the field and the number of coefficients of the functions are chosen anew.
+    """
+    field = blank = blank_field(setup)
+    start, before = stage, setup
+    for turn in range(_MAX_FIELD_TURNS):
+        system = field_system(setup, stage.problem, stage.result, field)
+        if turn < _CHOOSING_TURNS:
+            choice = choose_field(setup, system, blank)
+            if not (choice.worthwhile or always):
+                return start, None
+        theta, field = solve_field(system, choice.prior, blank)
+        after = corrected(setup, field)
+        stage = _adjusted(after, stage, theta, choosing=turn < _CHOOSING_TURNS)
+        pairs = zip(before.views, after.views, strict=True)
+        change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
+        before = after
+        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
+            return stage, FittedField(field, choice, system, True)
+    return stage, FittedField(field, choice, system, False)
+
+
+def _adjusted(setup: Setup, stage: _Stage, theta: Array, *, choosing: bool) -> _Stage:
+    """The stage with other views and coefficients; ``choosing`` the number of coefficients again."""
+    functions, height = with_coefficients(stage.functions, theta), _height_sigma(stage.result)
+    if choosing:
+        sizes = {name: (functions[name].kind, functions[name].smooth_size) for name in _SMOOTH}
+        return _selected(setup, functions, stage.result.state, height, sizes)
+    problem = build_problem(setup, functions, setup.views, height)
+    result = refine(problem, replace(stage.result.state, theta=theta), tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
-    padded = _with_reserve(functions)
-    covariance = _covariance_with_reserve(setup, padded, result, height)
-    return JointFit(functions, result, problem, padded, covariance, rounds, settled)
+    return replace(stage, functions=functions, problem=problem, result=result)
 
 
-def without_magnification(fit: JointFit, index: int) -> Functions:
+def fit_joint(setup: Setup, residual: str = "off") -> JointFit:
+    """Calibrate from nominal values alone.
+
+    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
+    both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
+    one magnification at a time, until the choice no longer changes. With ``residual`` ``"on"``, or ``"auto"`` where
+    cross-validation finds it worthwhile, a residual field is estimated with them.
+    """
+    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    stage = _selected(setup, *_started(thin))
+    field = None
+    if residual != "off":
+        stage, field = _with_field(setup, stage, residual == "on")
+    stage = _finished(setup if field is None else corrected(setup, field.field), stage)
+    if field is not None:
+        system = field_system(setup, stage.problem, stage.result, field.field)
+        field = replace(field, system=system)
+    padded = _with_reserve(stage.functions)
+    covariance = _covariance_with_reserve(setup, padded, stage, field)
+    return JointFit(
+        stage.functions,
+        stage.result,
+        stage.problem,
+        padded,
+        covariance,
+        stage.rounds,
+        stage.settled,
+        field,
+    )
+
+
+def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
     """The joint solution without one magnification, by one Gauss-Newton step on the reduced equations.
 
     At the optimum the poses of the other views follow linearly, so that one step is as good as a new adjustment.
     """
+    if fit.field is not None:
+        fitted = fit.field
+        keep = fitted.system.group != index
+        theta, field = solve_field(fitted.system, fitted.choice.prior, fitted.field, keep)
+        return with_coefficients(fit.functions, theta), field
     information, gradient = fit.result.information.copy(), fit.result.gradient.copy()
     information[index] = 0.0
     gradient[index] = 0.0
     theta = theta_of(fit.functions)
     matrix, right = theta_system(fit.problem, theta, information, gradient)
-    return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0))
+    return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0)), None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.projection import PARAMETER_NAMES
 
@@ -55,7 +56,7 @@ class CalibrationModel:
     functions
         One :class:`ContinuousFunction` per name in ``FUNCTION_NAMES``.
     covariance
-        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``.
+        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``, then of the residual field.
     image_width, image_height
         Size in px of the calibration images (without databar).
     display_width_m
@@ -67,6 +68,8 @@ class CalibrationModel:
     statistics
         What a reader wants to know of the calibration: views, corners, residuals, held-out errors, priors and gauge,
         convergence, warnings. Plain numbers, strings, lists and dicts.
+    residual
+        What the distortion parameters do not describe, or None.
     """
 
     functions: Mapping[str, ContinuousFunction]
@@ -77,6 +80,7 @@ class CalibrationModel:
     magnifications: tuple[float, ...]
     method: str
     statistics: Mapping[str, Any] = field(default_factory=dict)
+    residual: ResidualField | None = None
 
     def __post_init__(self) -> None:
         missing = [name for name in FUNCTION_NAMES if name not in self.functions]
@@ -85,6 +89,7 @@ class CalibrationModel:
                 f"a calibration without {', '.join(missing)}", expected=", ".join(FUNCTION_NAMES)
             )
         size = sum(self.functions[name].size for name in FUNCTION_NAMES)
+        size += 0 if self.residual is None else self.residual.size
         if self.covariance.shape != (size, size):
             raise InvalidValueError(
                 f"covariance of shape {self.covariance.shape}", expected=f"({size}, {size})"
@@ -129,7 +134,12 @@ class CalibrationModel:
         in_range = bool(low * (1 - 1e-9) <= g <= high * (1 + 1e-9))
         design = design_matrix(self.functions, g, self.nominal_px_per_m(g))
         theta = np.concatenate([self.functions[name].coefficients for name in FUNCTION_NAMES])
-        covariance = design @ self.covariance @ design.T
+        size = len(theta)
+        covariance = design @ self.covariance[:size, :size] @ design.T
+        residual = None
+        if self.residual is not None:
+            spread, cross = self.covariance[size:, size:], design @ self.covariance[:size, size:]
+            residual = self.residual.at(g, spread, cross)
         if not in_range:
             covariance = covariance + self._extrapolation_covariance(g)
         values = dict(zip(PARAMETER_NAMES, (design @ theta).tolist(), strict=True))
@@ -142,6 +152,7 @@ class CalibrationModel:
                 height=self.image_height,
                 covariance=covariance,
                 in_range=in_range,
+                residual=residual,
             )
         except InvalidValueError as error:
             raise InvalidValueError(

@@ -12,7 +12,7 @@ from semcal_ros.core.bundle import BundleResult, refine
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.model import FUNCTION_NAMES, design_matrix
 from semcal_ros.core.poses import mirrored_tilt
-from semcal_ros.core.reprojection import Problem, State, make_problem
+from semcal_ros.core.reprojection import Problem, State, make_problem, whitened_norm
 from semcal_ros.core.views import GridView
 
 __all__ = [
@@ -256,13 +256,13 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
 
 
 def _view_costs(problem: Problem, result: BundleResult) -> Array:
-    square = np.sum(result.residuals_px**2, axis=1) * problem.weight**2 * result.huber_weight
+    square = whitened_norm(problem, result.residuals_px) ** 2 * result.huber_weight
     height = result.state.translations_m[:, 2] / problem.height_sigma_m
     return np.bincount(problem.view_of_point, weights=square) + height**2
 
 
 def variance_factor(problem: Problem, result: BundleResult) -> float:
     """Mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
-    norm2 = np.sum(result.residuals_px**2, axis=1) * problem.weight**2 * result.huber_weight
+    norm2 = whitened_norm(problem, result.residuals_px) ** 2 * result.huber_weight
     freedom = 2.0 * result.huber_weight.sum() - 6 * len(problem.group) - len(result.state.theta)
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))

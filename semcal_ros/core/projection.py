@@ -82,10 +82,13 @@ def project_points(parameters: Array, xyz_m: Array, norm_px: float) -> Array:
 def project_points_with_jacobians(
     parameters: Array, xyz_m: Array, norm_px: float
 ) -> ProjectionJacobians:
-    """Raw pixels with analytic derivatives; shapes as in :class:`ProjectionJacobians`."""
+    """Raw pixels with analytic derivatives; shapes as in :class:`ProjectionJacobians`.
+
+    In memory the points come last, so that every derivative of all points lies together.
+    """
     n = len(xyz_m)
     table = np.broadcast_to(parameters, (n, 10))
-    m, a, skew, px, py, rho, xi_r, xi_t = np.moveaxis(table[:, :8], -1, 0)
+    m, a, skew, px, py, rho, xi_r, xi_t = table[:, :8].T
     centre = table[:, 8:10]
     x, y, z = xyz_m.T
     w = 1.0 + rho * z
@@ -93,31 +96,27 @@ def project_points_with_jacobians(
     scale = m * inverse_w
     u = a * x + skew * y
     v = y / a
-    ideal = np.stack([px + scale * u, py + scale * v], axis=1)
+    scaled_u, scaled_v = scale * u, scale * v
+    ideal = np.stack([px + scaled_u, py + scaled_v], axis=1)
 
     f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, xi_r, xi_t)
-    xy = centre + norm_px * f
-
-    ideal_xyz = np.zeros((n, 2, 3))
-    ideal_xyz[:, 0, 0] = scale * a
-    ideal_xyz[:, 0, 1] = scale * skew
-    ideal_xyz[:, 1, 1] = scale / a
-    ideal_xyz[:, 0, 2] = -scale * u * rho * inverse_w
-    ideal_xyz[:, 1, 2] = -scale * v * rho * inverse_w
-
-    ideal_linear = np.zeros((n, 2, 6))
-    ideal_linear[:, 0, 0] = inverse_w * u
-    ideal_linear[:, 1, 0] = inverse_w * v
-    ideal_linear[:, 0, 1] = scale * x
-    ideal_linear[:, 1, 1] = -scale * v / a
-    ideal_linear[:, 0, 2] = scale * y
-    ideal_linear[:, 0, 3] = 1.0
-    ideal_linear[:, 1, 4] = 1.0
-    ideal_linear[:, 0, 5] = -scale * u * z * inverse_w
-    ideal_linear[:, 1, 5] = -scale * v * z * inverse_w
-
-    d_parameters = np.empty((n, 2, 10))
-    d_parameters[:, :, :6] = df_dq @ ideal_linear
-    d_parameters[:, :, 6:8] = norm_px * df_dxi
-    d_parameters[:, :, 8:10] = np.eye(2) - df_dq
-    return ProjectionJacobians(xy, df_dq @ ideal_xyz, d_parameters)
+    d_xyz, d_parameters = np.empty((2, 3, n)), np.empty((2, 10, n))
+    up, tilt = rho * inverse_w, z * inverse_w
+    for row in (0, 1):
+        by_x, by_y = df_dq[:, row, 0], df_dq[:, row, 1]
+        along = by_x * scaled_u + by_y * scaled_v
+        d_xyz[row, 0] = by_x * scale * a
+        d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
+        d_xyz[row, 2] = -along * up
+        d_parameters[row, 0] = along / m
+        d_parameters[row, 1] = by_x * scale * x - by_y * scaled_v / a
+        d_parameters[row, 2] = by_x * scale * y
+        d_parameters[row, 3] = by_x
+        d_parameters[row, 4] = by_y
+        d_parameters[row, 5] = -along * tilt
+        d_parameters[row, 6:8] = norm_px * df_dxi[:, row].T
+        d_parameters[row, 8:10] = -df_dq[:, row].T
+        d_parameters[row, 8 + row] += 1.0
+    return ProjectionJacobians(
+        centre + norm_px * f, np.moveaxis(d_xyz, -1, 0), np.moveaxis(d_parameters, -1, 0)
+    )

@@ -332,7 +332,10 @@ def _keep(store: OrderedDict[_Key, _Value], key: _Key, value: _Value, at_most: i
 
 
 def _camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object, ...]:
-    return size if camera is None else (*size, camera.norm_px, *camera.parameters.tolist())
+    if camera is None:
+        return size
+    field = b"" if camera.residual is None else camera.residual.coefficients.tobytes()
+    return (*size, camera.norm_px, *camera.parameters.tolist(), field)
 
 
 def _exact_bands(

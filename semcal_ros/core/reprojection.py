@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.poses import cross_matrices, rotations_from_vectors
+from semcal_ros.core.poses import rotations_from_vectors
 from semcal_ros.core.projection import project_points, project_points_with_jacobians
 from semcal_ros.core.views import GridView
 
@@ -24,6 +24,7 @@ __all__ = [
     "NormalEquations",
     "Problem",
     "State",
+    "WhitenedRows",
     "make_problem",
     "moved",
     "normal_equations",
@@ -34,6 +35,10 @@ __all__ = [
     "scaled_solve",
     "theta_system",
     "view_costs",
+    "whiten",
+    "whitened_norm",
+    "whitened_rows",
+    "with_height_prior",
 ]
 
 Array = NDArray[np.float64]
@@ -49,8 +54,10 @@ class Problem:
 
     Attributes
     ----------
-    board_m, observed_px, weight
-        (N, 3), (N, 2) and (N,): grid points, observed raw pixels, 1 / sigma.
+    board_m, observed_px
+        (N, 3) and (N, 2): grid points, and observed raw pixels (corrected by the residual field where there is one).
+    whitening
+        (N, 3): the lower triangle (xx, yx, yy) that turns a residual into one of unit covariance.
     starts
         (V + 1,) offsets of the views in these arrays.
     group
@@ -69,7 +76,7 @@ class Problem:
 
     board_m: Array
     observed_px: Array
-    weight: Array
+    whitening: Array
     starts: Index
     group: Index
     designs: Array
@@ -112,7 +119,7 @@ def make_problem(
     return Problem(
         board_m=np.column_stack([board, np.zeros(len(board))]),
         observed_px=np.concatenate([v.image_xy for v in views]),
-        weight=1.0 / np.concatenate([v.sigma_px for v in views]),
+        whitening=np.concatenate([v.whitening for v in views]),
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         group=group,
         designs=designs,
@@ -137,6 +144,12 @@ def residuals(problem: Problem, state: State) -> Array:
     return problem.observed_px - project_points(cameras, points, problem.norm_px)
 
 
+def whitened_norm(problem: Problem, miss: Array) -> Array:
+    """(N,) lengths of residuals (N, 2) in standard deviations."""
+    xx, yx, yy = problem.whitening.T
+    return np.asarray(np.hypot(xx * miss[:, 0], yx * miss[:, 0] + yy * miss[:, 1]))
+
+
 def _huber(norm: Array) -> tuple[Array, Array]:
     """Huber's loss (half squared norm inside) and weight of the whitened residual norms."""
     outside = norm > _HUBER
@@ -147,7 +160,7 @@ def _huber(norm: Array) -> tuple[Array, Array]:
 def view_costs(problem: Problem, state: State) -> Array:
     """(V,) half the robust sum of squares of each view with the prior of its height; infinite without projection."""
     miss = residuals(problem, state)
-    norm = np.hypot(miss[:, 0], miss[:, 1]) * problem.weight
+    norm = whitened_norm(problem, miss)
     loss = np.where(np.isfinite(norm), _huber(norm)[0], np.inf)
     height = state.translations_m[:, 2] / problem.height_sigma_m
     return np.asarray(np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * height * height)
@@ -169,32 +182,75 @@ class NormalEquations:
     huber_weight: Array
 
 
-def normal_equations(problem: Problem, state: State) -> NormalEquations:
-    """Huber-weighted normal equations of every view, with the prior of its height."""
+@dataclass(frozen=True)
+class WhitenedRows:
+    """Linearised observations of unit variance, Huber-weighted.
+
+    Attributes
+    ----------
+    rows
+        (2, 17, N): derivatives by camera (10), turn (3) and shift (3), and the residual.
+    residuals_px
+        (N, 2) without weights.
+    huber_weight
+        (N,).
+    """
+
+    rows: Array
+    residuals_px: Array
+    huber_weight: Array
+
+
+def whitened_rows(problem: Problem, state: State) -> WhitenedRows:
+    """Residuals and derivatives of all observations."""
     rotated, points, cameras = _points_and_cameras(problem, state)
     jacobians = project_points_with_jacobians(cameras, points, problem.norm_px)
     miss = problem.observed_px - jacobians.xy
-    norm = np.hypot(miss[:, 0], miss[:, 1]) * problem.weight
-    huber = _huber(norm)[1]
-    whiten = (problem.weight * np.sqrt(huber))[:, None]
-    unit = problem.unit_m[problem.view_of_point][:, None, None]
+    huber = _huber(whitened_norm(problem, miss))[1]
+    rows = np.empty((2, 17, len(points)))
+    rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
+    shift = np.moveaxis(jacobians.d_xyz, 0, -1)
+    x, y, z = rotated.T
+    rows[:, 10] = y * shift[:, 2] - z * shift[:, 1]
+    rows[:, 11] = z * shift[:, 0] - x * shift[:, 2]
+    rows[:, 12] = x * shift[:, 1] - y * shift[:, 0]
+    rows[:, 13:16] = shift * problem.unit_m[problem.view_of_point]
+    rows[:, 16] = miss.T
+    whiten(problem.whitening, rows, huber)
+    return WhitenedRows(rows, miss, huber)
 
-    rows = np.empty((len(points), 2, 17))
-    rows[:, :, :10] = jacobians.d_parameters
-    rows[:, :, 10:13] = -jacobians.d_xyz @ cross_matrices(rotated)
-    rows[:, :, 13:16] = jacobians.d_xyz * unit
-    rows[:, :, 16] = miss
-    rows *= whiten[:, :, None]
 
+def whiten(whitening: Array, rows: Array, huber: Array) -> None:
+    """Turn rows (2, k, N) into ones of unit variance, in place."""
+    xx, yx, yy = whitening.T * np.sqrt(huber)
+    rows[1] *= yy
+    if np.any(yx):
+        rows[1] += yx * rows[0]
+    rows[0] *= xx
+
+
+def with_height_prior(problem: Problem, state: State, matrix: Array, column: int) -> None:
+    """Add the prior of each view's height to augmented normal equations (V, k, k), in place.
+
+    ``column`` is that of the height; the right-hand side is the last column.
+    """
+    height = problem.unit_m / problem.height_sigma_m
+    matrix[:, column, column] += height**2
+    matrix[:, column, -1] -= height * state.translations_m[:, 2] / problem.height_sigma_m
+
+
+def normal_equations(problem: Problem, state: State) -> NormalEquations:
+    """Huber-weighted normal equations of every view, with the prior of its height."""
+    whitened = whitened_rows(problem, state)
     n_views = len(problem.group)
     matrix = np.empty((n_views, 17, 17))
     for v in range(n_views):
-        block = rows[problem.starts[v] : problem.starts[v + 1]].reshape(-1, 17)
-        matrix[v] = block.T @ block
-    height = problem.unit_m / problem.height_sigma_m
-    matrix[:, 15, 15] += height**2
-    matrix[:, 15, 16] -= height * state.translations_m[:, 2] / problem.height_sigma_m
-    return NormalEquations(matrix[:, :16, :16], matrix[:, :16, 16], miss, huber)
+        x, y = whitened.rows[:, :, problem.starts[v] : problem.starts[v + 1]]
+        matrix[v] = x @ x.T + y @ y.T
+    with_height_prior(problem, state, matrix, 15)
+    return NormalEquations(
+        matrix[:, :16, :16], matrix[:, :16, 16], whitened.residuals_px, whitened.huber_weight
+    )
 
 
 def reduced(
@@ -251,7 +307,7 @@ def part_of(problem: Problem, chosen: NDArray[np.bool_]) -> Problem:
         problem,
         board_m=problem.board_m[points],
         observed_px=problem.observed_px[points],
-        weight=problem.weight[points],
+        whitening=problem.whitening[points],
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         group=problem.group[chosen],
         unit_m=problem.unit_m[chosen],

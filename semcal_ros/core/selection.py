@@ -63,6 +63,7 @@ class _Candidates:
         self.setup = setup
         self.base = base
         self.rows: dict[tuple[str, str, int], Array] = {}
+        self.priors: dict[tuple[str, str, int], tuple[Array, Array]] = {}
         self.scores: dict[tuple[tuple[str, int], ...], float] = {}
 
     def _rows(self, name: str, kind: str, size: int) -> Array:
@@ -76,6 +77,13 @@ class _Candidates:
                 rows = rows * self.setup.nominal_px_per_m(self.setup.magnifications)[:, None]
             self.rows[key] = rows
         return self.rows[key]
+
+    def _prior(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
+        key = (name, kind, size)
+        if key not in self.priors:
+            mean, sigma = self.setup.coefficient_priors(name, kind, size)
+            self.priors[key] = mean, sigma**-2.0
+        return self.priors[key]
 
     def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
         """Cost of predicting each inner magnification from the others, and of fitting the outermost ones."""
@@ -93,9 +101,7 @@ class _Candidates:
         for row, (name, block) in enumerate(zip(FUNCTION_NAMES, blocks, strict=True)):
             stop = column + block.shape[1]
             designs[:, row, column:stop] = block
-            centre, sigma = self.setup.coefficient_priors(name, *sizes[name])
-            mean[column:stop] = centre
-            precision[column:stop] = sigma**-2.0
+            mean[column:stop], precision[column:stop] = self._prior(name, *sizes[name])
             column = stop
         transposed = np.swapaxes(designs, 1, 2)
         matrices = transposed @ self.summary.information @ designs

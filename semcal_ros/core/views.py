@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ class GridView:
         (n,) 1-sigma of the observation per axis, px.
     name
         For messages and reports, such as the frame number.
+    covariance_px2
+        (n, 2, 2) covariance of the observations where more than ``sigma_px`` is known, else None.
     """
 
     magnification: float
@@ -42,6 +44,7 @@ class GridView:
     image_xy: Array
     sigma_px: Array
     name: str = ""
+    covariance_px2: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.board_xy_m)
@@ -56,6 +59,42 @@ class GridView:
             )
         if not (np.all(np.isfinite(self.image_xy)) and np.all(self.sigma_px > 0)):
             raise InvalidValueError("a view with non-finite corners", expected="finite pixels")
+        if self.covariance_px2 is not None and not _all_positive(self.covariance_px2, n):
+            raise InvalidValueError(
+                f"covariances of shape {self.covariance_px2.shape}",
+                expected=f"positive definite ones of shape ({n}, 2, 2)",
+            )
+
+    @property
+    def whitening(self) -> Array:
+        """(n, 3) lower triangle (xx, yx, yy) of the matrix that gives observation errors unit covariance."""
+        if self.covariance_px2 is None:
+            weight = 1.0 / self.sigma_px
+            return np.stack([weight, np.zeros_like(weight), weight], axis=1)
+        xx, xy, yy = (self.covariance_px2[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        first = 1.0 / np.sqrt(xx)
+        last = 1.0 / np.sqrt(yy - xy * xy / xx)
+        return np.stack([first, -last * xy / xx, last], axis=1)
+
+    def chosen(self, keep: NDArray[Any]) -> GridView:
+        """The view with some of its corners, by index or mask."""
+        spread = None if self.covariance_px2 is None else self.covariance_px2[keep]
+        return replace(
+            self,
+            board_xy_m=self.board_xy_m[keep],
+            image_xy=self.image_xy[keep],
+            sigma_px=self.sigma_px[keep],
+            covariance_px2=spread,
+        )
+
+
+def _all_positive(covariance: Array, n: int) -> bool:
+    if covariance.shape != (n, 2, 2) or not np.all(np.isfinite(covariance)):
+        return False
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    if not np.all((xx > 0.0) & (xx * yy > xy * xy)):
+        return False
+    return bool(np.all(np.abs(xy - covariance[:, 1, 0]) <= 1e-6 * np.sqrt(xx * yy)))
 
 
 @dataclass(frozen=True)
@@ -171,7 +210,14 @@ def views_from_detections(
     assignment = assign_squares(spacing, nominal, squares_m)
     labels = names if names is not None else [str(i) for i in range(len(detections))]
     views = tuple(
-        GridView(float(g), _centred_ij(d) * float(square), d.xy, d.sigma_px, label)
+        GridView(
+            float(g),
+            _centred_ij(d) * float(square),
+            d.xy,
+            d.sigma_px,
+            label,
+            d.covariance_px2 if len(d.covariance_px2) else None,
+        )
         for d, g, square, label in zip(
             detections, magnifications, assignment.square_m, labels, strict=True
         )

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from semcal_ros.core.errors import CalibrationError
-from semcal_ros.core.views import assign_squares, views_from_detections
+from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.views import GridView, assign_squares, views_from_detections
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 
 
-@dataclass(frozen=True)
-class _Detection:
-    ij: np.ndarray
-    xy: np.ndarray
-    sigma_px: np.ndarray
-    spacing_px: float
-    image_size: tuple[int, int] = (512, 512)
-    accepted: bool = True
-    reason: str = ""
+def _covariances(n, seed=0):
+    root = np.random.default_rng(seed).normal(size=(n, 2, 2)) + 2.0 * np.eye(2)
+    return 0.01 * root @ np.swapaxes(root, 1, 2)
+
+
+def _detection(ij, xy, spacing_px, covariance_px2):
+    sigma = np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2.0)
+    return LatticeDetection(True, "", ij, xy, sigma, spacing_px, (512, 512), covariance_px2)
 
 
 def _spacings(g, squares, factor):
@@ -48,7 +48,7 @@ def test_with_one_square_size_the_display_width_decides():
 
 def test_views_get_metres():
     ij = np.array([[i, j] for i in range(4) for j in range(3)])
-    detection = _Detection(ij, ij * 42.67 + 100.0, np.full(12, 0.05), 42.67)
+    detection = _detection(ij, ij * 42.67 + 100.0, 42.67, _covariances(12))
     views, assignment = views_from_detections(
         [detection], [1000.0], display_width_m=0.12, squares_m=SQUARES, names=["a"]
     )
@@ -56,14 +56,51 @@ def test_views_get_metres():
     middle = ij[np.argmin(np.sum((detection.xy - 255.5) ** 2, axis=1))]
     np.testing.assert_allclose(views[0].board_xy_m, (ij - middle) * 10e-6, atol=1e-18)
     assert views[0].name == "a"
+    np.testing.assert_array_equal(views[0].covariance_px2, detection.covariance_px2)
     assert assignment.square_m.tolist() == pytest.approx([10e-6])
 
 
 def test_no_or_rejected_detections_are_refused():
     with pytest.raises(CalibrationError, match="no image"):
         views_from_detections([], [], display_width_m=0.12, squares_m=SQUARES)
-    rejected = _Detection(
-        np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0.0, accepted=False, reason="blank"
+    rejected = LatticeDetection(
+        False, "blank", np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0.0, (512, 512)
     )
     with pytest.raises(CalibrationError, match="blank"):
         views_from_detections([rejected], [100.0], display_width_m=0.12, squares_m=SQUARES)
+
+
+def test_whitening_turns_the_covariance_into_the_unit_matrix():
+    n = 20
+    view = GridView(1.0, np.zeros((n, 2)), np.zeros((n, 2)), np.ones(n), "", _covariances(n))
+    xx, yx, yy = view.whitening.T
+    matrix = np.stack([np.stack([xx, 0 * xx], 1), np.stack([yx, yy], 1)], 1)
+    unit = matrix @ view.covariance_px2 @ np.swapaxes(matrix, 1, 2)
+    np.testing.assert_allclose(unit, np.broadcast_to(np.eye(2), (n, 2, 2)), atol=1e-12)
+    plain = replace(view, covariance_px2=None, sigma_px=np.full(n, 0.25))
+    np.testing.assert_array_equal(plain.whitening, np.tile([4.0, 0.0, 4.0], (n, 1)))
+
+
+def test_a_part_of_a_view_keeps_what_belongs_together():
+    n = 6
+    xy = np.arange(2.0 * n).reshape(n, 2)
+    view = GridView(1.0, xy, 10.0 + xy, np.arange(1.0, n + 1), "a", _covariances(n))
+    part = view.chosen(np.array([4, 1]))
+    for name in ("board_xy_m", "image_xy", "sigma_px", "covariance_px2"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(view, name)[[4, 1]])
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        np.zeros((3, 2, 2)),
+        -np.tile(np.eye(2), (3, 1, 1)),
+        np.tile([[1.0, 2.0], [2.0, 1.0]], (3, 1, 1)),
+        np.tile([[1.0, 0.5], [0.2, 1.0]], (3, 1, 1)),
+        np.tile([[np.nan, 0.0], [0.0, 1.0]], (3, 1, 1)),
+        np.tile(np.eye(2), (2, 1, 1)),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(spoiled):
+    with pytest.raises(InvalidValueError, match="positive definite"):
+        GridView(1.0, np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3), "", spoiled)

@@ -1,0 +1,234 @@
+"""Residual field: what two distortion parameters cannot describe of a scan.
+
+Spiral distortion, non-linear scan coils and the settling of the beam at the start of a line are smooth displacements
+of the image that no small set of parameters covers. They are held by a tensor-product B-spline over the raw pixel and
+log g (design section 4): a raw pixel x would lie at
+
+    x + n G((x - c) / n, g)
+
+if there were only the parametric distortion, with ``c`` the middle of the image and ``n`` half its width. Being defined
+on the raw pixel, the field corrects observations by a fixed linear map of its coefficients.
+
+The knots are denser at the start of the lines, where the beam settles. The field leaves alone what the rest of the
+model describes: shifts, linear maps, and the patterns of the radial and of the tangential distortion. Two ways to say
+the same would leave the pixel size undefined.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["FieldSlice", "ResidualField", "zero_field"]
+
+Array = NDArray[np.float64]
+
+_DEGREE = 3
+# Half image widths; the outermost knots lie outside of the image, so that its border is inside of the domain.
+_BREAKS_X = (-1.04, -0.97, -0.9, -0.8, -0.65, -0.45, -0.22, 0.0, 0.25, 0.5, 0.75, 1.04)
+# Half image heights.
+_BREAKS_Y = (-1.04, -0.5, 0.0, 0.5, 1.04)
+_MAX_STEPS = 60
+_TOLERANCE = 1e-13
+
+
+def _clamped(breaks: Array, degree: int) -> Array:
+    return np.concatenate([np.repeat(breaks[0], degree), breaks, np.repeat(breaks[-1], degree)])
+
+
+def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
+    """(n, size) values of the basis functions; outside of the knots those of their ends."""
+    inside = np.clip(values, knots[0], knots[-1])
+    return np.asarray(BSpline.design_matrix(inside, knots, degree).toarray(), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FieldSlice:
+    """The residual field at one magnification.
+
+    Attributes
+    ----------
+    knots_x, knots_y
+        Knots of the cubic splines in half image widths from the middle of the image, ends repeated.
+    coefficients
+        (ny, nx, 2), in half image widths.
+    covariance
+        (2 ny nx, 2 ny nx) of the coefficients, or None where it is not known.
+    cross_covariance
+        (10, 2 ny nx) with the parameters of the camera, or None.
+    """
+
+    knots_x: Array
+    knots_y: Array
+    coefficients: Array
+    covariance: Array | None = None
+    cross_covariance: Array | None = None
+
+    def basis(self, q: Array) -> Array:
+        """(n, ny nx) products of the basis functions at normalised raw positions (n, 2)."""
+        x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
+        y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
+        return (y[:, :, None] * x[:, None, :]).reshape(len(q), -1)
+
+    def displacement(self, q: Array) -> Array:
+        """(n, 2) displacement at normalised raw positions (n, 2); NaN where the position is."""
+        out = np.full_like(q, np.nan)
+        known = np.all(np.isfinite(q), axis=1)
+        ny, nx, _ = self.coefficients.shape
+        x = _spline_rows(q[known, 0], self.knots_x, _DEGREE)
+        y = _spline_rows(q[known, 1], self.knots_y, _DEGREE)
+        along = (y @ self.coefficients.reshape(ny, -1)).reshape(-1, nx, 2)
+        out[known] = np.einsum("na,nac->nc", x, along)
+        return out
+
+    def inverse(self, target: Array) -> Array:
+        """Raw positions (n, 2) that the field moves to ``target`` (n, 2); NaN where there is none.
+
+        The field is small and smooth, so that ``q = target - G(q)`` contracts.
+        """
+        q = target.copy()
+        for _ in range(_MAX_STEPS):
+            better = target - self.displacement(q)
+            change = np.max(np.abs(better - q), axis=1, initial=0.0)
+            q = better
+            if not np.any(change > _TOLERANCE * (1.0 + np.abs(target).max(axis=1, initial=0.0))):
+                return q
+        q[change > 1e-9] = np.nan
+        return q
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """Residual field as a function of the magnification.
+
+    Attributes
+    ----------
+    knots_x, knots_y
+        As in :class:`FieldSlice`.
+    g_range
+        (lowest, highest) magnification of the views; beyond, the field of the nearer end holds.
+    coefficients
+        (ng, ny, nx, 2): a spline without inner knots in log g, that is a polynomial of degree ng - 1 in Bernstein form.
+    """
+
+    knots_x: Array
+    knots_y: Array
+    g_range: tuple[float, float]
+    coefficients: Array
+
+    def __post_init__(self) -> None:
+        low, high = self.g_range
+        if not (0.0 < low <= high and np.isfinite(high)):
+            raise InvalidValueError(
+                f"magnification range {self.g_range} of a residual field",
+                expected="0 < lowest <= highest",
+            )
+        for knots in (self.knots_x, self.knots_y):
+            rising = knots.ndim == 1 and np.all(np.isfinite(knots)) and np.all(np.diff(knots) >= 0)
+            if not (rising and len(knots) >= 2 * (_DEGREE + 1) and knots[0] < knots[-1]):
+                raise InvalidValueError(
+                    f"knots {knots.tolist()} of a residual field", expected="a rising sequence"
+                )
+        nx, ny = len(self.knots_x) - _DEGREE - 1, len(self.knots_y) - _DEGREE - 1
+        shape = self.coefficients.shape
+        if len(shape) != 4 or shape[0] < 1 or shape[1:] != (ny, nx, 2):
+            raise InvalidValueError(
+                f"coefficients of shape {shape} of a residual field", expected=f"(k, {ny}, {nx}, 2)"
+            )
+        if not np.all(np.isfinite(self.coefficients)):
+            raise InvalidValueError("a residual field with gaps", expected="finite coefficients")
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return int(self.coefficients.size)
+
+    @property
+    def slice_size(self) -> int:
+        """Number of coefficients at one magnification."""
+        return self.size // len(self.coefficients)
+
+    def weights(self, g: float) -> Array:
+        """(ng,) weights of the coefficients at a magnification; they are positive and sum to 1."""
+        count = len(self.coefficients)
+        low, high = np.log(self.g_range)
+        if count == 1 or low == high:
+            return np.asarray(np.eye(count)[0], dtype=np.float64)
+        at = np.clip((np.log(g) - low) / (high - low), 0.0, 1.0)
+        rows = _spline_rows(np.array([at]), _clamped(np.array([0.0, 1.0]), count - 1), count - 1)
+        return np.asarray(rows[0], dtype=np.float64)
+
+    def at(
+        self, g: float, covariance: Array | None = None, cross: Array | None = None
+    ) -> FieldSlice:
+        """The field at a magnification.
+
+        ``covariance`` (size, size) of all coefficients and ``cross`` (10, size) with the camera at ``g`` are optional.
+        """
+        weights = self.weights(g)
+        spread = between = None
+        if covariance is not None and cross is not None:
+            count, size = len(weights), self.slice_size
+            blocks = covariance.reshape(count, size, count, size)
+            spread = np.einsum("k,kalb,l->ab", weights, blocks, weights, optimize=True)
+            between = np.einsum("pka,k->pa", cross.reshape(-1, count, size), weights)
+        return FieldSlice(
+            self.knots_x,
+            self.knots_y,
+            np.tensordot(weights, self.coefficients, axes=1),
+            spread,
+            between,
+        )
+
+    def overlaps(self) -> Array:
+        """(8, slice_size) inner products with what the rest of the model describes.
+
+        These are the shifts, the linear maps, and the patterns of the radial and of the tangential distortion, each
+        with a mean square of 1 over the domain. A field whose coefficients they annul leaves all of that to the camera
+        and to the poses.
+        """
+        q, weight = _quadrature(self.knots_x, self.knots_y)
+        x, y = q.T
+        zero, one, r2 = np.zeros_like(x), np.ones_like(x), x * x + y * y
+        patterns = [(one, zero), (zero, one), (x, zero), (y, zero), (zero, x), (zero, y)]
+        patterns += [(r2 * x, r2 * y), (r2 + 2.0 * x * x, r2 + 2.0 * y * y)]
+        basis = self.at(self.g_range[0]).basis(q) * weight[:, None]
+        rows = []
+        for pattern in patterns:
+            vectors = np.stack(pattern, axis=1)
+            size = np.sqrt(weight @ np.sum(vectors**2, axis=1))
+            rows.append((basis.T @ vectors / size).ravel())
+        return np.stack(rows)
+
+
+def _quadrature(knots_x: Array, knots_y: Array) -> tuple[Array, Array]:
+    """Gauss nodes (n, 2) over the cells of the knots and their weights (n,), which sum to 1.
+
+    Six nodes are exact for a cubic spline times a pattern of third degree.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    axes = []
+    for knots in (knots_x, knots_y):
+        breaks = np.unique(knots)
+        half = 0.5 * np.diff(breaks)[:, None]
+        at = breaks[:-1, None] + half * (nodes + 1.0)
+        axes.append((at.ravel(), (half * weights).ravel() / (knots[-1] - knots[0])))
+    (x, along), (y, down) = axes
+    points = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1)
+    return points, np.asarray(np.outer(down, along).ravel(), dtype=np.float64)
+
+
+def zero_field(
+    image_size: tuple[int, int], g_range: tuple[float, float], count: int
+) -> ResidualField:
+    """A field without displacement, with ``count`` coefficients in log g."""
+    aspect = image_size[1] / image_size[0]
+    knots_x = _clamped(np.array(_BREAKS_X), _DEGREE)
+    knots_y = _clamped(aspect * np.array(_BREAKS_Y), _DEGREE)
+    shape = (count, len(knots_y) - _DEGREE - 1, len(knots_x) - _DEGREE - 1, 2)
+    return ResidualField(knots_x, knots_y, g_range, np.zeros(shape))
