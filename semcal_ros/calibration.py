@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import os
 from collections.abc import Mapping
@@ -16,6 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
+from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.files.atomic import atomic_write_text
@@ -95,17 +98,24 @@ class Calibration(CalibrationModel):
         _check_kind(data, source)
         _check_schema(data, source)
         try:
+            covariance, field = _covariance_from(data["covariance"]), None
+            if "residual_field" in data:
+                field = _field_from(data["residual_field"])
+                covariance = _with_field_covariance(
+                    covariance, data["residual_field"]["covariance"], field.size
+                )
             return cls(
                 functions={
                     name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES
                 },
-                covariance=_covariance_from(data["covariance"]),
+                covariance=covariance,
                 image_width=data["image_width_px"],
                 image_height=data["image_height_px"],
                 display_width_m=float(data["display_width_m"]),
                 magnifications=tuple(float(g) for g in data["magnifications"]),
                 method=data["method"],
                 statistics=data.get("statistics", {}),
+                residual=field,
             )
         except InvalidValueError as error:
             raise CalibrationFileError(
@@ -114,7 +124,10 @@ class Calibration(CalibrationModel):
 
     def dumps(self) -> str:
         """The text of the calibration file, with every number in full precision."""
-        data = {
+        field = self.residual
+        size = len(self.covariance) - (0 if field is None else field.size)
+        own = self.covariance[:size, :size]
+        data: dict[str, Any] = {
             "format": _FORMAT,
             "version": FILE_VERSION,
             "method": self.method,
@@ -125,10 +138,12 @@ class Calibration(CalibrationModel):
             "functions": {name: _function_to(self.functions[name]) for name in FUNCTION_NAMES},
             "statistics": _plain(self.statistics),
             "covariance": {
-                "size": len(self.covariance),
-                "upper_rows": [row[i:].tolist() for i, row in enumerate(self.covariance)],
+                "size": size,
+                "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
             },
         }
+        if field is not None:
+            data["residual_field"] = _field_to(field, self.covariance[size:])
         body: str = yaml.dump(
             data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None
         )
@@ -229,6 +244,55 @@ def _function_to(function: ContinuousFunction) -> dict[str, Any]:
     return out
 
 
+def _field_from(data: Mapping[str, Any]) -> ResidualField:
+    low, high = data["magnification_range"]
+    rows = [np.array(part, dtype=np.float64) for part in data["coefficients"]]
+    if any(row.shape != rows[0].shape for row in rows):
+        raise InvalidValueError("a residual field of uneven parts", expected="parts of equal size")
+    knots_x, knots_y = (np.array(data[k], dtype=np.float64) for k in ("knots_x", "knots_y"))
+    return ResidualField(knots_x, knots_y, (float(low), float(high)), np.stack(rows))
+
+
+def _field_to(field: ResidualField, covariance: Array) -> dict[str, Any]:
+    """``covariance`` holds the rows of the field's coefficients, its last columns being their own."""
+    own = len(covariance)
+    cross, square = np.split(covariance, [covariance.shape[1] - own], axis=1)
+    packed = np.concatenate([cross.ravel(), square[np.triu_indices(own)]])
+    return {
+        "magnification_range": [float(g) for g in field.g_range],
+        "knots_x": field.knots_x.tolist(),
+        "knots_y": field.knots_y.tolist(),
+        "coefficients": field.coefficients.tolist(),
+        # Hundreds of thousands of numbers: as text they would take seconds to read.
+        "covariance": base64.b64encode(packed.astype("<f8").tobytes()).decode("ascii"),
+    }
+
+
+def _with_field_covariance(functions: Array, packed: str, own: int) -> Array:
+    """The covariance of the functions' coefficients and of the field's, from its parts in the file."""
+    size = len(functions)
+    expected = own * size + own * (own + 1) // 2
+    try:
+        values = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<f8")
+    except (ValueError, binascii.Error) as error:
+        raise InvalidValueError(
+            "a covariance of the residual field that is no base64", expected="8 bytes per number"
+        ) from error
+    if len(values) != expected:
+        raise InvalidValueError(
+            f"a covariance of the residual field of {len(values)} numbers", expected=str(expected)
+        )
+    whole = np.zeros((size + own, size + own))
+    whole[:size, :size] = functions
+    whole[size:, :size] = values[: own * size].reshape(own, size)
+    whole[:size, size:] = whole[size:, :size].T
+    square = np.zeros((own, own))
+    square[np.triu_indices(own)] = values[own * size :]
+    whole[size:, size:] = square + np.triu(square, 1).T
+    _check_covariance(whole)
+    return whole
+
+
 def _covariance_from(data: Mapping[str, Any]) -> Array:
     size, rows = data["size"], data["upper_rows"]
     if [len(row) for row in rows] != list(range(size, 0, -1)):
@@ -239,11 +303,15 @@ def _covariance_from(data: Mapping[str, Any]) -> Array:
     for i, row in enumerate(rows):
         upper[i, i:] = row
     matrix = upper + np.triu(upper, 1).T
+    _check_covariance(matrix)
+    return matrix
+
+
+def _check_covariance(matrix: Array) -> None:
     if not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
         raise InvalidValueError(
             "a covariance that is none", expected="finite numbers, variances >= 0"
         )
-    return matrix
 
 
 def _plain(value: Any) -> Any:

@@ -193,6 +193,7 @@ def calibrate_found(
     method: str = "joint",
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
+    residual: str = "auto",
 ) -> RecordingCalibration:
     """Calibrate from images whose corners have been found."""
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
@@ -203,6 +204,7 @@ def calibrate_found(
         method=method,
         options=options,
         breakpoints=breakpoints,
+        residual=residual,
     )
     factor = collected.assignment.scale_factor
     warnings = list(result.warnings)
@@ -230,6 +232,7 @@ def calibrate_recording(
     method: str = "joint",
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
+    residual: str = "auto",
     on_progress: Progress | None = None,
 ) -> RecordingCalibration:
     """Calibrate from a recording: a bag, or a folder of SEM TIFF files.
@@ -251,6 +254,7 @@ def calibrate_recording(
         method=method,
         options=options,
         breakpoints=breakpoints,
+        residual=residual,
     )
 
 
@@ -263,6 +267,7 @@ def calibrate(
     method: str = "joint",
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
+    residual: str = "auto",
 ) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
 
@@ -277,7 +282,7 @@ def calibrate(
         Replace the values of ``config``.
     method
         ``"joint"``, ``"pda"`` or ``"discrete"``.
-    options, breakpoints
+    options, breakpoints, residual
         As for :func:`~semcal_ros.core.calibrate.calibrate_views`.
 
     Examples
@@ -298,7 +303,12 @@ def calibrate(
         chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
     if isinstance(source, (str, os.PathLike)):
         done = calibrate_recording(
-            Path(source), chosen, method=method, options=options, breakpoints=breakpoints
+            Path(source),
+            chosen,
+            method=method,
+            options=options,
+            breakpoints=breakpoints,
+            residual=residual,
         )
         return done.calibration
     frames = (
@@ -314,4 +324,5 @@ def calibrate(
         method=method,
         options=options,
         breakpoints=breakpoints,
+        residual=residual,
     ).calibration

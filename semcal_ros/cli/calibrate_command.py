@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from semcal_ros.cli.common import config_option, configured, echo_table, progress, require_folder
-from semcal_ros.core.calibrate import METHODS, MethodOptions
+from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views, named_frames
 
@@ -40,6 +40,13 @@ def _magnifications(
     metavar="G,G,...",
     help="joint: where the microscope switches its scan range, so that the scale jumps.",
 )
+@click.option(
+    "--residual",
+    type=click.Choice(RESIDUAL_MODES),
+    default="auto",
+    show_default=True,
+    help="joint: a field for what the distortion parameters cannot describe.",
+)
 @click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
 @click.option("--report", type=click.Path(path_type=Path), help="Also write an HTML report.")
 def command(
@@ -50,6 +57,7 @@ def command(
     pda_order: int,
     legendre: int | None,
     breakpoints: tuple[float, ...],
+    residual: str,
     tau: float | None,
     report: Path | None,
 ) -> None:
@@ -78,6 +86,7 @@ def command(
             method=method,
             options=MethodOptions(pda_order, legendre, tau),
             breakpoints=breakpoints,
+            residual=residual,
         )
     done.calibration.save(output)
     _tell(done, notes)
@@ -116,6 +125,8 @@ def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
             else ""
         )
     )
+    if done.calibration.residual is not None:
+        click.echo("with a residual field for what the distortion parameters do not describe")
     for view in rejected[:10]:
         click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
     if len(rejected) > 10:

@@ -16,7 +16,7 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
 from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.joint import RESIDUAL_MODES, FittedField, fit_joint, without_magnification
+from semcal_ros.core.joint import RESIDUAL_MODES, fit_joint, without_magnification
 from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
 from semcal_ros.core.pda import pda_functions
@@ -25,6 +25,7 @@ from semcal_ros.core.problem import (
     Setup,
     variance_factor,
 )
+from semcal_ros.core.statistics import about_field, data_warnings, statistics_of
 from semcal_ros.core.views import GridView
 
 __all__ = ["METHODS", "RESIDUAL_MODES", "CalibrationResult", "MethodOptions", "calibrate_views"]
@@ -92,7 +93,7 @@ class _Fitted:
     functions: Functions
     covariance: Array
     without: Callable[[int], tuple[Functions, ResidualField | None]]
-    height_sigma_m: float
+    height_sigma_m: Array
     poses: tuple[Array, Array] | None
     details: dict[str, Any]
     warnings: tuple[str, ...]
@@ -183,8 +184,10 @@ def calibrate_views(
     model = _model(setup, fitted.functions, fitted.covariance, method, fitted.residual)
     poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses)
     held_out = _held_out(setup, fitted, method)
-    warnings = (*fitted.warnings, *_data_warnings(setup, model))
-    statistics = _statistics(setup, fitted, poses, held_out, warnings)
+    warnings = (*fitted.warnings, *data_warnings(setup, model))
+    statistics = statistics_of(
+        setup, fitted.details, fitted.height_sigma_m, poses, held_out, warnings
+    )
     return CalibrationResult(
         replace(model, statistics=statistics), ordered, poses, held_out, warnings
     )
@@ -252,7 +255,7 @@ def _fit_joint(setup: Setup, residual: str) -> _Fitted:
         "variance_factor": factor,
         "coefficients": {name: [f.kind, f.smooth_size] for name, f in fit.functions.items()},
         "breakpoints": list(setup.breakpoints),
-        "residual_field": _about_field(fit.field),
+        "residual_field": about_field(fit.field),
     }
     return _Fitted(
         fit.padded,
@@ -264,19 +267,6 @@ def _fit_joint(setup: Setup, residual: str) -> _Fitted:
         tuple(warnings),
         None if fit.field is None else fit.field.field,
     )
-
-
-def _about_field(fitted: FittedField | None) -> dict[str, Any] | None:
-    if fitted is None:
-        return None
-    choice = fitted.choice
-    return {
-        "strength_px": choice.strength_px,
-        "held_out_gain": choice.gain,
-        "held_out_gain_sigma": choice.gain_sigma,
-        "worthwhile": choice.worthwhile,
-        "converged": fitted.settled,
-    }
 
 
 def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
@@ -316,7 +306,7 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
         functions,
         covariance,
         lambda index: (functions_of(np.arange(count) != index)[0], None),
-        setup.priors.height_sigma_m,
+        np.full(len(setup.views), setup.priors.height_sigma_m),
         None,
         details,
         tuple(warnings),
@@ -347,7 +337,8 @@ def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
         starts = None if fitted.poses is None else (fitted.poses[0][mine], fitted.poses[1][mine])
         try:
             camera_at = _predictor(setup, *fitted.without(index), index, method)
-            fit = fit_poses(own, camera_at, height_sigma_m=fitted.height_sigma_m, starts=starts)
+            height = fitted.height_sigma_m[mine]
+            fit = fit_poses(own, camera_at, height_sigma_m=height, starts=starts)
         except (CalibrationError, InvalidValueError):
             # The method has no answer there: that is an infinite error, not a missing one.
             out[float(g)] = float("inf")
@@ -362,55 +353,3 @@ def _predictor(
     size = sum(f.size for f in functions.values()) + (0 if residual is None else residual.size)
     rest = replace(setup, magnifications=np.delete(setup.magnifications, index))
     return _model(rest, functions, np.zeros((size, size)), method, residual).at
-
-
-def _data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
-    """What the views do not determine beyond the priors."""
-    warnings: list[str] = []
-    covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
-    assert covariance is not None
-    sigma = np.sqrt(np.diag(covariance))
-    for index, name, label in (
-        (3, "px", "principal point"),
-        (5, "rho", "distance of the scan pivot"),
-    ):
-        if sigma[index] > 0.8 * setup.prior_of(name)[1]:
-            warnings.append(f"the views do not determine the {label}; it is held by its prior")
-    counts = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
-    few = [f"{g:g}" for g, n in counts.items() if n < 3]
-    if few:
-        warnings.append(f"fewer than 3 views at magnification {', '.join(few)}")
-    return warnings
-
-
-def _statistics(
-    setup: Setup,
-    fitted: _Fitted,
-    poses: PoseFit,
-    held_out: Mapping[float, float],
-    warnings: Sequence[str],
-) -> dict[str, Any]:
-    inner = [held_out[float(g)] for g in setup.magnifications[1:-1] if float(g) in held_out]
-    rms = rms_by_magnification(poses)
-    return {
-        "views": len(setup.views),
-        "corners": int(sum(len(v.board_xy_m) for v in setup.views)),
-        "rms_px": poses.rms_px(),
-        "held_out_rms_px": float(np.sqrt(np.mean(np.square(inner)))) if inner else None,
-        "by_magnification": [
-            {
-                "magnification": float(g),
-                "views": int(sum(v.magnification == g for v in setup.views)),
-                "rms_px": rms[float(g)],
-                "held_out_rms_px": held_out.get(float(g)),
-                "held_out_extrapolated": bool(
-                    g in (setup.magnifications[0], setup.magnifications[-1])
-                ),
-            }
-            for g in setup.magnifications
-        ],
-        "gauge": "the heights of the views about the reference plane have zero prior mean",
-        "priors": {**asdict(setup.priors), "height_sigma_m": fitted.height_sigma_m},
-        "fit": fitted.details,
-        "warnings": list(warnings),
-    }

@@ -56,13 +56,13 @@ def fit_poses(
     views: Sequence[GridView],
     camera_at: Callable[[float], ScanCamera],
     *,
-    height_sigma_m: float = 1e-4,
+    height_sigma_m: Array | float = 1e-4,
     starts: tuple[Array, Array] | None = None,
 ) -> PoseFit:
     """Fit the pose of every view with the camera of its magnification held fixed.
 
-    ``height_sigma_m`` is the prior 1-sigma of each view's height. ``starts`` are rotations (V, 3, 3) and translations
-    (V, 3) near the solution; without them both signs of the tilt are tried.
+    ``height_sigma_m`` is the prior 1-sigma of the heights, one number or (V,). ``starts`` are rotations (V, 3, 3) and
+    translations (V, 3) near the solution; without them both signs of the tilt are tried.
 
     Raises
     ------

@@ -48,7 +48,12 @@ RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
 _RESERVE, _LEAST_SIZE = 2, 5
-_HEIGHT_UPDATES = 3
+_HEIGHT_UPDATES = 4
+# Spread of heights: a micrometre is below what any view shows, and nobody has millimetres of depth of field.
+_LEAST_HEIGHT_M, _MOST_HEIGHT_M = 1e-6, 2e-3
+_FLAT_RAD = np.radians(5.0)
+# Fewer views than this say nothing about a spread of their own.
+_ENOUGH_HEIGHTS = 4
 # For what only has to be near: signs of tilts, poses, moderately flexible functions.
 _ENOUGH_CORNERS = 60
 # Tolerance of the adjustments on the way; only the last one has to be exact.
@@ -120,10 +125,20 @@ class _Stage:
     settled: bool
 
 
-def _height_sigma(result: BundleResult) -> float:
-    """Expectation-maximisation update of the spread of the heights."""
+def _height_sigma(result: BundleResult) -> Array:
+    """(V,) expectation-maximisation update of the spread of the heights.
+
+    Views without tilt have a spread of their own: nobody turns the stage about the very point that is looked at, so
+    that tilting changes the height, while views from above may all share one.
+    """
     square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
-    return float(np.clip(np.sqrt(np.mean(square)), 1e-6, 2e-3))
+    flat = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
+    if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:
+        flat = np.zeros_like(flat)
+    variance = np.empty(len(square))
+    for group in (flat, ~flat):
+        variance[group] = np.mean(square[group]) if np.any(group) else 0.0
+    return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT_M, _MOST_HEIGHT_M))
 
 
 def enriched(
@@ -150,14 +165,14 @@ def _thinned(view: GridView) -> GridView:
     return view.chosen(keep)
 
 
-def _started(setup: Setup) -> tuple[Functions, State, float]:
+def _started(setup: Setup) -> tuple[Functions, State, Array]:
     """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     functions: Functions = constant_functions(
         setup, {"scale": start.scale_factor, "rho": min(max(start.rho, 0.0), _MAX_START_RHO)}
     )
-    height = setup.priors.height_sigma_m
+    height = np.full(len(setup.views), setup.priors.height_sigma_m)
     problem = build_problem(setup, functions, setup.views, height)
     state = State(theta_of(functions), start.rotations, start.translations_m)
     state, _ = resolve_mirrored_tilts(problem, state)
@@ -210,7 +225,7 @@ def _selected(
     setup: Setup,
     functions: Functions,
     state: State,
-    height_sigma_m: float,
+    height_sigma_m: Array,
     sizes: Mapping[str, tuple[str, int]] | None = None,
 ) -> _Stage:
     """Choose the number of coefficients of every function until the choice no longer changes."""

@@ -158,7 +158,7 @@ class Setup:
 
 
 def build_problem(
-    setup: Setup, functions: Functions, views: Sequence[GridView], height_sigma_m: float
+    setup: Setup, functions: Functions, views: Sequence[GridView], height_sigma_m: Array | float
 ) -> Problem:
     """The adjustment of ``views`` with coefficient functions of the given kinds and sizes."""
     nominal = setup.nominal_px_per_m(setup.magnifications)

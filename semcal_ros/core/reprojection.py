@@ -71,7 +71,7 @@ class Problem:
     prior_mean, prior_sigma
         (K,) prior of theta; an infinite sigma is no prior.
     height_sigma_m
-        Prior 1-sigma of each view's height t_z about the reference plane.
+        (V,) prior 1-sigma of each view's height t_z about the reference plane.
     """
 
     board_m: Array
@@ -84,7 +84,7 @@ class Problem:
     norm_px: float
     prior_mean: Array
     prior_sigma: Array
-    height_sigma_m: float
+    height_sigma_m: Array
 
     @property
     def view_of_point(self) -> Index:
@@ -110,9 +110,12 @@ def make_problem(
     nominal_px_per_m: Array,
     prior_mean: Array,
     prior_sigma: Array,
-    height_sigma_m: float,
+    height_sigma_m: Array | float,
 ) -> Problem:
-    """Arrange views for the adjustment; ``magnifications`` (M,) are the distinct ones, in order."""
+    """Arrange views for the adjustment; ``magnifications`` (M,) are the distinct ones, in order.
+
+    ``height_sigma_m`` is one number, or one for each view.
+    """
     counts = [len(v.board_xy_m) for v in views]
     group = np.searchsorted(magnifications, [v.magnification for v in views]).astype(np.intp)
     board = np.concatenate([v.board_xy_m for v in views])
@@ -127,7 +130,7 @@ def make_problem(
         norm_px=norm_px,
         prior_mean=prior_mean,
         prior_sigma=prior_sigma,
-        height_sigma_m=height_sigma_m,
+        height_sigma_m=np.broadcast_to(np.asarray(height_sigma_m, dtype=np.float64), len(views)),
     )
 
 
@@ -311,4 +314,5 @@ def part_of(problem: Problem, chosen: NDArray[np.bool_]) -> Problem:
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         group=problem.group[chosen],
         unit_m=problem.unit_m[chosen],
+        height_sigma_m=problem.height_sigma_m[chosen],
     )

@@ -25,7 +25,7 @@ from semcal_ros.bridge import (
 )
 from semcal_ros.bridge.overlay import corner_overlay
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibrate import METHODS
+from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.nodes.base import NODE_ERRORS
@@ -39,6 +39,12 @@ __all__ = ["CalibrationServer", "main"]
 
 _SETTINGS = (
     Setting("method", "joint", "Calibration method.", choices=tuple(METHODS)),
+    Setting(
+        "residual",
+        "auto",
+        "Field for what the distortion parameters cannot describe (joint).",
+        choices=tuple(RESIDUAL_MODES),
+    ),
     Setting("output", "", "File that ~/save writes."),
 )
 _THREADS = 4
@@ -160,7 +166,11 @@ class CalibrationServer(StreamNode):
         self._report_progress(f"calibrating from {len(views)} views")
         config = self.config
         job = CalibrationJob(
-            views, config.display_width_m, config.squares_m, self.settings["method"]
+            views,
+            config.display_width_m,
+            config.squares_m,
+            self.settings["method"],
+            self.settings["residual"],
         )
         result = run_job(job, lambda: self.context.ok() and not self._stopping)
         if result.failed:

@@ -32,6 +32,7 @@ class CalibrationJob:
     display_width_m: float
     squares_m: tuple[float, ...]
     method: str
+    residual: str
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ def _calibrate(job: CalibrationJob) -> JobResult:
             display_width_m=job.display_width_m,
             squares_m=job.squares_m,
             method=job.method,
+            residual=job.residual,
         )
     except SemcalError as error:
         return JobResult("", str(error), failed=True)
