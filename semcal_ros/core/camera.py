@@ -170,20 +170,20 @@ class ScanCamera:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
-        """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field.
-
-        To first order in the field, which is small and smooth; exact without one.
-        """
+        """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field."""
         points = as_points(xyz_m, 3)
         jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
         if self.residual is None:
             return jacobians.d_parameters
         known = np.all(np.isfinite(jacobians.xy), axis=1)
-        field = np.full((len(points), 2, self.residual.coefficients.size), np.nan)
-        field[known] = 0.0
-        basis = self.residual.basis(self._normalised(self._with_residual(jacobians.xy[known])))
-        field[known, 0, 0::2] = field[known, 1, 1::2] = -self.norm_px * basis
-        return np.concatenate([jacobians.d_parameters, field], axis=2)
+        q = self._normalised(self._with_residual(jacobians.xy[known]))
+        size = self.residual.coefficients.size
+        own = np.zeros((len(q), 2, 10 + size))
+        own[:, :, :10] = jacobians.d_parameters[known]
+        own[:, 0, 10::2] = own[:, 1, 11::2] = -self.norm_px * self.residual.basis(q)
+        out = np.full((len(points), 2, 10 + size), np.nan)
+        out[known] = np.linalg.solve(np.eye(2) + self.residual.gradient(q), own)
+        return out
 
     @property
     def joint_covariance(self) -> Array | None:

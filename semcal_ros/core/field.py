@@ -33,8 +33,9 @@ _DEGREE = 3
 _BREAKS_X = (-1.04, -0.97, -0.9, -0.8, -0.65, -0.45, -0.22, 0.0, 0.25, 0.5, 0.75, 1.04)
 # Half image heights.
 _BREAKS_Y = (-1.04, -0.5, 0.0, 0.5, 1.04)
-_MAX_STEPS = 60
-_TOLERANCE = 1e-13
+_MAX_STEPS = 20
+# Newton's error after a step of this size is below rounding.
+_TOLERANCE = 1e-9
 
 
 def _clamped(breaks: Array, degree: int) -> Array:
@@ -45,6 +46,14 @@ def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
     """(n, size) values of the basis functions; outside of the knots those of their ends."""
     inside = np.clip(values, knots[0], knots[-1])
     return np.asarray(BSpline.design_matrix(inside, knots, degree).toarray(), dtype=np.float64)
+
+
+def _spline_slopes(values: Array, knots: Array) -> Array:
+    """(n, size) derivatives of the basis functions; outside of the knots there are none."""
+    size = len(knots) - _DEGREE - 1
+    inside = (values > knots[0]) & (values < knots[-1])
+    slopes = BSpline(knots, np.eye(size), _DEGREE)(np.clip(values, knots[0], knots[-1]), nu=1)
+    return np.asarray(np.where(inside[:, None], slopes, 0.0), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -86,19 +95,34 @@ class FieldSlice:
         out[known] = np.einsum("na,nac->nc", x, along)
         return out
 
-    def inverse(self, target: Array) -> Array:
-        """Raw positions (n, 2) that the field moves to ``target`` (n, 2); NaN where there is none.
+    def gradient(self, q: Array) -> Array:
+        """(n, 2, 2) derivative of the displacement by the position; finite positions only."""
+        ny, nx, _ = self.coefficients.shape
+        (x, dx), (y, dy) = (
+            (_spline_rows(v, knots, _DEGREE), _spline_slopes(v, knots))
+            for v, knots in ((q[:, 0], self.knots_x), (q[:, 1], self.knots_y))
+        )
+        flat = self.coefficients.reshape(ny, -1)
+        along, across = (y @ flat).reshape(-1, nx, 2), (dy @ flat).reshape(-1, nx, 2)
+        by_x, by_y = np.einsum("na,nac->nc", dx, along), np.einsum("na,nac->nc", x, across)
+        return np.stack([by_x, by_y], axis=2)
 
-        The field is small and smooth, so that ``q = target - G(q)`` contracts.
+    def inverse(self, target: Array) -> Array:
+        """Raw positions (n, 2) that the field moves to ``target`` (n, 2); NaN where there are none.
+
+        By Newton's method, from the displacement at the target.
         """
-        q = target.copy()
+        q = target - self.displacement(target)
+        active = np.flatnonzero(np.all(np.isfinite(q), axis=1))
         for _ in range(_MAX_STEPS):
-            better = target - self.displacement(q)
-            change = np.max(np.abs(better - q), axis=1, initial=0.0)
-            q = better
-            if not np.any(change > _TOLERANCE * (1.0 + np.abs(target).max(axis=1, initial=0.0))):
+            if not active.size:
                 return q
-        q[change > 1e-9] = np.nan
+            here = q[active]
+            miss = here + self.displacement(here) - target[active]
+            step = np.linalg.solve(np.eye(2) + self.gradient(here), miss[:, :, None])[:, :, 0]
+            q[active] = here - step
+            active = active[np.max(np.abs(step), axis=1) > _TOLERANCE]
+        q[active] = np.nan
         return q
 
 

@@ -134,7 +134,7 @@ def residual_field_pictures(
     model: CalibrationModel, cameras: Sequence[ScanCamera]
 ) -> list[Picture]:
     """What the residual field of a calibration adds to the distortion; empty without such a field."""
-    if getattr(model, "residual", None) is None:
+    if model.residual is None:
         return []
     pictures = []
     for camera in cameras:

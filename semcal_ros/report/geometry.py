@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +42,7 @@ def displacement_field(camera: ScanCamera, across: int = 13) -> tuple[Array, Arr
 
 def without_residual_field(camera: ScanCamera) -> ScanCamera:
     """The camera with its parametric distortion alone."""
-    if getattr(camera, "residual", None) is None:
-        return camera
-    changes: dict[str, Any] = {"residual": None}
-    return replace(camera, **changes)
+    return replace(camera, residual=None)
 
 
 def _jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
@@ -54,8 +50,8 @@ def _jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
 
 
 def _larger_sigma(difference: Array, covariance: Array) -> Array:
-    """(n,) 1-sigma along the worse axis from (n, 2, 10) derivatives; NaN where they are not known."""
-    spread = np.einsum("nip,pq,njq->nij", difference, covariance, difference)
+    """(n,) 1-sigma along the worse axis from (n, 2, k) derivatives; NaN where they are not known."""
+    spread = np.einsum("nip,pq,njq->nij", difference, covariance, difference, optimize=True)
     known = np.all(np.isfinite(spread), axis=(1, 2))
     out = np.full(len(difference), np.nan)
     out[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(spread[known])[:, -1], 0.0))
@@ -69,12 +65,13 @@ def shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     image drops out: it trades off against the position of the specimen, which no measurement inside
     of one image needs.
     """
-    if camera.covariance is None:
+    covariance = camera.joint_covariance
+    if covariance is None:
         return np.zeros(len(xy))
     centre = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
     points = camera.sem_from_ideal(np.concatenate([centre, xy]))
-    jacobian = _jacobians(camera, points).d_parameters
-    return _larger_sigma(jacobian[1:] - jacobian[:1], camera.covariance)
+    jacobian = camera.project_jacobian(points)
+    return _larger_sigma(jacobian[1:] - jacobian[:1], covariance)
 
 
 def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
@@ -83,22 +80,25 @@ def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     This is what stays when the pose of a flat specimen is fitted to the image, so it is the part
     of the predicted error that reprojection errors can show.
     """
-    if camera.covariance is None:
+    covariance = camera.joint_covariance
+    if covariance is None:
         return np.zeros(len(xy))
     points = camera.sem_from_ideal(xy)
-    jacobians = _jacobians(camera, points)
-    known = np.all(np.isfinite(jacobians.d_parameters), axis=(1, 2))
+    # The moves of the specimen span the same images with and without the small residual field.
+    moved = _jacobians(camera, points).d_xyz
+    jacobian = camera.project_jacobian(points)
+    known = np.all(np.isfinite(jacobian), axis=(1, 2))
     if not np.any(known):
         return np.full(len(xy), np.nan)
     x, y = (points[known, :2] - points[known, :2].mean(axis=0)).T
     one, zero = np.ones_like(x), np.zeros_like(x)
     moves = np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
-    columns = (jacobians.d_xyz[known][:, :, :2] @ moves).reshape(-1, 4)
+    columns = (moved[known][:, :, :2] @ moves).reshape(-1, 4)
     basis = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
-    rows = jacobians.d_parameters[known].reshape(-1, 10)
-    left = (rows - basis @ (basis.T @ rows)).reshape(-1, 2, 10)
+    rows = jacobian[known].reshape(-1, jacobian.shape[2])
+    left = (rows - basis @ (basis.T @ rows)).reshape(-1, 2, jacobian.shape[2])
     out = np.full(len(xy), np.nan)
-    out[known] = _larger_sigma(left, camera.covariance)
+    out[known] = _larger_sigma(left, covariance)
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +14,7 @@ from report_samples import SIZE, Unused, camera_at
 from semcal_ros.core.calibrate import CalibrationResult
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.field import zero_field
 from semcal_ros.report.cells import empty_share, filled_shares
 from semcal_ros.report.coverage_figures import tilts_deg
 from semcal_ros.report.error_figures import rms_picture
@@ -255,29 +256,21 @@ def test_uncertain_positions_are_a_finding(result: CalibrationResult) -> None:
     assert any("are uncertain by" in f for f in findings(replace(result, model=model)))
 
 
-@dataclass(frozen=True)
-class CameraWithField(ScanCamera):
-    """A camera as one with a residual field would be."""
-
-    residual: Any = None
-
-    def distort(self, xy: Any) -> Any:
-        shift = 0.0 if self.residual is None else np.array([self.residual, 0.0])
-        return super().distort(xy) + shift
-
-
 def test_residual_field_is_shown_where_there_is_one() -> None:
     base = camera_at(400.0)
-    camera = CameraWithField(**{**vars(base), "residual": 0.25})
+    blank = zero_field((SIZE, SIZE), (100.0, 1000.0), 1)
+    # A quarter of a px to the left of where the parametric distortion would have it, everywhere.
+    shift = np.broadcast_to(np.array([-0.25, 0.0]) / base.norm_px, blank.coefficients.shape)
+    field = replace(blank, coefficients=np.array(shift))
+    camera = replace(base, residual=field.at(400.0))
     assert np.allclose(displacement_field(camera)[1] - displacement_field(base)[1], [0.25, 0.0])
     assert without_residual_field(camera).distort(np.zeros((1, 2))) == pytest.approx(
         base.distort(np.zeros((1, 2)))
     )
-    model: Any = SimpleNamespace(residual=object())
+    model: Any = SimpleNamespace(residual=field)
     (picture,) = residual_field_pictures(model, [camera])
     assert "at most 0.25 px" in picture.caption
     assert residual_field_pictures(SimpleNamespace(residual=None), [camera]) == []  # type: ignore[arg-type]
-    assert without_residual_field(base) is base
 
 
 def test_predictions_need_a_covariance(result: CalibrationResult) -> None:

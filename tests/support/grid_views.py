@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +26,17 @@ def grid_view(
     noise_px: float = 0.0,
     rng: np.random.Generator | None = None,
     name: str = "",
+    project: Callable[[Array], Array] | None = None,
 ) -> GridView:
-    """All lattice corners that fall into the image, with Gaussian noise on their pixels."""
+    """All lattice corners that fall into the image, with Gaussian noise on their pixels.
+
+    ``project`` takes the place of the camera's own projection of sem-frame points.
+    """
     square_m = square_px / camera.m
     i, j = np.meshgrid(np.arange(-40, 41), np.arange(-40, 41))
     board = np.column_stack([i.ravel(), j.ravel()]) * square_m
     points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T + translation_m
-    xy = camera.project(points)
+    xy = (project or camera.project)(points)
     with np.errstate(invalid="ignore"):
         seen = np.all((xy > 5) & (xy < np.array([camera.width, camera.height]) - 6), axis=1)
     xy = xy[seen]
@@ -52,10 +57,12 @@ def grid_views(
     square_px: float = 40.0,
     seed: int = 0,
     flat_height_sigma_m: float = 0.0,
+    project: Callable[[float, Array], Array] | None = None,
 ) -> list[GridView]:
     """``views`` random poses per magnification, the first untilted, tilts up to 40 degrees.
 
-    The heights have the sigma ``height_sigma_m``, those of the untilted views ``flat_height_sigma_m``.
+    The heights have the sigma ``height_sigma_m``, those of the untilted views ``flat_height_sigma_m``. ``project``
+    takes the place of the cameras' projection: of sem-frame points at a magnification, as of a whole microscope.
     """
     rng = np.random.default_rng(seed)
     # A generator of its own: the poses of a seed are the same with and without noise.
@@ -81,6 +88,7 @@ def grid_views(
                     noise_px=noise_px,
                     rng=noise_rng,
                     name=f"{g:g}/{k}",
+                    project=None if project is None else partial(project, g),
                 )
             )
     return out
