@@ -208,17 +208,25 @@ def _covariance_with_reserve(
     """Covariance of the padded functions' coefficients and of the field's.
 
     A coefficient that was left out is not known to be zero: what the data do not tell about it is as uncertain as its
-    prior says.
+    prior says. Nor is zero what the data say: by how much all coefficients would move if those were let free, the
+    estimate may be wrong on top of that.
     """
     views = setup.views if field is None else corrected(setup, field.field).views
     problem = build_problem(setup, padded, views, stage.problem.height_sigma_m)
     state = replace(stage.result.state, theta=theta_of(padded))
     result = refine(problem, state, max_iterations=0)
+    factor = variance_factor(stage.problem, stage.result)
     if field is None:
-        return result.covariance
-    system = field_system(setup, problem, result, field.field)
-    # The system is scaled to the variance that the residuals show.
-    return system.covariance(field.choice.prior) / variance_factor(stage.problem, stage.result)
+        reduced = theta_system(problem, state.theta, result.information, result.gradient)
+        covariance, moved = result.covariance, scaled_solve(*reduced, 0.0)
+    else:
+        system = field_system(setup, problem, result, field.field)
+        # This one is scaled to the variance that the residuals show.
+        covariance = system.covariance(field.choice.prior) / factor
+        theta, freed = solve_field(system, field.choice.prior, field.field)
+        change = freed.coefficients - field.field.coefficients
+        moved = np.concatenate([theta - state.theta, change.ravel()])
+    return covariance + np.outer(moved, moved) / factor
 
 
 def _selected(

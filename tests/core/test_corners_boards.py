@@ -268,6 +268,67 @@ def test_debris_and_missing_squares_do_not_make_false_corners(square: float) -> 
     index_map(board, detection)
 
 
+@pytest.mark.parametrize("square", [15.0, 24.0, 45.0])
+def test_grains_hidden_by_noise_and_blur_do_not_shift_corners(square: float) -> None:
+    board = Board(square, turn_deg=25.0, electrons=25.0, tilt_deg=20.0, blur_px=2.0)
+    rng = np.random.default_rng(7)
+    picture = board.clean(4)
+    y, x = np.mgrid[0:512, 0:512]
+    covered = np.zeros((512, 512), bool)
+    for _ in range(14):
+        cx, cy, radius = rng.uniform(0, 512), rng.uniform(0, 512), rng.uniform(4, 20)
+        # The grains are as blurred as the board.
+        edge = np.clip(0.5 + (radius - np.hypot(x - cx, y - cy)) / (2.5 * board.blur_px), 0.0, 1.0)
+        picture = picture * (1.0 - edge) + rng.uniform(0.1, 1.4) * edge
+        covered |= edge > 0.02
+    detection = find_lattice(
+        (rng.poisson(picture * 25.0) / 25.0 * 120.0).clip(0, 255).astype(np.uint8)
+    )
+    assert detection.accepted
+    error = errors(board, detection)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(detection.covariance_px2), error)
+    # Noise gives five sigmas once in 270 000 corners.
+    assert np.mean(squared > 25.0) <= 3e-3
+    near = round(0.7 * square)
+    clear = cv2.dilate(covered.astype(np.uint8), np.ones((near, near), np.uint8)) == 0
+    truth = board.corners(margin=5.0)[1]
+    column, row = np.rint(truth).astype(int).T
+    untouched = truth[clear[row, column]]
+    # Four corners of every 1000 are given up wrongly: by the two checks, at 3.7 and 4 sigmas.
+    assert np.mean(cKDTree(detection.xy).query(untouched)[0] < 1.5) > 0.985
+
+
+def test_rejected_corners_have_positions() -> None:
+    board = Board(40.0, turn_deg=12.0, electrons=100.0)
+    picture = np.array(board.render(np.random.default_rng(4)))
+    truth = board.corners(margin=30.0)[1]
+    covered = truth[np.argmin(np.linalg.norm(truth - board.centre, axis=1))]
+    cv2.circle(picture, tuple(int(v) for v in np.rint(covered)), 9, 140, -1)
+    detection = find_lattice(picture)
+    assert detection.accepted
+    assert detection.rejected == len(detection.rejected_xy) >= 1
+    # Where the neighbours expect it, to a part of a pixel.
+    assert cKDTree(detection.rejected_xy).query(covered)[0] < 0.5
+    assert cKDTree(detection.xy).query(detection.rejected_xy)[0].min() > 20.0
+
+
+@pytest.mark.parametrize("square", [12.0, 20.0, 40.0])
+def test_board_in_a_corner_of_the_image(square: float) -> None:
+    board = Board(
+        square,
+        turn_deg=20.0,
+        tilt_deg=15.0,
+        electrons=80.0,
+        offset=(-170.0 / square, -170.0 / square),
+        bounds=(-4, -4, 4, 4),
+    )
+    detection = detect(board)
+    assert detection.accepted, detection.reason
+    assert found(board, detection) == 1.0
+    # Nothing on the border of the board, nothing beside it.
+    assert np.abs(errors(board, detection)).max() < 0.5
+
+
 def test_detection_follows_a_shift_of_the_image() -> None:
     board = Board(24.0, turn_deg=30.0, electrons=80.0)
     picture = board.render(np.random.default_rng(5))

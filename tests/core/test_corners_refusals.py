@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from corner_boards import Board
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import InvalidValueError
@@ -74,6 +75,37 @@ def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
         detection = find_lattice(rng.poisson(50.0 + 100.0 * pattern).astype(np.uint8))
         assert not detection.accepted, name
         assert detection.reason
+
+
+def joined(first: Board, second: Board) -> NDArray[np.uint8]:
+    """Two boards in one picture, side by side along a slanted line."""
+    x = np.arange(512)[None, :] + 0.3 * np.arange(512)[:, None]
+    picture = np.where(x < 330.0, first.clean(4), second.clean(4))
+    return np.random.default_rng(5).poisson(80.0 * picture).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("turn", "offset"),
+    [(15.0, (0.6, 0.6)), (10.0, (0.55, 0.2))],
+    ids=["turned by 5 deg", "shifted by a quarter"],
+)
+def test_two_boards_that_join_are_refused(turn: float, offset: tuple[float, float]) -> None:
+    detection = find_lattice(
+        joined(Board(15.0, turn_deg=10.0), Board(15.0, turn_deg=turn, offset=offset))
+    )
+    assert not detection.accepted and "two boards" in detection.reason
+
+
+@pytest.mark.parametrize(("square", "turn"), [(15.0, 35.0), (24.0, 40.0)])
+def test_two_boards_never_give_a_mixed_lattice(square: float, turn: float) -> None:
+    boards = Board(15.0, turn_deg=10.0), Board(square, turn_deg=turn, offset=(0.1, 0.6))
+    detection = find_lattice(joined(*boards))
+    if detection.accepted:
+        miss = [cKDTree(b.corners(0.0)[1]).query(detection.xy)[0].max() for b in boards]
+        # All corners belong to one board.
+        assert min(miss) < 1.0 < max(miss)
+    else:
+        assert "two boards" in detection.reason
 
 
 def test_too_few_corners_are_refused() -> None:

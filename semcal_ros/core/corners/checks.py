@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
+from semcal_ros.core.corners.local_map import LocalMaps
 from semcal_ros.core.corners.refine import CornerFit
 from semcal_ros.core.corners.window import PixelWindows
 
@@ -19,7 +18,6 @@ __all__ = [
     "credible",
     "inflation",
     "parity_of",
-    "smooth",
     "undisturbed",
 ]
 
@@ -38,12 +36,17 @@ CHI2_MAX = 4.0
 CHI2_EXCESS = 0.5
 CHI2_SIGMAS = 6.0
 MISFIT_MAX = 0.12
-# A local map does not follow a strong distortion exactly; its error is a small part of a square,
-# and grows where the map extrapolates. Noise alone exceeds four sigmas once in 3000 corners.
-MISS_SIGMAS = (5.0, 4.0)
-MISS_PART = 0.005
-# What a map through large squares on one side misses of a strong distortion, per variance.
-EXTRAPOLATED_PX = 2.5
+# Undisturbed corners exceed this score once in 2000; it has two degrees of freedom, and a median
+# of 1.39.
+IMBALANCE_MAX = 15.0
+IMBALANCE_MEDIAN = 1.39
+# Stains of the board and the model's own shortcomings, relative to half the contrast.
+UNLIKE_MAX = 0.05
+# Beyond the border of a board all squares are alike: the fourth at its corners differs by one.
+BORDER = 0.5
+# Noise alone exceeds four sigmas once in 15000 corners, but the spread is that of all corners and
+# its tails are longer than a normal distribution's.
+BLUR_SIGMAS = 4.0
 CORNERS_MIN = 6
 
 
@@ -82,7 +85,7 @@ class Fitted:
 def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Single) -> Mask:
     """Fits that settled near the prediction, with the right sign of contrast."""
     norm = np.linalg.norm(maps.axes, axis=2)
-    spacing = np.abs(np.linalg.det(maps.axes)) / norm.max(axis=1)
+    spacing = np.abs(maps.cell_px2) / norm.max(axis=1)
     expected = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
     turn = np.abs(np.angle(np.exp(1j * (fit.angles - expected)))).max(axis=1)
     moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
@@ -118,40 +121,29 @@ def undisturbed(fitted: Fitted) -> Mask:
     the excess must also be a visible part of the contrast.
     """
     fit = fitted.fit
-    if not np.any(fitted.good):
-        return fitted.good
-    pooled = float(np.median(fit.chi2[fitted.good]))
+    # Those on the border of a small board may be half of all, and would pass for the usual.
+    good = fitted.good & (fit.unlike < BORDER)
+    if not np.any(good):
+        return good
+    pooled = float(np.median(fit.chi2[good]))
     significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
     surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
-    return np.asarray(~(significant & (surplus > (MISFIT_MAX * fit.contrast) ** 2)))
+    visible = surplus > (MISFIT_MAX * fit.contrast) ** 2
+    return np.asarray(good & ~(significant & visible) & _alike(fit, good, pooled), dtype=np.bool_)
 
 
-def smooth(fitted: Fitted) -> Mask:
-    """Corners that agree with what their neighbours predict.
+def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
+    """Corners with opposite squares of the same grey value and edges as sharp as elsewhere.
 
-    The second look is without the worst, which spoil the predictions of their neighbours.
+    A grain in one square hardly shows in the sum of the squared residuals of a noisy picture, but
+    shifts the corner by many sigmas.
     """
-    good = fitted.good
-    for sigmas in MISS_SIGMAS:
-        if good.sum() < CORNERS_MIN:
-            return np.zeros(len(good), dtype=np.bool_)
-        good = fitted.good & _predicted(fitted, good, sigmas)
-    return good
-
-
-def _predicted(fitted: Fitted, good: Mask, sigmas: float) -> Mask:
-    """Corners within so many standard deviations of what the good ones around them predict."""
-    maps = fit_local_maps(fitted.cells, fitted.cells[good], fitted.fit.xy[good])
-    reach = np.sqrt(1.0 + maps.leverage)
-    miss = np.linalg.norm(fitted.fit.xy - maps.xy, axis=1) / reach
-    # The median of a length in the plane is 1.18 standard deviations per axis.
-    typical = float(np.median(miss[good])) / 1.18
-    pooled = float(np.median(fitted.fit.chi2[good]))
-    own = np.sqrt(pooled * np.trace(fitted.fit.covariance, axis1=1, axis2=2) / 2.0)
-    spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)
-    tolerance = sigmas * np.maximum(typical, own) + MISS_PART * spacing * reach
-    tolerance += EXTRAPOLATED_PX * (spacing / LARGE_SQUARE_PX) ** 3 * maps.leverage
-    return np.asarray((miss < tolerance) & maps.usable, dtype=np.bool_)
+    usual = max(pooled, float(np.median(fit.imbalance[good])) / IMBALANCE_MEDIAN)
+    uneven = (fit.imbalance > IMBALANCE_MAX * usual) & (fit.unlike > UNLIKE_MAX)
+    pull = np.abs(fit.blur_pull)
+    # The median of the absolute value is 0.675 standard deviations.
+    typical = max(1.0, float(np.median(pull[good])) / 0.675)
+    return np.asarray(~uneven & (pull < BLUR_SIGMAS * typical), dtype=np.bool_)
 
 
 def inflation(fit: CornerFit, keep: Mask) -> Array:

@@ -26,9 +26,16 @@ FILLED = 0.6
 # Debris and missing squares may spoil so many corners without another scale being better.
 CONVINCING = 0.6
 
+# A larger part of the corners off the lattice is a second board rather than what debris cut off.
+FOREIGN_MAX = 0.15
+
 
 def _no_covariance() -> Array:
     return np.zeros((0, 2, 2))
+
+
+def _no_positions() -> Array:
+    return np.zeros((0, 2))
 
 
 @dataclass(frozen=True)
@@ -57,8 +64,8 @@ class LatticeDetection:
         (n, 2, 2) covariance of each position, px^2.
     blur_px
         Median standard deviation of the blur of the edges, px; NaN when nothing was fitted.
-    rejected
-        Number of fitted lattice positions that were not good enough.
+    rejected_xy
+        (k, 2) where lattice points in the image that were not good enough were expected, px.
     """
 
     accepted: bool
@@ -70,7 +77,12 @@ class LatticeDetection:
     image_size: tuple[int, int]
     covariance_px2: Array = field(default_factory=_no_covariance)
     blur_px: float = float("nan")
-    rejected: int = 0
+    rejected_xy: Array = field(default_factory=_no_positions)
+
+    @property
+    def rejected(self) -> int:
+        """Number of lattice points in the image that were not good enough."""
+        return len(self.rejected_xy)
 
 
 def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection:
@@ -91,8 +103,8 @@ def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection
     Returns
     -------
     LatticeDetection
-        With ``accepted`` False and a reason if the image is blank, saturated, or does not show a
-        lattice.
+        With ``accepted`` False and a reason if the image is blank, saturated, shows no lattice, or
+        one that goes over into another.
 
     Raises
     ------
@@ -112,6 +124,12 @@ def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection
         return _refused(
             f"no chess lattice: only {round(100 * corners.quality)} % of the expected corners"
             " look like corners",
+            size,
+        )
+    if corners.foreign > max(FOREIGN_MAX * len(corners.ij), MINIMUM_CORNERS // 2):
+        return _refused(
+            f"two boards: {corners.foreign} corners do not continue the lattice of the other"
+            f" {len(corners.ij)}",
             size,
         )
     if len(corners.ij) < MINIMUM_CORNERS and filled < FILLED / 2.0:
@@ -188,5 +206,5 @@ def _accepted(corners: RefinedCorners, size: tuple[int, int]) -> LatticeDetectio
         size,
         corners.covariance,
         corners.blur_px,
-        corners.rejected,
+        corners.rejected_xy,
     )

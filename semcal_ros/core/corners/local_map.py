@@ -46,10 +46,16 @@ class LocalMaps:
     leverage: Array
 
     @property
+    def cell_px2(self) -> Array:
+        """(n,) signed area of a square, px^2."""
+        along, across = self.axes[:, 0], self.axes[:, 1]
+        return np.asarray(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0])
+
+    @property
     def usable(self) -> NDArray[np.bool_]:
         """Where enough neighbours, not all in a row, determine a regular map."""
         norm = np.linalg.norm(self.axes, axis=2)
-        skew = np.linalg.det(self.axes) / np.maximum(norm[:, 0] * norm[:, 1], 1e-9)
+        skew = self.cell_px2 / np.maximum(norm[:, 0] * norm[:, 1], 1e-9)
         return np.asarray((self.support >= SUPPORT_MIN) & (norm.min(axis=1) > 1.0) & (skew > 0.2))
 
     def select(self, keep: NDArray[np.bool_]) -> LocalMaps:
@@ -103,23 +109,32 @@ def fit_local_maps(
     steps = (u * side + v).astype(np.int64)
     member = lookup.ravel()[((cells - low) @ np.array([side, 1]))[:, None] + steps]
     known = member >= 0
-    # Most cells have the same neighbours, and the fit is linear in their positions.
-    code, which = np.unique(known @ (1 << np.arange(len(u), dtype=np.int64)), return_inverse=True)
-    patterns = ((code[:, None] >> np.arange(len(u))) & 1).astype(np.float64) * weight
-    total = np.maximum(patterns.sum(axis=1, keepdims=True), 1e-12)
-    # Positions relative to the neighbours' mean keep the ridge off the zeroth order and the numbers
-    # small.
-    average = (patterns / total)[which]
-    mean = (average[:, None] @ xy[member])[:, 0]
+    # Most cells have the same neighbours, and the fit is linear in their positions. Sums of powers
+    # of two below 2^49 are exact.
+    code, which = np.unique(known @ 2.0 ** np.arange(len(u)), return_inverse=True)
+    bits = code.astype(np.int64)[:, None] >> np.arange(len(u))
+    patterns = (bits & 1).astype(np.float64) * weight
     solver = _solvers(patterns, basis, np.array(ridge))
-    solution = solver[which] @ (xy[member] - mean[:, None])
+    solution = _solve(solver, which, xy, member)
     return LocalMaps(
-        solution[:, 0] + mean,
+        solution[:, 0],
         solution[:, 1:3],
         solution[:, [3, 5]],
         (patterns > 0).sum(axis=1).astype(np.float64)[which],
         (solver[:, 0] ** 2).sum(axis=1)[which],
     )
+
+
+def _solve(solver: Array, which: Indices, xy: Array, member: Indices) -> Array:
+    """(n, terms, 2) coefficients: ``solver[which]`` times the positions of the neighbours.
+
+    Inside of a lattice all cells share one solver, which makes one large product of many small.
+    """
+    common = int(np.argmax(np.bincount(which)))
+    solution = np.stack([coordinate[member] @ solver[common].T for coordinate in xy.T], axis=2)
+    other = which != common
+    solution[other] = solver[which[other]] @ xy[member[other]]
+    return np.asarray(solution)
 
 
 def _solvers(patterns: Array, basis: Array, ridge: Array) -> Array:
@@ -128,7 +143,12 @@ def _solvers(patterns: Array, basis: Array, ridge: Array) -> Array:
     pairs = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     normal = (patterns @ pairs).reshape(-1, terms, terms)
     normal += np.diag(ridge + 1e-9)
-    return np.asarray(np.linalg.inv(normal) @ (basis.T * patterns[:, None, :]), dtype=np.float64)
+    solver = np.linalg.inv(normal) @ (basis.T * patterns[:, None, :])
+    # Positions relative to the neighbours' mean keep the ridge off the zeroth order.
+    mean = patterns / np.maximum(patterns.sum(axis=1, keepdims=True), 1e-12)
+    solver -= solver.sum(axis=2, keepdims=True) * mean[:, None]
+    solver[:, 0] += mean
+    return np.asarray(solver, dtype=np.float64)
 
 
 def _dense(ij: Indices, cells: Indices, reach: int) -> tuple[Indices, Indices]:

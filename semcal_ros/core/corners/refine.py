@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.corners.balance import opposite_squares
 from semcal_ros.core.corners.edge_model import (
     ANGLES,
     BRIGHTNESS,
@@ -32,6 +33,8 @@ BAND_BLURS = 3.0
 LEAST_OF_FLOOR = 0.25
 # Large enough to hide what a call costs, small enough to keep the arrays in a cache.
 BLOCK_PIXELS = 24000
+# Where pixels say next to nothing, rounding must not decide what is a large pull.
+PULL_LEAST = 0.02
 # For the first pass, which knows no noise yet.
 ASSUMED_VARIANCE = 0.02
 
@@ -83,6 +86,12 @@ class CornerFit:
     level, variance
         (n, 2) mean grey value and squared residual of the pixels darker and of those brighter than
         the middle.
+    imbalance, unlike
+        (n,) score test of opposite squares that differ in grey value, chi-square with two degrees
+        of freedom in units of ``chi2``, and by how much of the contrast they do; zeros where
+        that was not asked for.
+    blur_pull
+        (n,) how far the blur is from its prior, in standard deviations.
     """
 
     xy: Array
@@ -96,6 +105,9 @@ class CornerFit:
     coverage: Array
     level: Array
     variance: Array
+    imbalance: Array
+    unlike: Array
+    blur_pull: Array
 
     def select(self, keep: NDArray[np.bool_]) -> CornerFit:
         """The fits of the corners where ``keep`` is true."""
@@ -159,6 +171,7 @@ def fit_corners(
     *,
     noise: NoiseModel | None,
     iterations: int,
+    judged: bool = False,
 ) -> CornerFit:
     """Gauss-Newton on position, edge directions, blur, grey levels and their gradients.
 
@@ -176,6 +189,8 @@ def fit_corners(
         Noise for the weights; None for equal weights.
     iterations
         Number of steps.
+    judged
+        Whether opposite squares are to be compared.
     """
     block = max(1, BLOCK_PIXELS // windows.x.shape[1])
     parts = []
@@ -188,7 +203,9 @@ def fit_corners(
             linear = _solve_linear(part, shape, nonlinear, expected)
         else:
             nonlinear, linear = start[rows, :NONLINEAR].copy(), start[rows, NONLINEAR:].copy()
-        parts.append(_fit_block(part, shape, nonlinear, linear, expected, noise, iterations))
+        parts.append(
+            _fit_block(part, shape, nonlinear, linear, expected, noise, iterations, judged)
+        )
     return CornerFit.join(parts)
 
 
@@ -200,15 +217,16 @@ def _fit_block(
     prior: Prior,
     noise: NoiseModel | None,
     iterations: int,
+    judged: bool,
 ) -> CornerFit:
     shortest = np.minimum(geometry.spacing_1, geometry.spacing_2)
     limits = np.tile([0.0, 0.0, 0.15, 0.15, 0.5, 1.0, 1.0], (len(shortest), 1))
     limits[:, :2] = 0.2 * shortest[:, None]
     blur_limits = np.log(BLUR_MIN_PX), np.log(np.maximum(0.35 * shortest, 0.5))
     known = (1.0 if noise is not None else ASSUMED_VARIANCE) / prior.deviation**2
-    axes = np.zeros((len(shortest), NONLINEAR + LINEAR, 2))
-    axes[:, :2] = np.eye(2)
-    for _ in range(iterations):
+    axes = np.zeros((len(shortest), NONLINEAR + LINEAR, 3))
+    axes[:, [0, 1, LOG_BLUR], [0, 1, 2]] = 1.0
+    for left in range(iterations - 1, -1, -1):
         # Levels and variances are those before the last step, which is tiny where the fit has
         # settled.
         jacobian, model = evaluate(windows, geometry, nonlinear, linear)
@@ -218,7 +236,11 @@ def _fit_block(
         np.einsum("nii->ni", normal)[...] += known
         pull = known * (prior.mean - np.column_stack([nonlinear, linear]))
         right += pull
-        solution = np.linalg.solve(normal, np.concatenate([right[:, :, None], axes], axis=2))
+        # Covariances are those of the last step.
+        sides = [right[:, :, None]] if left else [right[:, :, None], axes]
+        solution = np.linalg.solve(normal, np.concatenate(sides, axis=2)).astype(
+            np.float64, copy=False
+        )
         step = solution[:, :, 0]
         nonlinear = nonlinear + np.clip(step[:, :NONLINEAR], -limits, limits)
         nonlinear[:, LOG_BLUR] = np.clip(nonlinear[:, LOG_BLUR], *blur_limits)
@@ -231,9 +253,14 @@ def _fit_block(
     change = np.einsum("na,na->n", step, right - 2.0 * pull + known * step)
     chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
     level, variance = _statistics(windows, residual, model, freedom)
+    balance = (
+        opposite_squares(windows, nonlinear, jacobian, residual, weight, normal, step)
+        if judged
+        else np.zeros((2, len(shortest)))
+    )
     return CornerFit(
         windows.origin + nonlinear[:, :2],
-        solution[:, :2, 1:],
+        solution[:, :2, 1:3],
         nonlinear,
         linear,
         normal,
@@ -243,7 +270,18 @@ def _fit_block(
         windows.coverage,
         level,
         variance,
+        balance[0],
+        balance[1] / np.maximum(np.abs(linear[:, CONTRAST - NONLINEAR]), 1e-9),
+        _pull(nonlinear[:, LOG_BLUR], solution[:, LOG_BLUR, 3], prior),
     )
+
+
+def _pull(log_blur: Array, variance: Array, prior: Prior) -> Array:
+    """(n,) how far the blur is from its prior, in standard deviations of what a fit makes of it."""
+    deviation = prior.deviation[:, LOG_BLUR]
+    # A fit under a prior scatters by the prior's variance less its own.
+    spread = np.maximum(deviation**2 - variance, PULL_LEAST * deviation**2)
+    return np.asarray((log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread))
 
 
 def fit_noise(fit: CornerFit) -> NoiseModel:

@@ -14,12 +14,12 @@ from semcal_ros.core.corners.checks import (
     credible,
     inflation,
     parity_of,
-    smooth,
     undisturbed,
 )
 from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.parts import one_board
 from semcal_ros.core.corners.priors import (
     Learnt,
     learn,
@@ -34,6 +34,7 @@ from semcal_ros.core.corners.refine import (
     fit_noise,
     rough_start,
 )
+from semcal_ros.core.corners.smoothness import smooth
 from semcal_ros.core.corners.window import gather_windows
 
 __all__ = ["RefinedCorners", "refine_lattice"]
@@ -68,8 +69,10 @@ class RefinedCorners:
         Median blur.
     quality
         Part of the corners expected inside the lattice's extent that passed.
-    rejected
-        Number that did not pass.
+    rejected_xy
+        (k, 2) where lattice points in the image that did not pass were expected, px.
+    foreign
+        Number of corners that are good, but do not continue this lattice.
     """
 
     ij: Indices
@@ -77,7 +80,8 @@ class RefinedCorners:
     covariance: Array
     blur_px: float
     quality: float
-    rejected: int
+    rejected_xy: Array
+    foreign: int = 0
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,7 @@ def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
         return None
     part = _quality(first, image)
     if part < HOPELESS:
-        return _result(first, first.good, part)
+        return _result(first, first.good, part, first.maps.xy[~first.good])
     knowledge = _learn(first)
     maps = _better_maps(grown, first)
     grown, maps = grown.select(maps.usable), maps.select(maps.usable)
@@ -136,7 +140,14 @@ def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
         return None
     keep = last.good & undisturbed(last)
     keep &= smooth(replace(last, good=keep))
-    return _result(last, keep, part) if keep.sum() >= CORNERS_MIN else None
+    if keep.sum() < CORNERS_MIN:
+        return None
+    agreeing, keep = int(keep.sum()), one_board(last, keep)
+    passed = last.cells[keep]
+    doubtful = np.concatenate([second.cells[~second.good], last.cells[~keep]])
+    expected = np.concatenate([second.maps.xy[~second.good], last.maps.xy[~keep]])
+    result = _result(last, keep, part, _failed(doubtful, expected, passed, image))
+    return replace(result, foreign=agreeing - len(passed))
 
 
 def _quality(fitted: Fitted, image: Single) -> float:
@@ -161,7 +172,15 @@ def _shuffled(lattice: Lattice) -> Lattice:
     return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
 
 
-def _result(fitted: Fitted, keep: Mask, quality: float) -> RefinedCorners:
+def _failed(cells: Indices, xy: Array, passed: Indices, image: Single) -> Array:
+    """(k, 2) positions in the image of the cells, each once, that are not among those passed."""
+    keys, first = np.unique(_keys(cells), return_index=True)
+    size = np.array([image.shape[1], image.shape[0]])
+    inside = np.all((xy[first] >= 0) & (xy[first] <= size - 1), axis=1)
+    return np.asarray(xy[first][inside & ~np.isin(keys, _keys(passed))])
+
+
+def _result(fitted: Fitted, keep: Mask, quality: float, rejected_xy: Array) -> RefinedCorners:
     fit = fitted.fit
     order = np.lexsort(fitted.cells[keep].T[::-1])
     covariance = fit.covariance[keep] * inflation(fit, keep)[keep, None, None]
@@ -171,7 +190,7 @@ def _result(fitted: Fitted, keep: Mask, quality: float) -> RefinedCorners:
         covariance[order],
         float(np.median(fit.blur_px[keep])),
         quality,
-        int(len(keep) - keep.sum()),
+        rejected_xy,
     )
 
 
@@ -248,6 +267,7 @@ def _last_fit(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted | N
         prior.near(known.fit.parameters),
         noise=knowledge.noise,
         iterations=1,
+        judged=True,
     )
     good = credible(known.cells, maps, fit, image)
     return Fitted(known.cells, maps, known.windows, fit, good)

@@ -73,7 +73,15 @@ def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
         axis=1,
     ).astype(np.float64)
     # One Newton step to where the gradient vanishes; it is small at a true saddle.
-    step = -np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0] if len(rows) else gradient
+    across = np.stack(
+        [
+            hessian[:, 1, 1] * gradient[:, 0] - hessian[:, 0, 1] * gradient[:, 1],
+            hessian[:, 0, 0] * gradient[:, 1] - hessian[:, 0, 1] * gradient[:, 0],
+        ],
+        axis=1,
+    )
+    determinant = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+    step = -across / determinant[:, None]
     step *= np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12))
     points = np.stack([columns, rows], axis=1) + step
     return SaddlePoints(points, hessian, response[rows, columns].astype(np.float64))

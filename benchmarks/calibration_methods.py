@@ -1,0 +1,324 @@
+"""The methods of the benchmark of the calibrations, and their errors at magnifications that they never saw."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from calibration_opencv import OpenCv
+from calibration_views import HEIGHT_SIGMA_M, Array, Case, PixelSize
+from numpy.polynomial import Polynomial
+from scipy.interpolate import PchipInterpolator
+
+from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.discrete import DiscreteFit, fit_discrete, table_functions
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.evaluate import fit_poses
+from semcal_ros.core.functions import ContinuousFunction
+from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.pda import pda_functions
+from semcal_ros.core.problem import Priors, Setup
+from semcal_ros.core.projection import PARAMETER_NAMES
+from semcal_ros.core.views import GridView
+
+CameraAt = Callable[[float], ScanCamera]
+Curve = Callable[[float], Array]
+
+# The poses are fitted with sigmas of the corners and of the height that are so many times as large. The optimum is the
+# same, but the robust loss is quadratic for large errors too: bad cameras get the pose with the smallest RMS.
+LOOSENED = 100.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A calibration.
+
+    Attributes
+    ----------
+    residuals
+        Observed minus projected px of views of one magnification, whose poses are fitted.
+    pixel_size_m
+        Pixel size (x, y) at a magnification.
+    drifting
+        Whether it leaves drift in the images.
+    remarks
+        What a reader should know.
+    """
+
+    residuals: Callable[[Sequence[GridView]], list[Array]]
+    pixel_size_m: Callable[[float], PixelSize]
+    drifting: bool = False
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass
+class Work:
+    """A case with its separate calibrations, which are made when they are first asked for."""
+
+    case: Case
+    separate_s: float = 0.0
+
+    @property
+    def setup(self) -> Setup:
+        views = tuple(sorted(self.case.seen, key=lambda v: v.magnification))
+        magnifications = np.unique([v.magnification for v in views])
+        c = self.case
+        return Setup(views, magnifications, c.image_size, c.display_width_m, Priors())
+
+    @cached_property
+    def separate(self) -> DiscreteFit:
+        start = time.perf_counter()
+        fit = fit_discrete(self.setup)
+        self.separate_s = time.perf_counter() - start
+        return fit
+
+
+@dataclass(frozen=True)
+class Method:
+    """How a calibration is made; ``separate`` says that it takes separate calibrations, and their time."""
+
+    make: Callable[[Work], Answer]
+    separate: bool = False
+    fitted: bool = True
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What came of a method in one case.
+
+    Attributes
+    ----------
+    clean_px, noisy_px
+        RMS over the magnifications of the corners' distances.
+    worst_at
+        Magnification of the largest error without noise.
+    scale_percent
+        Largest relative error of a pixel size.
+    seconds
+        Time of the calibration.
+    remarks
+        What a reader should know.
+    """
+
+    clean_px: float | None = None
+    noisy_px: float | None = None
+    worst_at: float | None = None
+    scale_percent: float | None = None
+    seconds: float | None = None
+    remarks: tuple[str, ...] = ()
+
+
+# -- the methods -----------------------------------------------------------------------------------
+
+
+def by_cameras(
+    camera_at: CameraAt, *, drifting: bool = False, remarks: tuple[str, ...] = ()
+) -> Answer:
+    """An answer in the suite's own cameras."""
+
+    def residuals(views: Sequence[GridView]) -> list[Array]:
+        for view in views:
+            require_ideal_corners(camera_at(view.magnification), view)
+        loose = [
+            GridView(v.magnification, v.board_xy_m, v.image_xy, v.sigma_px * LOOSENED, v.name)
+            for v in views
+        ]
+        return list(
+            fit_poses(loose, camera_at, height_sigma_m=HEIGHT_SIGMA_M * LOOSENED).residuals_px
+        )
+
+    return Answer(residuals, lambda g: camera_at(g).pixel_size_m, drifting, remarks)
+
+
+def require_ideal_corners(camera: ScanCamera, view: GridView) -> None:
+    """An interpolated distortion may be so strong that corners have no undistorted pixel."""
+    known = np.all(np.isfinite(camera.undistort(view.image_xy)), axis=1)
+    if not known.all():
+        raise CalibrationError(
+            f"{np.sum(~known)} of {len(known)} corners without an undistorted pixel",
+            expected="a camera that sees all of the image",
+        )
+
+
+def nominal(work: Work, drifting: bool) -> Answer:
+    c = work.case
+    return by_cameras(
+        lambda g: ScanCamera.nominal(g, *c.image_size, c.display_width_m), drifting=drifting
+    )
+
+
+def by_curve(work: Work, curve: Curve) -> Answer:
+    """Of parameters as functions of g, the scale relative to the nominal one."""
+    c = work.case
+
+    def camera_at(g: float) -> ScanCamera:
+        values = dict(zip(PARAMETER_NAMES, curve(g).tolist(), strict=True))
+        values["m"] *= c.nominal_px_per_m(g)
+        width, height = c.image_size
+        return ScanCamera(
+            magnification=g, **values, norm_px=0.5 * width, width=width, height=height
+        )
+
+    return by_cameras(camera_at, remarks=remarks_on(work.separate))
+
+
+def remarks_on(fit: DiscreteFit) -> tuple[str, ...]:
+    """Where separate calibrations failed, or knew what others have to estimate."""
+    pairs = list(zip(fit.magnifications, fit.results, fit.centres, strict=True))
+    failed = [f"{g:g}" for g, result, _ in pairs if not result.converged]
+    straight = sum(centre.degenerate for _, _, centre in pairs)
+    out = []
+    if failed:
+        out.append(f"separate calibrations did not converge at {', '.join(failed)}")
+    if straight:
+        out.append(
+            f"separate calibrations took the radial distortion for zero at {straight} of {len(pairs)}"
+            " magnifications, where a test found none; joint always estimates it"
+        )
+    return tuple(out)
+
+
+def nearest(work: Work) -> Answer:
+    fit = work.separate
+    logs = np.log(fit.magnifications)
+    return by_curve(work, lambda g: fit.parameters[np.argmin(np.abs(logs - np.log(g)))])
+
+
+def pchip(work: Work) -> Answer:
+    fit = work.separate
+    curve = PchipInterpolator(np.log(fit.magnifications), fit.parameters)
+    return by_curve(work, lambda g: np.asarray(curve(np.log(g))))
+
+
+def polynomial(work: Work, degree: int) -> Answer:
+    """Weighted least squares in log g."""
+    fit = work.separate
+    if len(fit.magnifications) < degree + 2:
+        raise CalibrationError(
+            f"{len(fit.magnifications)} magnifications", expected=f"at least {degree + 2}"
+        )
+    logs = np.log(fit.magnifications)
+    sigmas = np.sqrt(np.diagonal(fit.covariances, axis1=1, axis2=2))
+    curves = [
+        Polynomial.fit(logs, values, degree, w=1.0 / sigma)
+        for values, sigma in zip(fit.parameters.T, sigmas.T, strict=True)
+    ]
+    return by_curve(work, lambda g: np.array([curve(np.log(g)) for curve in curves]))
+
+
+def by_functions(
+    work: Work, found: tuple[dict[str, ContinuousFunction], Array], name: str
+) -> Answer:
+    c, fit = work.case, work.separate
+    magnifications = tuple(float(g) for g in fit.magnifications)
+    model = CalibrationModel(*found, *c.image_size, c.display_width_m, magnifications, name)
+    return by_cameras(model.at, remarks=remarks_on(fit))
+
+
+def linear(work: Work) -> Answer:
+    """The suite's method "discrete"."""
+    fit = work.separate
+    found = table_functions(fit.magnifications, fit.parameters, fit.covariances)
+    return by_functions(work, found, "discrete")
+
+
+def pda(work: Work, order: int = 2, degree: int | None = None) -> Answer:
+    found = pda_functions(work.separate, order=order, legendre_degree=degree)
+    return by_functions(work, found, "pda")
+
+
+def joint(work: Work, residual: str) -> Answer:
+    c = work.case
+    result = calibrate_views(
+        c.seen, image_size=c.image_size, display_width_m=c.display_width_m, residual=residual
+    )
+    return by_cameras(result.model.at)
+
+
+def opencv(work: Work, guess: bool) -> Answer:
+    camera = OpenCv.calibrated(work.case, guess)
+    refused = ", ".join(f"{g:g}" for g in camera.refused)
+    remarks = (f"cv2.calibrateCamera refused {refused}",) if refused else ()
+    return Answer(camera.residuals, camera.pixel_size_m, remarks=remarks)
+
+
+JOINT, JOINT_FIELD = "joint", "joint, residual field"
+METHODS: dict[str, Method] = {
+    "no correction": Method(lambda w: nominal(w, True), fitted=False),
+    "drift only": Method(lambda w: nominal(w, False), fitted=False),
+    "discrete": Method(nearest, True),
+    "discrete, linear": Method(linear, True),
+    "discrete, PCHIP": Method(pchip, True),
+    **{f"discrete, polynomial {k}": Method(lambda w, k=k: polynomial(w, k), True) for k in (3, 5)},
+    **{f"discrete, Legendre {k}": Method(lambda w, k=k: pda(w, degree=k), True) for k in (3, 5)},
+    **{f"pda, order {k}": Method(lambda w, k=k: pda(w, order=k), True) for k in (1, 2, 3, 4)},
+    JOINT: Method(lambda w: joint(w, "off")),
+    JOINT_FIELD: Method(lambda w: joint(w, "on")),
+    "cv2.calibrateCamera": Method(lambda w: opencv(w, False)),
+    "cv2, f guessed, centre fixed": Method(lambda w: opencv(w, True)),
+}
+
+
+# -- their errors ----------------------------------------------------------------------------------
+
+
+def errors_px(
+    answer: Answer, views: Sequence[GridView], shifts_px: Sequence[Array]
+) -> dict[float, float]:
+    """RMS at each magnification. One without an answer counts as infinitely wrong.
+
+    A method that leaves the drift meets every view again in the frames that follow, under the pose of the first.
+    """
+    out: dict[float, float] = {}
+    for g in sorted({v.magnification for v in views}):
+        own = [i for i, v in enumerate(views) if v.magnification == g]
+        try:
+            residuals = answer.residuals([views[i] for i in own])
+        except (CalibrationError, InvalidValueError):
+            out[g] = float("inf")
+            continue
+        if answer.drifting and shifts_px:
+            residuals = [r + shifts_px[i] for i, r in zip(own, residuals, strict=True)]
+        distances2 = [np.sum(r * r, axis=-1).ravel() for r in residuals]
+        rms = float(np.sqrt(np.mean(np.concatenate(distances2))))
+        out[g] = rms if np.isfinite(rms) else float("inf")
+    return out
+
+
+def together(errors: dict[float, float]) -> float:
+    """RMS over the magnifications."""
+    return float(np.sqrt(np.mean(np.square(list(errors.values())))))
+
+
+def scale_percent(answer: Answer, case: Case) -> float:
+    """Largest relative error of a pixel size, in percent; infinite where there is none."""
+    try:
+        found = np.array([answer.pixel_size_m(g) for g in case.pixel_size_m])
+    except InvalidValueError:
+        return float("inf")
+    truth = np.array(list(case.pixel_size_m.values()))
+    return 100.0 * float(np.max(np.abs(found / truth - 1.0)))
+
+
+def judged(name: str, work: Work) -> Judged:
+    """Calibrate and judge."""
+    method, case = METHODS[name], work.case
+    earlier_s, start = work.separate_s, time.perf_counter()
+    try:
+        answer = method.make(work)
+    except (CalibrationError, InvalidValueError) as error:
+        return Judged(remarks=(f"{name}: {error}",))
+    seconds = time.perf_counter() - start + (earlier_s if method.separate else 0.0)
+    clean = errors_px(answer, case.clean, case.shifts_px)
+    return Judged(
+        together(clean),
+        together(errors_px(answer, case.judged, case.shifts_px)),
+        max(clean, key=lambda g: clean[g]),
+        scale_percent(answer, case),
+        seconds if method.fitted else None,
+        answer.remarks,
+    )

@@ -1,0 +1,65 @@
+"""Whether opposite squares of a corner have the same grey value, as those of a chess board do."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.window import PixelWindows
+
+__all__ = ["opposite_squares"]
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+
+def opposite_squares(
+    windows: PixelWindows,
+    nonlinear: Array,
+    jacobian: Single,
+    residual: Single,
+    weight: Single,
+    normal: Array,
+    step: Array,
+) -> tuple[Array, Array]:
+    """Score test of the two edge steps that the model has not: both squares beyond an edge brighter.
+
+    Nothing is fitted again: the residuals are projected on the new terms, less what the parameters
+    of the model take of them.
+
+    Parameters
+    ----------
+    windows, nonlinear
+        Pixels of n corners and (n, 7) parameters of :mod:`semcal_ros.core.corners.edge_model`.
+    jacobian, residual, weight
+        (n, 15, p) derivatives, (n, p) residuals and weights of the pixels before the last step.
+    normal, step
+        (n, 15, 15) normal matrices and (n, 15) last step.
+
+    Returns
+    -------
+    statistic
+        (n,) chi-square with two degrees of freedom where squares are alike.
+    difference
+        (n,) the larger of the two steps, half the difference of grey value.
+    """
+
+    def column(values: Array) -> Single:
+        return np.asarray(values, dtype=np.float32)[:, None]
+
+    px, py, angle_1, angle_2 = nonlinear.T[:4]
+    x, y = windows.x - column(px), windows.y - column(py)
+    side_1 = np.copysign(weight, column(np.cos(angle_1)) * y - column(np.sin(angle_1)) * x)
+    side_2 = np.copysign(weight, column(np.sin(angle_2)) * x - column(np.cos(angle_2)) * y)
+    sides = np.stack([side_1, side_2], axis=1)
+    shared = (sides @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+    score = (sides @ residual[:, :, None])[:, :, 0] - np.einsum("nka,na->nk", shared, step)
+    total = weight.sum(axis=1, dtype=np.float64)
+    information = np.empty((len(x), 2, 2))
+    # The ridge is for a window of which only one side of an edge is in view.
+    information[:, 0, 0] = information[:, 1, 1] = total * (1.0 + 1e-6)
+    both = np.einsum("np,np->n", side_1, np.copysign(np.float32(1.0), side_2))
+    information[:, 0, 1] = information[:, 1, 0] = both
+    information -= shared @ np.linalg.solve(normal, shared.transpose(0, 2, 1))
+    size = np.linalg.solve(information, score[:, :, None])[:, :, 0]
+    return np.einsum("nk,nk->n", score, size), np.abs(size).max(axis=1)

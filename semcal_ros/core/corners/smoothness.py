@@ -1,0 +1,95 @@
+"""Which corners agree with what their neighbours predict, given the covariances of all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.checks import CORNERS_MIN, Fitted, inflation
+from semcal_ros.core.corners.local_map import SUPPORT_MIN, fit_local_maps
+from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
+
+__all__ = ["smooth"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
+MISS_SIGMAS = (5.0, 4.3, 3.7)
+# What local maps through squares of LARGE_SQUARE_PX miss of the strongest distortion, per standard
+# deviation of a single corner's prediction; it grows as the third power of the square.
+MAP_ERROR_PX = 2.0
+# It is concentrated in parts of the image, where it is so many times its median.
+MAP_ERROR_RATIO = 4.0
+# Smooth distortions and perspectives are followed to a few hundredths of a pixel; twice as many
+# corners as terms keep single corners from bending it.
+TREND_DEGREE = 5
+# Medians of the square of a length in the plane, in variances per axis.
+MEDIAN_SQUARE = 1.386
+
+
+def smooth(fitted: Fitted) -> Mask:
+    """Corners that agree with what their neighbours predict.
+
+    Later looks are without the worst, which spoil the predictions of their neighbours.
+    """
+    good = fitted.good
+    for sigmas in MISS_SIGMAS:
+        if good.sum() < CORNERS_MIN:
+            return np.zeros(len(good), dtype=np.bool_)
+        good = fitted.good & _predicted(fitted, good, sigmas)
+    return good
+
+
+def _predicted(fitted: Fitted, good: Mask, sigmas: float) -> Mask:
+    """Corners within so many standard deviations of what the good ones around them predict."""
+    cells, xy = fitted.cells, fitted.fit.xy
+    # Local maps extrapolate at the rim and are coarse in large squares, where only what is left
+    # beside a smooth trend is small enough for them.
+    rest = xy - _trend(cells, good, xy)
+    maps = fit_local_maps(cells, cells[good], rest[good])
+    # The neighbours are as uncertain as the corner itself.
+    miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
+    covariance = fitted.fit.covariance * inflation(fitted.fit, good)[:, None, None]
+    error = _map_error(fitted, good, covariance, _squared(miss, covariance))
+    covariance = covariance + (error**2)[:, None, None] * np.eye(2)
+    passed = _squared(miss, covariance) < sigmas**2
+    return np.asarray(passed & (maps.support >= SUPPORT_MIN), dtype=np.bool_)
+
+
+def _squared(miss: Array, covariance: Array) -> Array:
+    """(n,) squared lengths of (n, 2) vectors in standard deviations."""
+    x, y = miss.T
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
+
+
+def _map_error(fitted: Fitted, good: Mask, covariance: Array, squared: Array) -> Array:
+    """(n,) what the maps miss besides noise, px, from what the image as a whole shows of it.
+
+    An uneven board is uneven everywhere; a distortion too strong for the maps is so in a part of
+    the image.
+    """
+    excess = max(float(np.median(squared[good])) / MEDIAN_SQUARE - 1.0, 0.0)
+    variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
+    seen = np.sqrt(excess * float(np.median(variance[good])))
+    spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)
+    worst = MAP_ERROR_PX * (spacing / LARGE_SQUARE_PX) ** 3
+    return np.asarray(np.maximum(seen, np.minimum(worst, MAP_ERROR_RATIO * seen)))
+
+
+def _trend(cells: Indices, good: Mask, xy: Array) -> Array:
+    """(n, 2) positions of all cells on a polynomial through the good corners."""
+    known = int(good.sum())
+    degree = max(d for d in range(1, TREND_DEGREE + 1) if d == 1 or (d + 1) * (d + 2) <= known)
+    low, high = cells.min(axis=0), cells.max(axis=0)
+    scaled = (2.0 * cells - low - high) / max(1, int((high - low).max()))
+    u, v = (np.vander(column, degree + 1, increasing=True) for column in scaled.T)
+    basis = np.concatenate(
+        [u[:, a, None] * v[:, : degree + 1 - a] for a in range(degree + 1)], axis=1
+    )
+    through = basis[good]
+    # The ridge is for boards of a few rows, which do not determine all terms.
+    normal = through.T @ through + 1e-9 * known * np.eye(basis.shape[1])
+    return np.asarray(basis @ np.linalg.solve(normal, through.T @ xy[good]))
