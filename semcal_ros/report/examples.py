@@ -84,8 +84,8 @@ class Overlay:
     width, height
         Size of the embedded image, px; the marks are in its coordinates with (0, 0) at the top left
         edge.
-    marks
-        SVG path of all crosses.
+    marks, refused
+        SVG paths of all crosses, and of squares where corners were refused.
     alt, caption
         Texts.
     """
@@ -94,6 +94,7 @@ class Overlay:
     width: int
     height: int
     marks: str
+    refused: str
     alt: str
     caption: str
 
@@ -110,17 +111,27 @@ def best_per_magnification(views: Sequence[ExampleView]) -> list[ExampleView]:
     return [best[g] for g in sorted(best)]
 
 
-def _marks(xy: Array, spacing: float) -> str:
-    k = float(np.clip(_MARK_OF_SPACING * np.nan_to_num(spacing), *_MARK_LIMITS_PX))
+def _mark_size(spacing: float) -> float:
+    return float(np.clip(_MARK_OF_SPACING * np.nan_to_num(spacing), *_MARK_LIMITS_PX))
+
+
+def _squares(xy: Array, k: float) -> str:
+    return "".join(f"M{x - k:.1f} {y - k:.1f}h{2 * k:.3g}v{2 * k:.3g}h{-2 * k:.3g}z" for x, y in xy)
+
+
+def _crosses(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
 
 
 def overlay_of(view: ExampleView) -> Overlay:
-    """The view shrunk to a thumbnail, with a cross at each corner."""
+    """The view shrunk to a thumbnail, with a cross at each corner and a square where one was refused."""
     small, factor = shrunk(as_bytes_image(view.image), _OVERLAY_WIDTH)
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
-    xy = (np.asarray(view.detection.xy, dtype=np.float64) + 0.5) * factor
-    count = len(xy)
+    xy, refused_xy = (
+        (np.asarray(points, dtype=np.float64) + 0.5) * factor
+        for points in (view.detection.xy, view.detection.rejected_xy)
+    )
+    count, size = len(xy), _mark_size(view.detection.spacing_px * factor)
     refused = view.detection.rejected
     dropped = f", {refused} refused" if refused else ""
     sigma = view.detection.sigma_px
@@ -129,7 +140,8 @@ def overlay_of(view: ExampleView) -> Overlay:
         src=data_uri("jpeg", jpeg_of(small, _JPEG_QUALITY)),
         width=small.shape[1],
         height=small.shape[0],
-        marks=_marks(xy, view.detection.spacing_px * factor),
+        marks=_crosses(xy, size),
+        refused=_squares(refused_xy, size),
         alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
         caption=plain(
             f"{view.magnification:g}×: {count} corners{dropped}{precision} ({view.name})"

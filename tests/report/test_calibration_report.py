@@ -181,7 +181,14 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
     image = np.zeros((1280, 1280), dtype=np.uint16)
     xy = np.array([[0.0, 0.0], [639.5, 639.5], [1279.0, 1279.0]])
     detection = LatticeDetection(
-        True, "", np.zeros((3, 2), dtype=np.int64), xy, np.full(3, 0.1), 40.0, (1280, 1280)
+        True,
+        "",
+        np.zeros((3, 2), dtype=np.int64),
+        xy,
+        np.full(3, 0.1),
+        40.0,
+        (1280, 1280),
+        rejected_xy=np.array([[99.5, 199.5]]),
     )
     overlay = overlay_of(Found("a", 100.0, image, detection))
     assert (overlay.width, overlay.height) == (320, 320)
@@ -189,6 +196,9 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
     centres = np.array([[float(x) + 0.5 * float(h), float(y)] for x, y, h in starts])
     # A pixel centre is half a pixel from the edge; the path has one decimal.
     assert np.allclose(centres, (xy + 0.5) / 4.0, atol=0.11)
+    ((x, y, side),) = re.findall(r"M([-\d.]+) ([\d.]+)h([\d.]+)v", overlay.refused)
+    middle = np.array([float(x), float(y)]) + 0.5 * float(side)
+    assert np.allclose(middle, [25.0, 50.0], atol=0.11)
 
 
 def test_examples_are_the_richest_accepted_views(result: CalibrationResult) -> None:
