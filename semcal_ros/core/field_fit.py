@@ -51,15 +51,17 @@ _LEAST_GAIN, _CLEARLY = 6.0, 2.5
 
 @dataclass(frozen=True)
 class FieldSystem:
-    """Quadratic approximation of the reprojection error of each view, with its pose eliminated.
+    """Quadratic approximation of the reprojection error with the poses eliminated.
+
+    Its members are what cross-validation leaves out: magnifications, or views where there are few magnifications.
 
     Attributes
     ----------
     information, right
-        (V, 10 + F, 10 + F) and (V, 10 + F): the cost of camera and slice z of a view is
+        (N, 10 + F, 10 + F) and (N, 10 + F): the cost of camera and slice z of a member is
         ``0.5 z' information z - right' z`` plus a constant, in units of the noise variance.
     group
-        (V,) index of the magnification.
+        (N,) index of each member's magnification.
     designs
         (M, 10, K): camera of each magnification per unit of theta.
     weights
@@ -101,14 +103,14 @@ class FieldSystem:
         return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
 
     def solve(self, keep: Mask, prior: Array) -> Array:
-        """Theta followed by the coefficients of the field, from the views that are kept."""
+        """Theta followed by the coefficients of the field, from the members that are kept."""
         matrix, right = self.assembled(keep, prior)
         scale = 1.0 / np.sqrt(np.diag(matrix))
         factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
         return np.asarray(scale * cho_solve(factor, scale * right), dtype=np.float64)
 
     def covariance(self, prior: Array) -> Array:
-        """Covariance of what :meth:`solve` gives from all views."""
+        """Covariance of what :meth:`solve` gives from all members."""
         matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
         scale = 1.0 / np.sqrt(np.diag(matrix))
         factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
@@ -116,7 +118,7 @@ class FieldSystem:
         return np.asarray(0.5 * (inverse + inverse.T) * np.outer(scale, scale), dtype=np.float64)
 
     def costs(self, solution: Array) -> Array:
-        """(V,) cost of each view, but for a constant."""
+        """(N,) cost of each member, but for a constant."""
         size = self.designs.shape[2]
         slices = self.weights @ solution[size:].reshape(self.weights.shape[1], -1)
         z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
@@ -195,10 +197,16 @@ def field_system(
     weights = np.stack([field.weights(float(g)) for g in setup.magnifications])
     slices = weights @ field.coefficients.reshape(len(field.coefficients), -1)
     z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[problem.group]
+    right += np.einsum("vpq,vq->vp", information, z)
+    group = problem.group
+    if len(setup.magnifications) >= _ENOUGH_MAGNIFICATIONS:
+        first = np.searchsorted(group, np.arange(len(setup.magnifications)))
+        information, right = (np.add.reduceat(a, first, axis=0) for a in (information, right))
+        group = np.arange(len(setup.magnifications), dtype=np.intp)
     return FieldSystem(
         information,
-        right + np.einsum("vpq,vq->vp", information, z),
-        problem.group,
+        right,
+        group,
         problem.designs,
         weights,
         problem.prior_mean,
@@ -237,17 +245,15 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
     return np.asarray(whole, dtype=np.float64)
 
 
-def _folds(system: FieldSystem) -> tuple[list[Mask], NDArray[np.intp]]:
-    """Views that are left out together, and what each view belongs to when gains are compared."""
-    count = len(system.designs)
-    if count < _ENOUGH_MAGNIFICATIONS:
-        of_view = np.arange(len(system.group), dtype=np.intp)
-        folds = min(_MAX_FOLDS, len(of_view))
-        return [of_view % folds == k for k in range(folds)], of_view
-    # The calibration does not claim to hold beyond the outermost magnifications: they are not left out.
-    inner = (system.group > 0) & (system.group < count - 1)
-    folds = min(_MAX_FOLDS, count - 2)
-    return [inner & ((system.group - 1) % folds == k) for k in range(folds)], system.group
+def _folds(system: FieldSystem) -> list[Mask]:
+    """Members that are left out together."""
+    candidates = np.ones(len(system.group), dtype=bool)
+    if len(system.designs) >= _ENOUGH_MAGNIFICATIONS:
+        # The calibration does not claim to hold beyond the outermost magnifications: they are not left out.
+        candidates[[0, -1]] = False
+    order = np.cumsum(candidates) - 1
+    folds = min(_MAX_FOLDS, int(candidates.sum()))
+    return [candidates & (order % folds == k) for k in range(folds)]
 
 
 def choose_field(
@@ -256,22 +262,18 @@ def choose_field(
     blank: ResidualField,
 ) -> FieldChoice:
     """The strength of a field that predicts best what it has not seen, and whether the field is worthwhile at all."""
-    folds, members = _folds(system)
-    scored = np.any(folds, axis=0)
+    folds = _folds(system)
 
     def held_out(strength_px: float) -> Array:
         prior = _prior(blank, strength_px, setup.norm_px)
-        costs = np.zeros(len(system.group))
-        for fold in folds:
-            costs[fold] = system.costs(system.solve(~fold, prior))[fold]
-        return np.asarray(np.bincount(members[scored], costs[scored]), dtype=np.float64)
+        costs = [system.costs(system.solve(~fold, prior))[fold] for fold in folds]
+        return np.concatenate(costs)
 
     without = held_out(_NO_STRENGTH_PX)
-    present = np.unique(members[scored])
-    gains = {s: (without - held_out(s))[present] for s in _STRENGTHS_PX}
+    gains = {s: without - held_out(s) for s in _STRENGTHS_PX}
     best = max(gains, key=lambda s: float(gains[s].sum()))
     gain = float(gains[best].sum())
-    sigma = float(np.std(gains[best]) * np.sqrt(len(present)))
+    sigma = float(np.std(gains[best]) * np.sqrt(len(without)))
     prior = _prior(blank, best, setup.norm_px)
     return FieldChoice(
         strength_px=best,
@@ -285,7 +287,7 @@ def choose_field(
 def solve_field(
     system: FieldSystem, prior: Array, blank: ResidualField, keep: Mask | None = None
 ) -> tuple[Array, ResidualField]:
-    """Theta and field from all views, or from those that are kept."""
+    """Theta and field from all members, or from those that are kept."""
     every = np.ones(len(system.group), dtype=bool)
     solution = system.solve(every if keep is None else keep, prior)
     theta, coefficients = np.split(solution, [system.designs.shape[2]])

@@ -82,7 +82,7 @@ class Priors:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is common to all problems over one set of views."""
+    """What is common to all problems over one set of views, which are in the order of their magnifications."""
 
     views: tuple[GridView, ...]
     magnifications: Array
