@@ -62,7 +62,7 @@ ERROR_NOTES = (
 SCALE_NOTES = (
     "Largest relative error of the pixel sizes x and y over the magnifications. Untilted views lie in the reference",
     f"plane; the heights of the others are unknown, {HEIGHT_SIGMA_M * 1e6:g} um (1-sigma), and change their scales by",
-    "that over the working distance: such errors are chance that no method can calculate away.",
+    "that over the working distance, so that a part of every error here is chance.",
     "OpenCV's reference plane is at the mean distance of the views.",
     "time: of the calibration, as ratio to joint's, which includes its held-out checks; median over the microscopes.",
 )

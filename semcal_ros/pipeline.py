@@ -44,6 +44,8 @@ Progress = Callable[[int], None]
 _TOO_FEW_TO_SHARE = 12
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
+# Octaves: how near to a factor of two the scale of a microscope with the right display width never is.
+_TWICE = 0.12
 
 
 @dataclass(frozen=True)
@@ -174,14 +176,75 @@ def collect_views(
         for v in found
         if v.detection.image_size != image_size
     ]
-    views, assignment = views_from_detections(
-        [v.detection for v in same],
-        [v.magnification for v in same],
+    views, assignment = _assigned(same, display_width_m, squares_m)
+    odd = [
+        RejectedView(v.name, v.magnification, _misfit_reason(apparent, squares_m), v.image)
+        for v, apparent, misfit in zip(same, assignment.apparent_m, assignment.misfits, strict=True)
+        if misfit
+    ]
+    if 2 * len(odd) > len(same):
+        raise CalibrationError(
+            f"{len(odd)} of {len(same)} views whose squares have none of the known sizes "
+            f"({odd[0].name} at {odd[0].magnification:g}: {odd[0].reason})",
+            expected="views of a grid whose squares have the sides squares_m",
+            do="correct squares_m in msg_configs, or the recorded magnifications",
+        )
+    if odd:
+        same = [v for v, misfit in zip(same, assignment.misfits, strict=True) if not misfit]
+        views, assignment = _assigned(same, display_width_m, squares_m)
+    return CollectedViews(views, tuple(same), (*rejected, *other, *odd), assignment, image_size)
+
+
+def _assigned(
+    found: Sequence[FoundView], display_width_m: float, squares_m: Sequence[float]
+) -> tuple[tuple[GridView, ...], SquareAssignment]:
+    return views_from_detections(
+        [v.detection for v in found],
+        [v.magnification for v in found],
         display_width_m=display_width_m,
         squares_m=squares_m,
-        names=[v.name for v in same],
+        names=[v.name for v in found],
     )
-    return CollectedViews(views, tuple(same), (*rejected, *other), assignment, image_size)
+
+
+def _micrometres(sides_m: Iterable[float]) -> str:
+    return ", ".join(f"{1e6 * side:.3g}" for side in sides_m)
+
+
+def _misfit_reason(apparent_m: float, squares_m: Sequence[float]) -> str:
+    return (
+        f"the other views make its squares {_micrometres([apparent_m])} um at this magnification, and squares_m has "
+        f"{_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m"
+    )
+
+
+def _check_factor(factor: float, display_width_m: float) -> None:
+    """Refuse what confusing the side of a square with the period of the grid gives."""
+    if abs(abs(np.log2(factor)) - 1.0) < _TWICE:
+        raise CalibrationError(
+            f"images that show {factor:.3g} times the scale that squares_m and the display width of "
+            f"{display_width_m:g} m predict",
+            expected="squares_m to hold the sides of single squares, not the period of the grid",
+            do=f"correct squares_m, or if that is right, set display_width_m to {display_width_m / factor:.4g} m",
+        )
+
+
+def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
+    """The collected views less those that the calibration has left out."""
+    if not result.outliers:
+        return collected
+    kept = {view.name for view in result.views}
+    found = {view.name: view for view in collected.found}
+    out = [
+        RejectedView(o.view.name, o.view.magnification, o.reason, found[o.view.name].image)
+        for o in result.outliers
+    ]
+    return replace(
+        collected,
+        views=tuple(v for v in collected.views if v.name in kept),
+        found=tuple(v for v in collected.found if v.name in kept),
+        rejected=(*collected.rejected, *out),
+    )
 
 
 def calibrate_found(
@@ -197,6 +260,8 @@ def calibrate_found(
 ) -> RecordingCalibration:
     """Calibrate from images whose corners have been found."""
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
+    factor = collected.assignment.scale_factor
+    _check_factor(factor, display_width_m)
     result = calibrate_views(
         collected.views,
         image_size=collected.image_size,
@@ -206,7 +271,7 @@ def calibrate_found(
         breakpoints=breakpoints,
         residual=residual,
     )
-    factor = collected.assignment.scale_factor
+    collected = _without_outliers(collected, result)
     warnings = list(result.warnings)
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         warnings.append(

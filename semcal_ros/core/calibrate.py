@@ -16,9 +16,10 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
 from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.joint import RESIDUAL_MODES, fit_joint, without_magnification
+from semcal_ros.core.joint import RESIDUAL_MODES, JointFit, fit_joint, without_magnification
 from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.outliers import OutlyingView, outlying_views
 from semcal_ros.core.pda import pda_functions
 from semcal_ros.core.problem import (
     Priors,
@@ -77,6 +78,8 @@ class CalibrationResult:
         ones are extrapolated.
     warnings
         Plain sentences about what the data could not determine.
+    outliers
+        Views that were left out because they disagree with the others (``"joint"``).
     """
 
     model: CalibrationModel
@@ -84,6 +87,7 @@ class CalibrationResult:
     fit: PoseFit
     held_out_rms_px: Mapping[float, float]
     warnings: tuple[str, ...]
+    outliers: tuple[OutlyingView, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -174,22 +178,26 @@ def calibrate_views(
     options = options or MethodOptions()
     if residual not in RESIDUAL_MODES:
         raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
+    outliers: tuple[OutlyingView, ...] = ()
     if method == "joint":
-        fitted = _fit_joint(setup, residual)
+        fit, setup, outliers = _fit_joint(setup, residual)
+        fitted = _about_joint(setup, fit)
     elif residual == "on":
         raise InvalidValueError(f"a residual field with method {method}", expected='method "joint"')
     else:
         fitted = _fit_discrete(setup, method, options)
 
     model = _model(setup, fitted.functions, fitted.covariance, method, fitted.residual)
-    poses = fit_poses(ordered, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses)
+    poses = fit_poses(
+        setup.views, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses
+    )
     held_out = _held_out(setup, fitted, method)
     warnings = (*fitted.warnings, *data_warnings(setup, model))
     statistics = statistics_of(
         setup, fitted.details, fitted.height_sigma_m, poses, held_out, warnings
     )
     return CalibrationResult(
-        replace(model, statistics=statistics), ordered, poses, held_out, warnings
+        replace(model, statistics=statistics), setup.views, poses, held_out, warnings, outliers
     )
 
 
@@ -227,8 +235,21 @@ def _model(
     )
 
 
-def _fit_joint(setup: Setup, residual: str) -> _Fitted:
-    fit = fit_joint(setup, residual)
+def _fit_joint(setup: Setup, residual: str) -> tuple[JointFit, Setup, tuple[OutlyingView, ...]]:
+    """The adjustment without the views that disagree with the others, and these."""
+    outliers: list[OutlyingView] = []
+    while True:
+        fit = fit_joint(setup, residual)
+        reasons = outlying_views(fit.problem, fit.result)
+        if not reasons:
+            return fit, setup, tuple(outliers)
+        outliers += [OutlyingView(setup.views[v], reason) for v, reason in reasons.items()]
+        # At least two views of every magnification stay, so that this ends.
+        views = tuple(v for i, v in enumerate(setup.views) if i not in reasons)
+        setup = replace(setup, views=views)
+
+
+def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
     factor = variance_factor(fit.problem, fit.result)
     warnings = []
     if not fit.result.converged:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import CalibrationError
 from semcal_ros.core.poses import (
     AffineView,
     mirrored_tilt,
@@ -79,9 +80,20 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     -------
     rotations, translations_m
         (2, 3, 3) and (2, 3): the pose from the affine part of the undistorted view, and its mirrored tilt.
+
+    Raises
+    ------
+    CalibrationError
+        If the camera can undistort fewer than four corners of the view.
     """
     ideal = camera.undistort(view.image_xy)
     known = np.all(np.isfinite(ideal), axis=1)
+    if known.sum() < 4:
+        raise CalibrationError(
+            f"view {view.name}, of which the calibration can undistort {known.sum()} corners",
+            expected="images of the microscope that was calibrated",
+            do="check the magnification and the display width",
+        )
     principal = np.array([camera.px, camera.py])
     centre = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
     affine = view_affine(view.board_xy_m[known], ideal[known], centre)

@@ -18,6 +18,11 @@ __all__ = ["GridView", "SquareAssignment", "assign_squares", "views_from_detecti
 
 Array = NDArray[np.float64]
 
+# Relative error of the size of a square that tilt, height, noise and the microscope's own scale do not explain.
+_MISFIT = 0.12
+# As a wrong magnification makes it, whatever its error.
+_FAR = 0.3
+
 
 @dataclass(frozen=True)
 class GridView:
@@ -107,13 +112,23 @@ class SquareAssignment:
         (v,) side of the squares seen in each view, m.
     scale_factor
         Median ratio of the observed px per m to the nominal one of the display width.
-    spread
-        Largest deviation of one view from that ratio, as a factor above 1.
+    apparent_m
+        (v,) side that each view's magnification says, with the common ratio taken out.
     """
 
     square_m: Array
     scale_factor: float
-    spread: float
+    apparent_m: Array
+
+    @property
+    def spread(self) -> float:
+        """Largest deviation of one view from the common ratio, as a factor above 1."""
+        return float(np.exp(np.max(np.abs(np.log(self.apparent_m / self.square_m)))))
+
+    @property
+    def misfits(self) -> NDArray[np.bool_]:
+        """(v,) views whose squares have none of the known sizes at their magnification."""
+        return np.asarray(np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT)
 
 
 def assign_squares(
@@ -136,24 +151,25 @@ def assign_squares(
     """
     sizes = np.log(np.sort(np.asarray(squares_m, dtype=np.float64)))
     observed = np.log(np.asarray(spacing_px) / np.asarray(nominal_px_per_m))
-    best: tuple[float, float, float] | None = None
+    best: tuple[float, float] | None = None
     # Any consistent factor maps the first view onto one of the sizes.
     for offset in observed[0] - sizes:
         for _ in range(3):
             nearest = np.argmin(np.abs(observed[:, None] - offset - sizes[None, :]), axis=1)
             offset = float(np.median(observed - sizes[nearest]))
         deviation = np.abs(observed - offset - sizes[nearest])
-        spread = float(np.median(deviation) + 0.1 * deviation.max())
+        # The mean: a size of which there are few views must not be given up for the others.
+        spread = float(np.mean(np.minimum(deviation, _FAR)))
         # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale decides.
         score = max(spread, 0.05) + 0.02 * abs(offset)
         if best is None or score < best[0]:
-            best = (score, offset, float(deviation.max()))
+            best = (score, offset)
     if best is None:
         raise CalibrationError("no views", expected="at least one view with a grid")
-    _, offset, deviation_max = best
+    _, offset = best
     nearest = np.argmin(np.abs(observed[:, None] - offset - sizes[None, :]), axis=1)
     return SquareAssignment(
-        np.exp(sizes[nearest]), float(np.exp(offset)), float(np.exp(deviation_max))
+        np.exp(sizes[nearest]), float(np.exp(offset)), np.exp(observed - offset)
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from grid_views import grid_views
@@ -165,3 +167,12 @@ def test_bad_requests_are_refused():
 def test_two_views_cannot_determine_scale_aspect_and_skew():
     with pytest.raises(CalibrationError, match="at least 3 views"):
         _calibrate("jsm820", magnifications=[1000.0], views=2)
+
+
+def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
+    microscope = preset("jsm820")
+    views = grid_views(microscope.camera_at, [1000.0], views=2)
+    blind = replace(microscope.camera_at(1000.0), xi_r=-50.0, ex=5000.0)
+    assert not np.isfinite(blind.undistort(views[0].image_xy)).any()
+    with pytest.raises(CalibrationError, match="can undistort 0 corners"):
+        fit_poses(views, lambda _: blind)
