@@ -5,8 +5,10 @@
     python benchmarks/run.py drift rectify    only these parts
 
 ========================  ==========================================================================
-calibration.py            joint, pda and discrete calibration beside cv2.calibrateCamera, judged at
-                          magnifications that none of them saw; the corner finder beside OpenCV's
+calibration.py            calibration methods (joint with and without residual field, the paper's,
+                          interpolations of separate calibrations, cv2.calibrateCamera) on five
+                          simulated microscopes and the reference recordings, judged at magnifications
+                          that none of them saw; the corner finder beside OpenCV's
 drift.py                  registration beside phase correlation, ECC and, where it is installed,
                           scikit-image, and the Cramer-Rao bound
 coverage.py               how often the stated uncertainty of a calibration holds the truth
@@ -14,7 +16,7 @@ rectify.py                rectification beside a bare cv2.remap; its map beside 
 live.py                   the node stream_corrector over DDS beside a process that only relays
 ========================  ==========================================================================
 
-Everything is measured on simulated data whose truth is known, with fixed seeds. Accuracy is in px
+Everything but one column is measured on simulated data whose truth is known, with fixed seeds. Accuracy is in px
 and stands beside a bound wherever there is one. A time is never given in seconds: it is the ratio
 of two medians, taken turn by turn in one run, so that it means something on another machine or on a
 busy one. Ratios of a few percent are still chance. Nothing here passes or fails.
