@@ -177,9 +177,12 @@ def collect_views(
         if v.detection.image_size != image_size
     ]
     views, assignment = _assigned(same, display_width_m, squares_m)
+    # At a single magnification only heights differ, and those of a photographed board may differ by much.
+    judged = len({v.magnification for v in same}) > 1
+    misfits = assignment.misfits & judged
     odd = [
         RejectedView(v.name, v.magnification, _misfit_reason(apparent, squares_m), v.image)
-        for v, apparent, misfit in zip(same, assignment.apparent_m, assignment.misfits, strict=True)
+        for v, apparent, misfit in zip(same, assignment.apparent_m, misfits, strict=True)
         if misfit
     ]
     if 2 * len(odd) > len(same):
@@ -190,7 +193,7 @@ def collect_views(
             do="correct squares_m in msg_configs, or the recorded magnifications",
         )
     if odd:
-        same = [v for v, misfit in zip(same, assignment.misfits, strict=True) if not misfit]
+        same = [v for v, misfit in zip(same, misfits, strict=True) if not misfit]
         views, assignment = _assigned(same, display_width_m, squares_m)
     return CollectedViews(views, tuple(same), (*rejected, *other, *odd), assignment, image_size)
 
@@ -208,7 +211,7 @@ def _assigned(
 
 
 def _micrometres(sides_m: Iterable[float]) -> str:
-    return ", ".join(f"{1e6 * side:.3g}" for side in sides_m)
+    return ", ".join(f"{float(f'{1e6 * side:.3g}'):.6g}" for side in sides_m)
 
 
 def _misfit_reason(apparent_m: float, squares_m: Sequence[float]) -> str:

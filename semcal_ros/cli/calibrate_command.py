@@ -6,7 +6,14 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import config_option, configured, echo_table, progress, require_folder
+from semcal_ros.cli.common import (
+    config_option,
+    configured,
+    echo_table,
+    magnification_option,
+    progress,
+    require_folder,
+)
 from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views, named_frames
@@ -29,6 +36,7 @@ def _magnifications(
     "-o", "--output", required=True, type=click.Path(path_type=Path), help="Calibration file."
 )
 @config_option
+@magnification_option
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
 @click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
 @click.option(
@@ -53,6 +61,7 @@ def command(
     recording: Path,
     output: Path,
     config: str,
+    magnification: float | None,
     method: str,
     pda_order: int,
     legendre: int | None,
@@ -61,7 +70,7 @@ def command(
     tau: float | None,
     report: Path | None,
 ) -> None:
-    """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files, of the chess grid.
+    """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files or ordinary images, of the chess grid.
 
     \b
     Example:
@@ -71,7 +80,7 @@ def command(
         if target is not None:
             require_folder(target)
     microscope = configured(config)
-    with open_recording(recording, microscope) as opened:
+    with open_recording(recording, microscope, magnification=magnification) as opened:
         with progress(opened.frame_count, "finding corners") as bar:
             found, rejected = find_views(
                 named_frames(opened), on_progress=lambda n: bar.update(n) and None

@@ -20,6 +20,7 @@ __all__ = [
     "configured",
     "echo_json",
     "echo_table",
+    "magnification_option",
     "overwrite_option",
     "progress",
     "require_folder",
@@ -31,6 +32,11 @@ config_option = click.option(
     show_default=True,
     metavar="NAME_OR_FILE",
     help="msg_configs of the microscope: topics, units, display width, scan timing.",
+)
+magnification_option = click.option(
+    "--magnification",
+    type=float,
+    help="Of all images: only for a folder of ordinary ones (png, jpg), which do not tell it.",
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."

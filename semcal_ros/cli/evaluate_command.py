@@ -7,7 +7,14 @@ from pathlib import Path
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.common import config_option, configured, echo_json, echo_table, progress
+from semcal_ros.cli.common import (
+    config_option,
+    configured,
+    echo_json,
+    echo_table,
+    magnification_option,
+    progress,
+)
 from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import collect_views, find_views, named_frames
@@ -19,8 +26,11 @@ __all__ = ["command"]
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.argument("recording", type=click.Path(path_type=Path))
 @config_option
+@magnification_option
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
-def command(calibration: Path, recording: Path, config: str, as_json: bool) -> None:
+def command(
+    calibration: Path, recording: Path, config: str, magnification: float | None, as_json: bool
+) -> None:
     """Reprojection RMS of CALIBRATION on a grid RECORDING that it was not made from.
 
     Poses are fitted to each view; the camera is not.
@@ -32,7 +42,7 @@ def command(calibration: Path, recording: Path, config: str, as_json: bool) -> N
     model = Calibration.load(calibration)
     microscope = configured(config, model)
     with (
-        open_recording(recording, microscope) as opened,
+        open_recording(recording, microscope, magnification=magnification) as opened,
         progress(opened.frame_count, "finding corners") as bar,
     ):
         found, rejected = find_views(

@@ -16,7 +16,13 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.evaluate import PoseFit, fit_poses, rms_by_magnification
 from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.joint import RESIDUAL_MODES, JointFit, fit_joint, without_magnification
+from semcal_ros.core.joint import (
+    RESIDUAL_MODES,
+    JointFit,
+    fit_joint,
+    suited_to_views,
+    without_magnification,
+)
 from semcal_ros.core.jumps import likely_jump
 from semcal_ros.core.model import CalibrationModel
 from semcal_ros.core.outliers import OutlyingView, outlying_views
@@ -38,8 +44,8 @@ METHODS = ("joint", "pda", "discrete")
 _MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 _MIN_VIEWS = 3
-# Variance factor beyond which the misfit is the model's and not a matter of the corners' sigmas.
-_MISFIT = 9.0
+# Residuals over the corners' sigmas beyond which the misfit is the model's and not a matter of these.
+_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +160,8 @@ def calibrate_views(
         ``"joint"`` (one adjustment over everything), ``"discrete"`` (each magnification by itself, linear between) or
         ``"pda"`` (the paper's differential equations through the discrete results).
     priors
-        Weak prior knowledge; the defaults suit any SEM.
+        Weak prior knowledge; the defaults suit any SEM, and follow the views where their perspective is that of a
+        photograph.
     options
         Of the paper's methods.
     breakpoints
@@ -175,6 +182,8 @@ def calibrate_views(
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _checked_breakpoints(breakpoints, magnifications, method)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
+    if priors is None:
+        setup = suited_to_views(setup)
     options = options or MethodOptions()
     if residual not in RESIDUAL_MODES:
         raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
@@ -254,10 +263,13 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
     warnings = []
     if not fit.result.converged:
         warnings.append(f"the adjustment did not converge: {fit.result.reason}")
-    if factor > _MISFIT:
+    own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
+    misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
+    if misfit > _MISFIT:
         warnings.append(
-            f"residuals are {np.sqrt(factor):.1f} times what the uncertainty of the corners explains: the functions "
-            "do not follow the microscope everywhere; record more magnifications"
+            f"residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "
+            "do not follow the microscope everywhere, or the grid is not regular"
+            + ("; record more magnifications" if len(setup.magnifications) > 1 else "")
         )
     jump = likely_jump(setup, fit.problem, fit.result)
     if jump is not None:
@@ -274,6 +286,7 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
         "reason": fit.result.reason,
         "selection_rounds": fit.rounds,
         "variance_factor": factor,
+        "excess_sigma_px": fit.excess_px,
         "coefficients": {name: [f.kind, f.smooth_size] for name, f in fit.functions.items()},
         "breakpoints": list(setup.breakpoints),
         "residual_field": about_field(fit.field),

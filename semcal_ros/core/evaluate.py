@@ -17,6 +17,7 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.core.initial import pose_from_camera
 from semcal_ros.core.reprojection import State, make_problem
+from semcal_ros.core.scatter import excess_sigma_px, with_excess
 from semcal_ros.core.views import GridView
 
 __all__ = ["PoseFit", "fit_poses", "rms_by_magnification"]
@@ -105,7 +106,15 @@ def fit_poses(
             expected="images of the microscope that was calibrated",
             do="check the magnification and the display width",
         )
-    return _best_of(usable, problem.starts, magnifications[problem.group])
+    g_of_view = magnifications[problem.group]
+    best = _best_of(usable, problem.starts, g_of_view)
+    excess = excess_sigma_px(views, np.concatenate(best.residuals_px), 6 * len(views))
+    if excess == 0.0:
+        return best
+    whitening = np.concatenate([v.whitening for v in with_excess(views, excess)])
+    state = State(np.ones(1), best.rotations, best.translations_m)
+    again = refine(replace(problem, whitening=whitening), state, fixed_theta=True)
+    return _best_of([again], problem.starts, g_of_view)
 
 
 def _best_of(

@@ -37,10 +37,18 @@ from semcal_ros.core.problem import (
     with_coefficients,
 )
 from semcal_ros.core.reprojection import Problem, State, scaled_solve, theta_system
+from semcal_ros.core.scatter import excess_sigma_px, with_excess
 from semcal_ros.core.selection import Summary, select_functions
 from semcal_ros.core.views import GridView
 
-__all__ = ["RESIDUAL_MODES", "FittedField", "JointFit", "fit_joint", "without_magnification"]
+__all__ = [
+    "RESIDUAL_MODES",
+    "FittedField",
+    "JointFit",
+    "fit_joint",
+    "suited_to_views",
+    "without_magnification",
+]
 
 Array = NDArray[np.float64]
 
@@ -49,8 +57,9 @@ _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 _MAX_ROUNDS = 5
 _RESERVE, _LEAST_SIZE = 2, 5
 _HEIGHT_UPDATES = 4
-# Spread of heights: a micrometre is below what any view shows, and nobody has millimetres of depth of field.
-_LEAST_HEIGHT_M, _MOST_HEIGHT_M = 1e-6, 2e-3
+# Spread of heights over its prior: a micrometre is below what any view shows, and nobody has millimetres of depth of
+# field.
+_LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
 _FLAT_RAD = np.radians(5.0)
 # Fewer views than this say nothing about a spread of their own.
 _ENOUGH_HEIGHTS = 4
@@ -102,6 +111,8 @@ class JointFit:
         How the choice came about.
     field
         The residual field, or None.
+    excess_px
+        1-sigma per axis, px, by which all corners scatter beyond their own.
     """
 
     functions: Functions
@@ -112,6 +123,7 @@ class JointFit:
     rounds: int
     settled: bool
     field: FittedField | None
+    excess_px: float
 
 
 @dataclass(frozen=True)
@@ -125,7 +137,7 @@ class _Stage:
     settled: bool
 
 
-def _height_sigma(result: BundleResult) -> Array:
+def _height_sigma(setup: Setup, result: BundleResult) -> Array:
     """(V,) expectation-maximisation update of the spread of the heights.
 
     Views without tilt have a spread of their own: nobody turns the stage about the very point that is looked at, so
@@ -138,7 +150,8 @@ def _height_sigma(result: BundleResult) -> Array:
     variance = np.empty(len(square))
     for group in (flat, ~flat):
         variance[group] = np.mean(square[group]) if np.any(group) else 0.0
-    return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT_M, _MOST_HEIGHT_M))
+    prior = setup.priors.height_sigma_m
+    return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior))
 
 
 def enriched(
@@ -165,13 +178,21 @@ def _thinned(view: GridView) -> GridView:
     return view.chosen(keep)
 
 
+def suited_to_views(setup: Setup) -> Setup:
+    """The setup with priors for a photographic lens where the views show that strong a perspective."""
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    if not start.wide:
+        return setup
+    return replace(setup, priors=setup.priors.of_wide_views(start.rho))
+
+
 def _started(setup: Setup) -> tuple[Functions, State, Array]:
     """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
-    functions: Functions = constant_functions(
-        setup, {"scale": start.scale_factor, "rho": min(max(start.rho, 0.0), _MAX_START_RHO)}
-    )
+    rho = start.rho if start.wide else min(max(start.rho, 0.0), _MAX_START_RHO)
+    functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
     height = np.full(len(setup.views), setup.priors.height_sigma_m)
     problem = build_problem(setup, functions, setup.views, height)
     state = State(theta_of(functions), start.rotations, start.translations_m)
@@ -183,7 +204,7 @@ def _started(setup: Setup) -> tuple[Functions, State, Array]:
     result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
     for _ in range(_HEIGHT_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
-        height = _height_sigma(result)
+        height = _height_sigma(setup, result)
         problem = replace(problem, height_sigma_m=height)
         result = refine(problem, result.state, tolerance=_COARSE)
     return with_coefficients(functions, result.state.theta), result.state, height
@@ -248,7 +269,7 @@ def _selected(
             break
         sizes = chosen
         functions = enriched(with_coefficients(functions, result.state.theta), chosen)
-        problem = build_problem(setup, functions, setup.views, _height_sigma(result))
+        problem = build_problem(setup, functions, setup.views, _height_sigma(setup, result))
         result = refine(
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
@@ -259,7 +280,7 @@ def _selected(
 def _finished(setup: Setup, stage: _Stage) -> _Stage:
     """The exact adjustment with the chosen functions, all tilts having been tried both ways."""
     thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
-    height = _height_sigma(stage.result)
+    height = _height_sigma(setup, stage.result)
     turned, _ = resolve_mirrored_tilts(
         build_problem(thin, stage.functions, thin.views, height), stage.result.state
     )
@@ -294,12 +315,19 @@ def _with_field(setup: Setup, stage: _Stage, always: bool) -> tuple[_Stage, Fitt
     return stage, FittedField(field, choice, system, False)
 
 
+def _sizes_of(stage: _Stage) -> dict[str, tuple[str, int]]:
+    own = stage.functions
+    return {name: (own[name].kind, own[name].smooth_size) for name in _SMOOTH}
+
+
 def _adjusted(setup: Setup, stage: _Stage, theta: Array, *, choosing: bool) -> _Stage:
     """The stage with other views and coefficients; ``choosing`` the number of coefficients again."""
-    functions, height = with_coefficients(stage.functions, theta), _height_sigma(stage.result)
+    functions, height = (
+        with_coefficients(stage.functions, theta),
+        _height_sigma(setup, stage.result),
+    )
     if choosing:
-        sizes = {name: (functions[name].kind, functions[name].smooth_size) for name in _SMOOTH}
-        return _selected(setup, functions, stage.result.state, height, sizes)
+        return _selected(setup, functions, stage.result.state, height, _sizes_of(stage))
     problem = build_problem(setup, functions, setup.views, height)
     result = refine(problem, replace(stage.result.state, theta=theta), tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
@@ -319,7 +347,14 @@ def fit_joint(setup: Setup, residual: str = "off") -> JointFit:
     field = None
     if residual != "off":
         stage, field = _with_field(setup, stage, residual == "on")
-    stage = _finished(setup if field is None else corrected(setup, field.field), stage)
+    excess = excess_sigma_px(setup.views, stage.result.residuals_px, 6 * len(setup.views))
+    if excess > 0.0:
+        setup = replace(setup, views=with_excess(setup.views, excess))
+    final = setup if field is None else corrected(setup, field.field)
+    if excess > 0.0:
+        height = _height_sigma(setup, stage.result)
+        stage = _selected(final, stage.functions, stage.result.state, height, _sizes_of(stage))
+    stage = _finished(final, stage)
     if field is not None:
         system = field_system(setup, stage.problem, stage.result, field.field)
         field = replace(field, system=system)
@@ -334,6 +369,7 @@ def fit_joint(setup: Setup, residual: str = "off") -> JointFit:
         stage.rounds,
         stage.settled,
         field,
+        excess,
     )
 
 

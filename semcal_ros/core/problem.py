@@ -79,6 +79,13 @@ class Priors:
     skew_jump: float = 0.005
     height_sigma_m: float = 1e-4
 
+    def of_wide_views(self, rho: float) -> Priors:
+        """The same for a lens whose pivot is at a distance of ``1 / rho``, and not some centimetres away.
+
+        Nothing is presumed of distance and heights but their order of magnitude.
+        """
+        return replace(self, rho_mean=rho, rho_sigma=rho, height_sigma_m=0.3 / rho)
+
 
 @dataclass(frozen=True)
 class Setup:

@@ -81,6 +81,13 @@ class GridView:
         last = 1.0 / np.sqrt(yy - xy * xy / xx)
         return np.stack([first, -last * xy / xx, last], axis=1)
 
+    def with_excess(self, sigma_px: float) -> GridView:
+        """The view with corners that are more uncertain by ``sigma_px`` per axis."""
+        spread = self.covariance_px2
+        if spread is not None:
+            spread = spread + sigma_px**2 * np.eye(2)
+        return replace(self, sigma_px=np.hypot(self.sigma_px, sigma_px), covariance_px2=spread)
+
     def chosen(self, keep: NDArray[Any]) -> GridView:
         """The view with some of its corners, by index or mask."""
         spread = None if self.covariance_px2 is None else self.covariance_px2[keep]

@@ -14,11 +14,13 @@ from semcal_ros.bridge.config import MicroscopeConfig, load_config
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
+from semcal_ros.core.model import checked_magnification
 from semcal_ros.files.bag_errors import reading
 from semcal_ros.files.bags import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.magnifications import MagnificationTrack
+from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
 from semcal_ros.files.tiff import is_tiff
-from semcal_ros.files.tiff_folder import PLAIN_IMAGES, TiffFolder, scan_tiff_folder
+from semcal_ros.files.tiff_folder import TiffFolder, scan_tiff_folder
 from semcal_ros.files.topics import find_topic
 
 if TYPE_CHECKING:
@@ -287,7 +289,40 @@ class _TiffRecording(Recording):
             )
 
 
-def open_recording(path: str | Path, config: MicroscopeConfig | None = None) -> Recording:
+class _PlainRecording(Recording):
+    """Ordinary image files, all of one magnification."""
+
+    def __init__(self, path: Path, config: MicroscopeConfig, magnification: float) -> None:
+        super().__init__(path, config)
+        self._paths = plain_image_paths(path)
+        self._magnification = magnification
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._paths)
+
+    def _frames(self) -> Iterator[Frame]:
+        for index, path in enumerate(self._paths):
+            # The files tell no time; a second apart is as good as any.
+            stamp_ns = (index + 1) * 1_000_000_000
+            try:
+                image = self._cut(read_plain_image(path), self.config.image.databar_rows)
+            except SemcalError as error:
+                self._rejected.append(Rejected(stamp_ns, str(error)))
+                continue
+            yield Frame(
+                image=image,
+                stamp_ns=stamp_ns,
+                log_time_ns=stamp_ns,
+                magnification=self._magnification,
+                frame_id=self.config.frame_id,
+                encoding="mono8" if image.dtype.itemsize == 1 else "mono16",
+            )
+
+
+def open_recording(
+    path: str | Path, config: MicroscopeConfig | None = None, *, magnification: float | None = None
+) -> Recording:
     """Open a recording or a folder of SEM TIFFs for reading frames.
 
     Parameters
@@ -298,6 +333,9 @@ def open_recording(path: str | Path, config: MicroscopeConfig | None = None) -> 
         How the microscope's topics are named and what they carry; ``generic`` by default. For
         TIFFs, its display width is what magnifications refer to, and its databar rows, if not
         0, are used in place of what the files say.
+    magnification
+        Of all images of a folder of ordinary image files, which do not tell it. Other recordings do: for them it is
+        refused.
 
     Raises
     ------
@@ -309,7 +347,9 @@ def open_recording(path: str | Path, config: MicroscopeConfig | None = None) -> 
     path = Path(path)
     used = load_config("generic") if config is None else config
     with reading(path):
-        kind = _kind_of(path)
+        kind = _kind_of(path, magnification)
+    if kind == "plain" and magnification is not None:
+        return _PlainRecording(path, used, checked_magnification(magnification))
     if kind == "tiff":
         folder = scan_tiff_folder(
             path,
@@ -320,18 +360,25 @@ def open_recording(path: str | Path, config: MicroscopeConfig | None = None) -> 
     return _BagRecording(path, used)
 
 
-def _kind_of(path: Path) -> str:
-    """``tiff`` or ``bag``, which the reader of recordings then looks at closer."""
-    if not path.exists() or is_bag(path):
-        return "bag"
-    names = list(path.iterdir()) if path.is_dir() else [path]
-    if any(is_tiff(name) for name in names):
-        return "tiff"
-    images = [name.name for name in names if name.suffix.lower() in PLAIN_IMAGES]
-    if images:
+def _kind_of(path: Path, magnification: float | None) -> str:
+    """``tiff``, ``plain`` or ``bag``, which the reader of recordings then looks at closer."""
+    kind = "bag"
+    if path.exists() and not is_bag(path):
+        names = list(path.iterdir()) if path.is_dir() else [path]
+        images = plain_image_paths(path)
+        if any(is_tiff(name) for name in names):
+            kind = "tiff"
+        elif images and magnification is None:
+            raise BagError(
+                f"{path} has {len(images)} plain images such as {images[0].name}",
+                expected="a rosbag2 folder, or SEM TIFFs whose metadata tell the pixel size",
+                do="use the microscope's original TIFF files, or state the magnification of all images",
+            )
+        elif images:
+            kind = "plain"
+    if magnification is not None and kind != "plain":
         raise BagError(
-            f"{path} has {len(images)} plain images such as {min(images)}",
-            expected="a rosbag2 folder, or SEM TIFFs whose metadata tell the pixel size",
-            do="use the microscope's original TIFF files",
+            f"a magnification stated for {path}",
+            expected="a folder of ordinary images, since recordings and SEM TIFFs tell theirs",
         )
-    return "bag"
+    return kind

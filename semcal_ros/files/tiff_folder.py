@@ -8,12 +8,12 @@ from datetime import timezone
 from pathlib import Path
 
 from semcal_ros.core.errors import SemcalError, TiffError
+from semcal_ros.files.plain_images import PLAIN_IMAGES
 from semcal_ros.files.tiff import SemImage, is_tiff, read_sem_settings, read_sem_tiff
 from semcal_ros.files.tiff.sem_image import VendorSettings
 
 __all__ = [
     "MIN_SPACING_NS",
-    "PLAIN_IMAGES",
     "Skipped",
     "TiffEntry",
     "TiffFolder",
@@ -24,8 +24,6 @@ _SECOND_NS = 1_000_000_000
 _SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
 MIN_SPACING_NS = 1_000_000
 """Least time between two images of a folder, whose files tell whole seconds."""
-
-PLAIN_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"}
 
 
 @dataclass(frozen=True)

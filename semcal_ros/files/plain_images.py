@@ -1,0 +1,40 @@
+"""Ordinary image files of one magnification, which the files themselves do not tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import BagError
+
+__all__ = ["PLAIN_IMAGES", "plain_image_paths", "read_plain_image"]
+
+PLAIN_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"}
+
+
+def plain_image_paths(path: Path) -> list[Path]:
+    """The image files of a folder in the order of their names, or the one file."""
+    listed = sorted(path.iterdir()) if path.is_dir() else [path]
+    return [p for p in listed if p.is_file() and p.suffix.lower() in PLAIN_IMAGES]
+
+
+def read_plain_image(path: Path) -> NDArray[Any]:
+    """Grey values of an image file, 8 or 16 bit.
+
+    Raises
+    ------
+    BagError
+        If it cannot be read.
+    """
+    try:
+        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror or error}", expected="a readable image") from error
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
+    if image is None or image.dtype.name not in ("uint8", "uint16"):
+        raise BagError(f"{path}: no readable image", expected="an intact 8 or 16 bit image file")
+    return image
