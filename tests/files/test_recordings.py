@@ -7,11 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from semcal_ros.bridge.config import ImageConfig, MagnificationConfig, MicroscopeConfig
-from semcal_ros.core.errors import BagError, TiffError
+from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
 from semcal_ros.files.bags import BagTopic, BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording
 from semcal_ros.files.topics import find_topic, topic_matches
@@ -272,6 +273,41 @@ def test_folders_that_are_no_recording(tmp_path: Path) -> None:
         open_recording(tmp_path)
     with pytest.raises(BagError, match="does not exist"):
         open_recording(tmp_path / "missing")
+
+
+def test_a_folder_of_ordinary_images_with_a_stated_magnification(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    eight = rng.integers(0, 256, (40, 50), dtype=np.uint8)
+    sixteen = rng.integers(0, 65536, (40, 50), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / "b.png"), eight)
+    cv2.imwrite(str(tmp_path / "a.png"), sixteen)
+    (tmp_path / "c.jpg").write_bytes(b"no image")
+    (tmp_path / "d.bmp").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("x")
+    with open_recording(tmp_path, magnification=250.0) as recording:
+        frames = list(recording.frames())
+        assert recording.frame_count == 4
+        assert [Path(r.reason.split(":")[0]).name for r in recording.rejected] == ["c.jpg", "d.bmp"]
+    np.testing.assert_array_equal(frames[0].image, sixteen)
+    np.testing.assert_array_equal(frames[1].image, eight)
+    assert [f.encoding for f in frames] == ["mono16", "mono8"]
+    assert [f.magnification for f in frames] == [250.0, 250.0]
+    assert frames[0].stamp_ns < frames[1].stamp_ns
+    with open_recording(tmp_path / "b.png", magnification=250.0) as recording:
+        assert len(list(recording.frames())) == 1
+
+
+def test_a_magnification_is_stated_only_where_it_is_missing(tmp_path: Path) -> None:
+    messages = [
+        ("/sem/magnification", T0, number(100.0)),
+        ("/sem/image_raw", T0 + 1, image(T0 + 1)),
+    ]
+    bag = write(tmp_path / "bag", messages)
+    with pytest.raises(BagError, match="tell theirs"):
+        open_recording(bag, CONFIG, magnification=100.0)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((10, 10), np.uint8))
+    with pytest.raises(InvalidValueError, match="greater than 0"):
+        open_recording(tmp_path / "a.png", magnification=-1.0)
 
 
 @pytest.mark.parametrize(
