@@ -367,7 +367,7 @@ class DriftTracker:
             accepted=not reason,
             reason=reason,
             residual=float("nan") if registration is None else registration.residual_rms,
-            drift_px=shot.px_from_unit @ state.position,
+            px_from_unit=shot.px_from_unit,
             overlap=overlap,
             calibrated=shot.camera is not None,
         )

@@ -84,8 +84,8 @@ class DriftUpdate:
         Whether the drift rests on this frame's own picture; why not.
     residual
         RMS grey levels that the shift does not explain; NaN where nothing was registered.
-    drift_px
-        (2,) drift in ideal pixels of this frame.
+    px_from_unit
+        (2, 2) ideal pixels of this frame per unit of the drift.
     overlap
         Fraction of the picture that was compared with the keyframe.
     calibrated
@@ -100,7 +100,7 @@ class DriftUpdate:
     accepted: bool
     reason: str
     residual: float
-    drift_px: Array
+    px_from_unit: Array
     overlap: float
     calibrated: bool
 
@@ -108,6 +108,11 @@ class DriftUpdate:
     def units(self) -> str:
         """``"m"`` or ``"px"``: unit of drift, velocity (per s) and covariance."""
         return "m" if self.calibrated else "px"
+
+    @property
+    def drift_px(self) -> Array:
+        """(2,) drift in ideal pixels of this frame."""
+        return np.asarray(self.px_from_unit @ self.drift_m)
 
     @property
     def raster(self) -> RasterDrift:
