@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
-import numpy as np
 
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, progress, require_folder
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker, DriftUpdate
-from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.cli.drift_common import (
+    camera_of,
+    echo_nominal_unit,
+    echo_states,
+    kind_of,
+    live_option,
+    rate_text,
+    recording_path,
+    start_time_s,
+)
+from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift_path import DriftPath
+from semcal_ros.core.drift_types import DriftUpdate
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
 
-__all__ = ["camera_of", "command", "echo_states", "kind_of", "start_time_s"]
+__all__ = ["command"]
 
-
-_NUMBER = re.compile(r"-?\d[\d.]*")
-
-
-def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig) -> ScanCamera:
-    """The calibrated camera of a frame, or the nominal one of the display width."""
-    height, width = frame.image.shape[:2]
-    if model is None:
-        return ScanCamera.nominal(frame.magnification, width, height, config.display_width_m)
-    return model.at(frame.magnification).resized(width, height)
-
-
-def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
-    """Start of the acquisition in seconds after the first frame's stamp."""
-    return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
-
-
-def kind_of(update: DriftUpdate) -> str:
-    """The status without the numbers of the single frame, so that frames can be counted by kind."""
-    return _NUMBER.sub("…", update.status)
-
-
-def echo_states(states: Counter[str]) -> None:
-    """Print how many frames had which kind of drift."""
-    for kind, count in states.most_common():
-        click.echo(f"{count} frames {kind}")
+_PLOT_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 @click.command("drift")
@@ -53,8 +39,17 @@ def echo_states(states: Counter[str]) -> None:
 @click.option(
     "--calibration", type=click.Path(path_type=Path), help="Work in rectified coordinates."
 )
+@click.option("--plot", type=click.Path(path_type=Path), help="Figure as png, svg or pdf, too.")
+@live_option
 @config_option
-def command(recording: Path, output: Path, calibration: Path | None, config: str) -> None:
+def command(
+    recording: Path,
+    output: Path,
+    calibration: Path | None,
+    plot: Path | None,
+    live: bool,
+    config: str,
+) -> None:
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
 
     What lay at X in the sem frame is seen at X + drift. Columns: stamp_ns, dx_m, dy_m, sigma_x_m, sigma_y_m,
@@ -62,42 +57,72 @@ def command(recording: Path, output: Path, calibration: Path | None, config: str
 
     \b
     Example:
-      semcal drift recordings/gold --calibration cal.yaml -o drift.csv
+      semcal drift recordings/gold --calibration cal.yaml -o drift.csv --plot drift.png
     """
     require_folder(output)
+    _check_plot(plot, output)
     model = None if calibration is None else Calibration.load(calibration)
     microscope = configured(config, model)
-    tracker = DriftTracker()
-    rows: list[tuple[object, ...]] = []
-    states: Counter[str] = Counter()
-    first: int | None = None
-    with (
-        open_recording(recording, microscope) as opened,
-        progress(opened.frame_count, "drift") as bar,
-    ):
-        for frame in opened.frames():
-            first = frame.stamp_ns if first is None else first
-            camera = camera_of(frame, model, microscope)
-            update = tracker.update(
-                frame.image,
-                start_time_s(frame, first, microscope),
-                camera,
-                microscope.scan,
-            )
-            rows.append(_row(frame.stamp_ns, update))
-            states[kind_of(update)] += 1
-            bar.update(1)
-    write_csv(output, DRIFT_COLUMNS, rows)
+    with open_recording(recording, microscope) as opened:
+        stamps_ns, updates = _tracked(opened, model, microscope)
+        notes = opened.notes
+    path = recording_path(updates, live=live)
+    write_csv(output, DRIFT_COLUMNS, _rows(stamps_ns, path))
+    if plot is not None:
+        _write_plot(path, plot)
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
     if model is None:
-        click.echo(
-            "note: without --calibration drift is in raw pixels, scaled by the nominal pixel size of "
-            f"the display width {microscope.display_width_m:g} m",
-            err=True,
-        )
-    echo_states(states)
+        echo_nominal_unit(microscope, "drift is in raw pixels, scaled by")
+    echo_states(Counter(kind_of(u) for u in updates))
+    if len(path) > 1:
+        click.echo(rate_text(path))
     click.echo(f"drift: {output}")
+    if plot is not None:
+        click.echo(f"plot: {plot}")
 
 
-def _row(stamp_ns: int, update: DriftUpdate) -> tuple[object, ...]:
-    sigma = np.sqrt(np.diag(update.covariance)[:2])
-    return (stamp_ns, *update.drift_m, *sigma, *update.drift_px, update.status)
+def _check_plot(plot: Path | None, output: Path) -> None:
+    if plot is None:
+        return
+    if plot.suffix.lower() not in _PLOT_SUFFIXES:
+        raise InvalidValueError(
+            f"a plot named {plot}",
+            expected="a name that ends in " + ", ".join(_PLOT_SUFFIXES),
+            do="choose one of these suffixes",
+        )
+    if plot.absolute() == output.absolute():
+        raise InvalidValueError(f"{plot} for both table and plot", expected="two files")
+    require_folder(plot)
+
+
+def _tracked(
+    opened: Recording, model: Calibration | None, microscope: MicroscopeConfig
+) -> tuple[list[int], list[DriftUpdate]]:
+    """Stamp and drift of every frame."""
+    tracker = DriftTracker()
+    stamps_ns: list[int] = []
+    updates: list[DriftUpdate] = []
+    with progress(opened.frame_count, "drift") as bar:
+        for frame in opened.frames():
+            stamps_ns.append(frame.stamp_ns)
+            camera = camera_of(frame, model, microscope)
+            time_s = start_time_s(frame, stamps_ns[0], microscope)
+            updates.append(tracker.update(frame.image, time_s, camera, microscope.scan))
+            bar.update(1)
+    return stamps_ns, updates
+
+
+def _rows(stamps_ns: Sequence[int], path: DriftPath) -> list[tuple[object, ...]]:
+    sigma_m = path.sigma_m
+    return [
+        (stamp_ns, *path.drift_m[k], *sigma_m[k], *path.drift_px[k], path.status[k])
+        for k, stamp_ns in enumerate(stamps_ns)
+    ]
+
+
+def _write_plot(path: DriftPath, file: Path) -> None:
+    # Here, so that those who want no plot do not wait for matplotlib.
+    from semcal_ros.report.drift_figures import write_drift_figure
+
+    write_drift_figure(path, file)

@@ -23,6 +23,7 @@ _COMMANDS = {
     "play": "replay a recording as ROS topics",
     "rectify": "drift-free, undistorted copy of a recording",
     "simulate": "record the virtual SEM to a bag, with its truth",
+    "stack": "drift-corrected average of a recording, and a stabilised video",
 }
 
 

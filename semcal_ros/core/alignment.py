@@ -1,60 +1,78 @@
-"""Fine alignment of two pictures by inverse-compositional least squares at full resolution.
+"""Fine alignment of two pictures by inverse-compositional least squares, coarse to fine.
 
 With the model
 
     image(x + s) = (g0 + g1 x + g2 y) reference(x) + (o0 + o1 x + o2 y)
 
-the reference's gradient is computed once and every step solves the same two equations (Baker and
-Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Gain and offset may vary linearly over the
-field, because the detector's shading does not move with the specimen: a gain ramp along x has a
-constant product with the gradient along x and would pull the shift. They drop out when the gradient
-is made orthogonal to them. Only what overlaps is compared. Because the gradient belongs to the
-reference alone, the noise of the resampled image does not pull the estimate towards whole pixels.
+the reference's gradient is computed once and every step solves the same few equations (Baker and
+Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Gain and offset may vary over the field,
+because the detector's shading does not move with the specimen: a gain ramp along x has a constant
+product with the gradient along x and would pull the shift. Only what overlaps is compared. Because
+the gradient belongs to the reference alone, the noise of the resampled image does not pull the
+estimate towards whole pixels.
+
+A scanned frame is seen line after line, so that what drifts during the frame is sheared and
+stretched: the shift changes linearly with the row. That change is estimated with the shift.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.subpixel import gradients, shifted_patch
-from semcal_ros.core.template import Patch, Template, Window, overlap_window
+from semcal_ros.core.tile_fit import (
+    TileFit,
+    TileGeometry,
+    fitted,
+    geometry_of,
+    residuals,
+    well_posed,
+)
+from semcal_ros.core.tiles import Level, Pyramid, TileSums, TileWindow, tile_sums, tile_window
 
-__all__ = ["Alignment", "align", "block_energies"]
+__all__ = ["Alignment", "align", "tile_energies"]
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
-_MAX_ITERATIONS = 12
-_PATIENCE = 4
-# The step after one of this size is a hundred times smaller.
-_LAST_STEP_PX = 5e-3
+_MAX_PASSES = 12
+_COARSE_PASSES = 4
 _LONGEST_STEP_PX = 1.5
-# Enough blocks that their scatter is known to a few percent, and each wide against the smoothed
-# noise.
-_BLOCKS = 400
+# A coarse level is left when its step is this short (px of the level).
+_COARSE_STEP_PX = 0.2
+# What a step leaves is at most this part of it, and its square over the pictures' finest structure.
+_CONTRACTION = 0.06
+_CURVATURE = 0.5
+_SIGMAS_LEFT = 0.12
+_LEAST_LEFT_PX = 5e-4
 _BLOCK_SIGMAS = 9.0
+_LEAST_BLOCKS = 36
+# Rows of tiles from which a change of the shift over the rows can be told.
+_LEAST_ROWS = 6
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Outcome of :func:`align`; all shifts are those of the cropped pictures that went in.
+    """Outcome of :func:`align`; shifts are those of the cropped pictures that went in.
 
     Attributes
     ----------
     shift_px
         (2,) shift.
     covariance
-        (2, 2), from the scatter of the blocks' contributions.
+        (2, 2), from the scatter of the tiles' contributions.
+    joint_px, joint_covariance
+        (4,) shift at the image's middle row, and by how much more the last row of the image is
+        shifted than the first, estimated together, and their (4, 4) covariance; NaN and infinite
+        where too few rows are compared.
     look_difference_px, look_variance
         (2, 2) differences (rows: left/right, top/bottom) of the shifts that the two halves of the
         overlap ask for, and their variances.
     gain, offset
         Image grey levels per reference grey level, and at reference level 0, in the middle of the
-        overlap.
+        image.
     residual_rms
         RMS of what gain, offset and shift do not explain, in image grey levels after smoothing.
     reference_variance, image_variance, common_covariance
@@ -62,11 +80,13 @@ class Alignment:
     overlap
         Fraction of the smaller picture that was compared.
     converged, iterations
-        Whether the last step was negligible, and the number of steps.
+        Whether the last step left nothing that matters, and the number of steps.
     """
 
     shift_px: Array
     covariance: Array
+    joint_px: Array
+    joint_covariance: Array
     look_difference_px: Array
     look_variance: Array
     gain: float
@@ -80,187 +100,228 @@ class Alignment:
     iterations: int
 
 
-def _sampled(window: Window, image: Image, shift: Array) -> Image:
-    """The image over the overlap, at the reference's pixels moved by the shift."""
-    return shifted_patch(
-        image,
-        window.left + window.whole[0],
-        window.top + window.whole[1],
-        window.width,
-        window.height,
-        (float(shift[0] - window.whole[0]), float(shift[1] - window.whole[1])),
-    )
+@dataclass(frozen=True)
+class _Look:
+    """Everything about one look at the pixels of one level; shifts in px of the level."""
+
+    level: Level
+    window: TileWindow
+    geometry: TileGeometry
+    sums: TileSums
+    fit: TileFit
+    shift: Array
+    image_size: tuple[int, int]
+    mean: float
+
+    @property
+    def length(self) -> float:
+        """Length of the step that the look asks for."""
+        return float(np.hypot(self.fit.step[0], self.fit.step[1]))
+
+    @property
+    def improved(self) -> Array:
+        """The shift after the step, which is limited."""
+        limit = min(1.0, _LONGEST_STEP_PX / max(self.length, 1e-12))
+        return np.asarray(self.shift + limit * self.fit.step)
 
 
-def _well_posed(matrix: Array) -> bool:
-    bound = 1e-6 * float(matrix[0, 0] * matrix[1, 1])
-    return bool(matrix[0, 0] > 0.0 and float(np.linalg.det(matrix)) > bound > 0.0)
-
-
-def align(template: Template, image: Image, start_px: Array) -> Alignment | None:
-    """Refine a shift that is right to about a pixel.
+def align(levels: Sequence[Level], image: Pyramid, start_px: Array) -> Alignment | None:
+    """Refine a shift.
 
     Parameters
     ----------
-    template
-        Reference.
+    levels
+        Reference at falling reduction factors; the last one decides.
     image
-        Image, smoothed in the same way.
+        Image.
     start_px
-        (2,) shift to start from.
+        (2,) shift in full-resolution px, right to about a pixel of the first level.
 
     Returns
     -------
     Alignment or None
         None where too little overlaps or the gradient leaves a direction undetermined.
     """
-    shift = np.asarray(start_px, dtype=np.float64).copy()
-    window: Window | None = None
-    for iteration in range(1, _MAX_ITERATIONS + 1):
-        if window is None or float(np.max(np.abs(shift - window.whole))) > 0.9:
-            window = overlap_window(template.smooth, image, shift)
-            if window is None:
+    shift = np.asarray(start_px, dtype=np.float64)
+    mean = float(image.at(levels[0].factor).mean(dtype=np.float64))
+    passes = 0
+    for level in levels[:-1]:
+        slopes = None
+        for _ in range(_COARSE_PASSES):
+            look = _look(level, image, shift / level.factor, mean, slopes)
+            if look is None:
                 return None
-        patch = template.patch(window)
-        if not _well_posed(patch.information):
+            passes += 1
+            shift, slopes = look.improved * level.factor, look.sums.slopes
+            if look.length < _COARSE_STEP_PX:
+                break
+    slopes = None
+    for _ in range(_MAX_PASSES):
+        look = _look(levels[-1], image, shift / levels[-1].factor, mean, slopes)
+        if look is None:
             return None
-        seen = _sampled(window, image, shift)
-        gain = float(patch.nuisance[0] @ seen.ravel()) * float(patch.solve_nuisance[0, 0])
-        slope = patch.information * (gain if gain > 0.1 else 1.0)
-        if iteration > _PATIENCE:
-            # Too slow: noise that is not white passes for gradient. The common gradient has none.
-            common = _common_information(patch, seen)
-            slope = common if _well_posed(common) else slope
-        step = -np.linalg.solve(slope, (patch.gradient @ seen.ravel()).astype(np.float64))
-        length = float(np.hypot(step[0], step[1]))
-        shift = shift + step * min(1.0, _LONGEST_STEP_PX / max(length, 1e-12))
-        if length < _LAST_STEP_PX:
+        passes += 1
+        shift = look.improved * levels[-1].factor
+        # Far from the right shift the gradients have less in common.
+        slopes = look.sums.slopes if look.length < _LONGEST_STEP_PX else None
+        covariance = _covariance(look)
+        sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
+        left = _CONTRACTION * look.length + _CURVATURE * look.length**2
+        converged = left < max(_SIGMAS_LEFT * sigma, _LEAST_LEFT_PX)
+        if converged:
             break
-    assert window is not None
-    return _finish(template, image, window, seen, shift, length < _LAST_STEP_PX, iteration)
+    assert look is not None
+    return _finished(look, covariance, converged, passes)
 
 
-def _common_information(patch: Patch, seen: Image) -> Array:
-    """(2, 2) product of both pictures' gradients, to which noise does not contribute on average."""
-    own = np.stack(gradients(seen)).reshape(2, -1)
-    slope = (patch.gradient @ own.T).astype(np.float64)
-    return np.asarray(0.5 * (slope + slope.T))
-
-
-def _finish(
-    template: Template,
-    image: Image,
-    window: Window,
-    seen: Image,
-    shift: Array,
-    converged: bool,
-    iterations: int,
-) -> Alignment | None:
-    patch = template.patch(window)
-    slope = _common_information(patch, seen)
-    if not _well_posed(slope):
+def _look(
+    level: Level, image: Pyramid, shift: Array, mean: float, slopes: Array | None
+) -> _Look | None:
+    """Sums and fit at a shift in px of the level; ``slopes`` are those of an earlier look."""
+    picture = image.at(level.factor)
+    size = picture.shape[1], picture.shape[0]
+    window = tile_window(level, size, shift)
+    if window is None:
         return None
-    size = seen.size
-    mean = float(seen.mean(dtype=np.float64))
-    centred = (seen - np.float32(mean)).ravel()
-    along = (patch.nuisance @ centred).astype(np.float64)
-    factors = patch.solve_nuisance @ along
-    error = centred - factors.astype(np.float32) @ patch.nuisance
-    side = _block_side(window, template.sigma_px)
-    inverse = np.asarray(np.linalg.inv(slope), dtype=np.float64)
-    covariance = _scatter(_block_sums(patch.gradient * error, window, side), inverse)
-    # Blocks leave the far edges out.
-    covariance *= size / (window.width // side * (window.height // side) * side**2)
-    difference, variance = _looks(patch, window, error, float(factors[0]), covariance)
+    geometry = geometry_of(level, window)
+    sums = tile_sums(level, window, picture, shift, mean, slopes)
+    fit = fitted(geometry, sums)
+    return None if fit is None else _Look(level, window, geometry, sums, fit, shift, size, mean)
+
+
+def _blocks(look: _Look, scores: Array) -> Array:
+    """(blocks, k) sums of scores over so many tiles that neighbours are independent."""
+    level = look.level
+    rows = look.window.rows.stop - look.window.rows.start
+    cols = look.window.cols.stop - look.window.cols.start
+    wanted = _BLOCK_SIGMAS * level.sigma_px
+    merge = [max(1, int(np.ceil(wanted / side))) for side in level.side]
+    while (rows // merge[1]) * (cols // merge[0]) < _LEAST_BLOCKS and max(merge) > 1:
+        merge = [max(1, m - 1) for m in merge]
+    if max(merge) == 1:
+        return scores
+    grid = scores.reshape(rows, cols, -1)
+    starts = np.arange(0, rows, merge[1]), np.arange(0, cols, merge[0])
+    sums = np.add.reduceat(np.add.reduceat(grid, starts[0], axis=0), starts[1], axis=1)
+    return np.asarray(sums.reshape(-1, scores.shape[1]))
+
+
+def _covariance(look: _Look) -> Array:
+    """(2, 2) from the scatter of the blocks' scores: noise of any colour and strength is in
+    them.
+    """
+    return _sandwich(_blocks(look, look.fit.scores), _inverse(look.fit.information))
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _sandwich(blocks: Array, inverse: Array) -> Array:
+    count, estimated = blocks.shape
+    centred = blocks - blocks.mean(axis=0)
+    spread = centred.T @ centred * count / max(count - estimated, 1)
+    return np.asarray(inverse @ spread @ inverse.T)
+
+
+def _finished(look: _Look, covariance: Array, converged: bool, passes: int) -> Alignment:
+    gram, cross, level = look.geometry.gram, look.sums.cross.reshape(-1, 4), look.level
+    whole, seen = gram.sum(axis=0), cross.sum(axis=0)
+    pixels = float(whole[3, 3])
+    error = float(residuals(look.geometry, look.sums, look.fit).sum())
+    gain = float(look.fit.gain[0])
+    difference, variance = _halves(look, covariance)
+    joint, joint_covariance = _with_shear(look)
+    smaller = min(level.size[0] * level.size[1], look.image_size[0] * look.image_size[1])
+    factor = level.factor
     return Alignment(
-        shift_px=shift,
-        covariance=covariance,
-        look_difference_px=difference,
-        look_variance=variance,
-        gain=float(factors[0]),
-        offset=mean - float(factors[0]) * patch.mean,
-        residual_rms=float(np.sqrt(float(error @ error) / size)),
-        reference_variance=float(patch.nuisance[0] @ patch.nuisance[0]) / size,
-        image_variance=float(centred @ centred) / size,
-        common_covariance=float(along[0]) / size,
-        overlap=size / float(min(template.smooth.size, image.size)),
+        shift_px=look.improved * factor,
+        covariance=covariance * factor**2,
+        joint_px=joint * factor,
+        joint_covariance=joint_covariance * factor**2,
+        look_difference_px=difference * factor,
+        look_variance=variance * factor**2,
+        gain=gain,
+        offset=float(look.fit.offset[0]) + look.mean - gain * level.mean,
+        residual_rms=float(np.sqrt(max(error, 0.0) / pixels)),
+        reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels,
+        image_variance=float(look.sums.energy.sum() - seen[3] ** 2 / pixels) / pixels,
+        common_covariance=float(seen[2] - whole[2, 3] * seen[3] / pixels) / pixels,
+        overlap=pixels / smaller,
         converged=converged,
-        iterations=iterations,
+        iterations=passes,
     )
 
 
-def _block_side(window: Window, sigma_px: float) -> int:
-    side = max(np.sqrt(window.width * window.height / _BLOCKS), _BLOCK_SIGMAS * sigma_px, 6.0)
-    return int(min(side, min(window.width, window.height) // 4))
+def _weights(look: _Look) -> Array:
+    """(tiles, 2, 2) each tile's part of the information, in the proportion of its gradients."""
+    own = look.geometry.gram[:, :2, :2]
+    scale = np.sqrt(np.diag(look.fit.information) / np.diag(own.sum(axis=0)))
+    tiles = own * np.outer(scale, scale)
+    # The products of x and y: those of the common information, spread evenly.
+    missing = look.fit.information[0, 1] - tiles[:, 0, 1].sum()
+    tiles[:, 0, 1] += missing / len(tiles)
+    tiles[:, 1, 0] = tiles[:, 0, 1]
+    return np.asarray(tiles)
 
 
-def _block_sums(pictures: Image, window: Window, side: int) -> Array:
-    """(k, rows, cols) sums over square blocks of (k, n); what does not fill a block at the far
-    edges is left out.
-    """
-    rows, cols = window.height // side, window.width // side
-    sums = []
-    for picture in pictures.reshape(-1, window.height, window.width):
-        part = picture[: rows * side, : cols * side]
-        sums.append(cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA))
-    return np.asarray(np.stack(sums), dtype=np.float64) * float(side * side)
-
-
-def _scatter(scores: Array, inverse: Array) -> Array:
-    """(2, 2) covariance of a shift from its blocks' scores (2, ...): noise of any colour and
-    strength is in them.
-    """
-    flat = scores.reshape(2, -1)
-    flat = flat - flat.mean(axis=1, keepdims=True)
-    blocks = flat.shape[1]
-    return np.asarray(inverse @ (flat @ flat.T) @ inverse.T * blocks / max(blocks - 2, 1))
-
-
-def _looks(
-    patch: Patch, window: Window, error: Image, gain: float, covariance: Array
-) -> tuple[Array, Array]:
-    """Differences of the shifts of opposite halves, each with gain and offset of its own, and
-    their variances.
-    """
-    difference, variance = np.zeros((2, 2)), np.zeros((2, 2))
-    if patch.looks is None:
-        return difference, variance + np.inf
-    left = error.reshape(window.height, window.width).copy()
-    left[:, window.width // 2 :] = 0.0
-    upper = window.height // 2 * window.width
-    whole = patch.columns @ error
-    parts = (patch.columns @ left.ravel(), patch.columns[:, :upper] @ error[:upper])
-    # How much larger than that of white noise the variance of the whole is holds for its halves as
-    # well.
-    colour = np.diag(covariance) / np.diag(np.linalg.inv(patch.information))
-    for k, part in enumerate(parts):
-        for sums, gram, sign in (
-            (part, patch.looks[k, 0], 1.0),
-            (whole - part, patch.looks[k, 1], -1.0),
-        ):
-            unit = np.sqrt(np.diag(gram)) + 1e-30
-            inverse = np.linalg.inv(gram / np.outer(unit, unit) + 1e-6 * np.eye(8))
-            inverse = inverse / np.outer(unit, unit)
-            difference[k] -= sign * (inverse @ sums.astype(np.float64))[:2] / gain
-            variance[k] += np.diag(inverse)[:2] * colour
+def _halves(look: _Look, covariance: Array) -> tuple[Array, Array]:
+    """Differences of the shifts of opposite halves, and their variances."""
+    difference, variance = np.zeros((2, 2)), np.full((2, 2), np.inf)
+    if look.geometry.alone:
+        # Of a lone particle no half tells anything without the other.
+        return difference, variance
+    scores, weights = look.fit.scores, _weights(look)
+    cols = look.window.cols.stop - look.window.cols.start
+    rows = len(scores) // cols
+    index = np.arange(len(scores))
+    # Neighbouring tiles of smoothed noise are not independent.
+    single = np.diag(_sandwich(scores, _inverse(look.fit.information)))
+    colour = np.maximum(np.diag(covariance) / single, 1.0)
+    for k, first in enumerate((index % cols < cols // 2, index // cols < rows // 2)):
+        halves = [weights[part].sum(axis=0) for part in (first, ~first)]
+        if not all(well_posed(half) for half in halves):
+            continue
+        inverses = [_inverse(half) for half in halves]
+        parts = [scores[first], scores[~first]]
+        steps = [-inv @ part.sum(axis=0) for inv, part in zip(inverses, parts, strict=True)]
+        spreads = [np.diag(_sandwich(p, inv)) for inv, p in zip(inverses, parts, strict=True)]
+        difference[k] = steps[0] - steps[1]
+        variance[k] = (spreads[0] + spreads[1]) * colour
     return difference, variance
 
 
-def block_energies(template: Template, image: Image, alignment: Alignment) -> Array | None:
-    """(16, 16) mean squared residual over parts of the reference; NaN where they do not overlap
-    with the image.
+def _with_shear(look: _Look) -> tuple[Array, Array]:
+    """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
+    cols = look.window.cols.stop - look.window.cols.start
+    y = np.repeat(look.window.y, cols)
+    powers = np.stack([np.ones_like(y), y], axis=1)
+    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
+    whole = (_weights(look).reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
+    information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
+    scaled = information / np.outer(scale, scale)
+    if len(look.window.y) < _LEAST_ROWS or np.linalg.cond(scaled) > 1e6:
+        return np.full(4, np.nan), np.full((4, 4), np.inf)
+    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    scores = (powers[:, :, None] * look.fit.scores[:, None, :]).reshape(-1, 4)
+    step = -inverse @ scores.sum(axis=0)
+    joint = np.append(look.shift + step[:2], step[2:])
+    return joint, _sandwich(_blocks(look, scores), inverse)
 
-    For comparing rival shifts of the same two pictures: a paired test over blocks tells whether one
+
+def tile_energies(level: Level, image: Pyramid, shift_px: Array) -> Array | None:
+    """(rows, cols) mean squared residual of each tile of the reference at a shift; NaN where they
+    do not overlap with the image.
+
+    For comparing rival shifts of the same two pictures: a paired test over tiles tells whether one
     explains the image better than chance and model error allow.
     """
-    window = overlap_window(template.smooth, image, alignment.shift_px)
-    if window is None:
+    mean = float(image.at(level.factor).mean(dtype=np.float64))
+    look = _look(level, image, shift_px / level.factor, mean, None)
+    if look is None:
         return None
-    seen = _sampled(window, image, alignment.shift_px)
-    gain, offset = np.float32(alignment.gain), np.float32(alignment.offset)
-    error = seen - gain * window.of(template.smooth) - offset
-    full: Image = np.full(template.smooth.shape, np.nan, dtype=np.float32)
-    window.of(full)[:] = error**2
-    height, width = (n // 16 for n in template.smooth.shape)
-    cells = full[: 16 * height, : 16 * width].reshape(16, height, 16, width)
-    return np.asarray(cells.mean(axis=(1, 3)), dtype=np.float64)
+    energies = np.full(level.gram.shape[:2], np.nan)
+    left = residuals(look.geometry, look.sums, look.fit) / level.gram[0, 0, 3, 3]
+    energies[look.window.rows, look.window.cols] = left.reshape(len(look.window.y), -1)
+    return energies

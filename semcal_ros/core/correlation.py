@@ -8,14 +8,18 @@ correlation does, and its heights can be compared with each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import cast
 
 import cv2
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-__all__ = ["CoarsePeak", "coarse_peaks"]
+from semcal_ros.core.tiles import Pyramid
+
+__all__ = ["CoarsePeak", "CoarseReference", "coarse_peaks"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -55,18 +59,74 @@ class CoarsePeak:
         return self.significance >= _SIGNIFICANT or self.correlation >= _HIGH
 
 
-def coarse_peaks(
-    reference: Image, image: Image, min_overlap: float, guess_px: Array
-) -> list[CoarsePeak]:
+@dataclass(frozen=True)
+class _Half:
+    """All that one picture contributes to the surface of a pair of sizes."""
+
+    reduced: Image
+    spectrum: NDArray[np.complex64]
+    sums: Image
+    deviation: Image
+
+
+@dataclass(frozen=True)
+class _Geometry:
+    """What a surface looks like for two sizes.
+
+    ``there`` and ``here`` are the first and last-plus-one samples of reference and image that
+    overlap at each shift, ``count`` (rows, cols) the overlapping samples, ``root`` their square root,
+    ``allowed`` whether they are enough, ``size`` that of the Fourier transforms.
+    """
+
+    shift_x: NDArray[np.intp]
+    shift_y: NDArray[np.intp]
+    here: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
+    there: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
+    count: Image
+    root: Image
+    allowed: NDArray[np.bool_]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class CoarseReference:
+    """A reference picture for :func:`coarse_peaks`.
+
+    Parameters
+    ----------
+    pyramid
+        The grey picture.
+    min_overlap
+        Shifts are searched whose overlap is at least this fraction of the smaller picture, per axis
+        and in area.
+    """
+
+    pyramid: Pyramid
+    min_overlap: float
+    # Everything about the reference for one reduction and one size of image.
+    _known: dict[tuple[int, tuple[int, ...]], _Half] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def half(self, factor: int, image_shape: tuple[int, ...]) -> _Half | None:
+        """The reference's part of the surface, computed once."""
+        key = factor, image_shape
+        if key not in self._known:
+            small = _flat(self.pyramid.at(factor))
+            geometry = _geometry(small.shape, image_shape, self.min_overlap)
+            if geometry is None:
+                return None
+            self._known[key] = _half(small, geometry, *geometry.here)
+        return self._known[key]
+
+
+def coarse_peaks(reference: CoarseReference, image: Pyramid, guess_px: Array) -> list[CoarsePeak]:
     """Local maxima of the correlation, best first, down to half of the height of the best.
 
     Parameters
     ----------
     reference, image
         Pictures of the same scale; sizes may differ.
-    min_overlap
-        Shifts are searched whose overlap is at least this fraction of the smaller picture, per axis
-        and in area.
     guess_px
         (2,) predicted shift, near which peaks are listed even if many others are higher.
 
@@ -75,12 +135,11 @@ def coarse_peaks(
     list
         Empty where no shift stands out, not even at half of the full resolution.
     """
-    longest = max(*reference.shape, *image.shape)
+    longest = max(*reference.pyramid.full.shape, *image.full.shape)
     best: list[CoarsePeak] = []
     for level in _LEVELS_PX:
-        factor = max(1, int(np.ceil(longest / level)))
-        pair = _reduced(reference, factor), _reduced(image, factor)
-        peaks = _peaks_at(*pair, factor, min_overlap, guess_px)
+        factor = 1 << max(0, int(np.ceil(np.log2(longest / level))))
+        peaks = _peaks_at(reference, image, factor, guess_px)
         if peaks and (not best or peaks[0].significance > best[0].significance):
             best = peaks
         if (peaks and peaks[0].significance >= _SIGNIFICANT) or factor == 1:
@@ -88,36 +147,39 @@ def coarse_peaks(
     return best if best and best[0].significant else []
 
 
-def _reduced(image: Image, factor: int) -> Image:
-    """Area-averaged, with shading removed: only structure below an eighth of the field is
-    compared.
-    """
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    small = image[: height * factor, : width * factor]
-    if factor > 1:
-        reduced = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
-        small = np.asarray(reduced, dtype=np.float32)
-    background = cv2.GaussianBlur(small, (0, 0), max(height, width) / 16.0)
+def _flat(picture: NDArray[np.generic]) -> Image:
+    """Shading removed: only structure below an eighth of the field is compared."""
+    small = np.asarray(picture, dtype=np.float32)
+    sigma = max(small.shape) / 16.0
+    # The shading is smooth: a quarter of the pixels tell it.
+    tiny = cv2.resize(small, (0, 0), fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(tiny, (0, 0), 0.25 * sigma)
+    background = cv2.resize(smooth, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(small - background, dtype=np.float32)
 
 
 def _peaks_at(
-    reference: Image, image: Image, factor: int, min_overlap: float, guess_px: Array
+    reference: CoarseReference, image: Pyramid, factor: int, guess_px: Array
 ) -> list[CoarsePeak]:
-    ncc, overlap, origin = _surface(reference, image, min_overlap)
-    if ncc.size == 0 or not np.any(ncc > 0.0):
+    small = _flat(image.at(factor))
+    before = reference.half(factor, small.shape)
+    if before is None:
         return []
+    geometry = _geometry(before.reduced.shape, small.shape, reference.min_overlap)
+    assert geometry is not None
+    now = _half(small, geometry, *geometry.there)
+    ncc = _surface(before, now, geometry)
     # The spread of a chance correlation grows as the overlap shrinks.
-    score = np.arctanh(np.clip(ncc, -0.999999, 0.999999)) * np.sqrt(overlap)
-    searched = score[overlap >= min_overlap * min(reference.size, image.size)]
-    if searched.size == 0:
-        return []
-    spread = 1.4826 * float(np.median(np.abs(searched - np.median(searched))))
+    score = ncc * geometry.root
     top = float(score.max())
-    single = score.astype(np.float32)
-    local = cv2.dilate(single, np.ones((5, 5), np.uint8)) <= single
-    rows, cols = np.nonzero(local & (score >= 0.5 * top) & (score > 0.0))
+    if not top > 0.0:
+        return []
+    searched = score[::4, ::2][geometry.allowed[::4, ::2]]
+    spread = 1.4826 * float(np.median(np.abs(searched - np.median(searched))))
+    local = cv2.dilate(score, np.ones((5, 5), np.uint8)) <= score
+    rows, cols = np.nonzero(local & (score >= np.float32(0.5 * top)))
     highest = np.argsort(-score[rows, cols], kind="stable")
+    origin = int(geometry.shift_x[0]), int(geometry.shift_y[0])
     away = np.hypot(
         cols + origin[0] - guess_px[0] / factor, rows + origin[1] - guess_px[1] / factor
     )
@@ -133,7 +195,7 @@ def _peaks_at(
     return peaks
 
 
-def _vertex(score: Array, row: int, col: int) -> tuple[float, float]:
+def _vertex(score: Image, row: int, col: int) -> tuple[float, float]:
     """Vertex of the parabolas through the maximum and its neighbours along each axis."""
 
     def along(before: float, centre: float, after: float) -> float:
@@ -162,40 +224,66 @@ def _axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[NDArray[n
     return shifts[keep], first[keep], last[keep]
 
 
-def _box_sums(
-    values: Array, rows: tuple[NDArray[np.intp], ...], cols: tuple[NDArray[np.intp], ...]
-) -> Array:
-    table = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
-    np.cumsum(np.cumsum(values, axis=0), axis=1, out=table[1:, 1:])
-    strips = table[rows[1]] - table[rows[0]]
-    return np.asarray(strips[:, cols[1]] - strips[:, cols[0]])
-
-
-def _surface(
-    reference: Image, image: Image, min_overlap: float
-) -> tuple[Array, Array, tuple[int, int]]:
-    """Correlation coefficients, overlap in samples, and the (x, y) shift of element [0, 0]."""
-    shift_y, first_y, last_y = _axis(reference.shape[0], image.shape[0], min_overlap)
-    shift_x, first_x, last_x = _axis(reference.shape[1], image.shape[1], min_overlap)
+@lru_cache(maxsize=8)
+def _geometry(
+    reference: tuple[int, ...], image: tuple[int, ...], min_overlap: float
+) -> _Geometry | None:
+    shift_y, first_y, last_y = _axis(reference[0], image[0], min_overlap)
+    shift_x, first_x, last_x = _axis(reference[1], image[1], min_overlap)
     if shift_x.size == 0 or shift_y.size == 0:
-        return np.zeros((0, 0)), np.zeros((0, 0)), (0, 0)
+        return None
+    # Shifts that are not looked at may wrap around.
     size = [
-        scipy.fft.next_fast_len(a + b - 1, real=True)
-        for a, b in zip(reference.shape, image.shape, strict=True)
+        scipy.fft.next_fast_len(max(a + int(s[-1]), b - int(s[0])), real=True)
+        for a, b, s in zip(reference, image, (shift_y, shift_x), strict=True)
     ]
-    product = scipy.fft.rfft2(image, size) * np.conj(scipy.fft.rfft2(reference, size))
-    cross = scipy.fft.irfft2(product, size)[np.ix_(shift_y, shift_x)].astype(np.float64)
-
-    here_y, here_x = (first_y, last_y), (first_x, last_x)
-    there_y, there_x = (first_y + shift_y, last_y + shift_y), (first_x + shift_x, last_x + shift_x)
-    r, i = reference.astype(np.float64), image.astype(np.float64)
     count = np.outer(last_y - first_y, last_x - first_x).astype(np.float64)
-    sum_r, sum_i = _box_sums(r, here_y, here_x), _box_sums(i, there_y, there_x)
-    energy_r = _box_sums(r * r, here_y, here_x) - sum_r * sum_r / count
-    energy_i = _box_sums(i * i, there_y, there_x) - sum_i * sum_i / count
-    floor = 1e-9 * max(float(np.sum(r * r)), float(np.sum(i * i)), 1e-300)
-    scale = np.sqrt(np.maximum(energy_r, floor) * np.maximum(energy_i, floor))
-    ncc = (cross - sum_r * sum_i / count) / scale
-    smaller = float(min(reference.size, image.size))
-    ncc[count < min_overlap * smaller] = 0.0
-    return ncc, count, (int(shift_x[0]), int(shift_y[0]))
+    smaller = float(min(reference[0] * reference[1], image[0] * image[1]))
+    return _Geometry(
+        shift_x=shift_x,
+        shift_y=shift_y,
+        here=((first_y, last_y), (first_x, last_x)),
+        there=((first_y + shift_y, last_y + shift_y), (first_x + shift_x, last_x + shift_x)),
+        count=count.astype(np.float32),
+        root=np.sqrt(count).astype(np.float32),
+        allowed=count >= min_overlap * smaller,
+        size=(size[0], size[1]),
+    )
+
+
+def _half(
+    picture: Image,
+    geometry: _Geometry,
+    rows: tuple[NDArray[np.intp], ...],
+    cols: tuple[NDArray[np.intp], ...],
+) -> _Half:
+    table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    sums = _box_sums(cast("Array", table), rows, cols)
+    variance = _box_sums(cast("Array", squares), rows, cols) - sums**2 / geometry.count
+    floor = 1e-9 * max(float(variance.max()), 1e-30)
+    return _Half(
+        picture,
+        scipy.fft.rfft2(picture, geometry.size),
+        sums,
+        np.sqrt(np.maximum(variance, np.float32(floor))),
+    )
+
+
+def _box_sums(
+    table: Array,
+    rows: tuple[NDArray[np.intp], ...],
+    cols: tuple[NDArray[np.intp], ...],
+) -> Image:
+    strips = table[rows[1]] - table[rows[0]]
+    return np.asarray(strips[:, cols[1]] - strips[:, cols[0]], dtype=np.float32)
+
+
+def _surface(reference: _Half, image: _Half, geometry: _Geometry) -> Image:
+    """Correlation coefficients at all shifts; 0 where too little overlaps."""
+    size = geometry.size
+    wrapped = scipy.fft.irfft2(image.spectrum * np.conj(reference.spectrum), size)
+    cross = wrapped[geometry.shift_y % size[0]][:, geometry.shift_x % size[1]]
+    cross -= reference.sums * image.sums / geometry.count
+    cross /= reference.deviation * image.deviation
+    cross[~geometry.allowed] = 0.0
+    return np.asarray(cross, dtype=np.float32)

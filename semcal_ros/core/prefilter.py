@@ -1,10 +1,10 @@
 """Noise level of a picture, and the smoothing that makes its shift best determined.
 
-For two pictures with the same signal spectrum S and white noise N each, the variance of a shift
+For two pictures with the same signal spectrum S and white noise N and M, the variance of a shift
 estimated through the power weighting ``psi`` is (Knapp and Carter 1976,
 doi:10.1109/TASSP.1976.1162830)
 
-    var(psi)  ~  integral w^2 psi^2 (2 S N + N^2)  /  (integral w^2 psi S)^2
+    var(psi)  ~  integral w^2 psi^2 (S (N + M) + N M)  /  (integral w^2 psi S)^2
 
 A Gaussian of width sigma applied to both pictures is ``psi = exp(-w^2 sigma^2)``; the best sigma is
 looked up on the radial spectrum.
@@ -13,6 +13,7 @@ looked up on the radial spectrum.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _CROP_PX = 256
-_NOISE_CROP_PX = 128
+_NOISE_CROP_PX = 64
 _BINS = 48
 _SIGMAS_PX = np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)])
 
@@ -49,19 +50,27 @@ class PictureStatistics:
     sigma_px: float
 
 
-def _radial_spectrum(image: Image, crop_px: int) -> tuple[Array, Array, Array]:
+@lru_cache(maxsize=8)
+def _rings(rows: int, cols: int) -> tuple[Array, NDArray[np.intp], Array, Array]:
+    """Window, ring of each coefficient, radial frequency (rad/px) and size of each ring."""
+    window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1])
+    radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None, :])
+    ring = np.minimum((radius / np.sqrt(0.5) * _BINS).astype(int), _BINS - 1).ravel()
+    count = np.bincount(ring, minlength=_BINS).astype(np.float64)
+    middle = 2.0 * np.pi * np.sqrt(0.5) * (np.arange(_BINS) + 0.5) / _BINS
+    return window, ring, middle, count
+
+
+def _radial_spectrum(image: NDArray[np.generic], crop_px: int) -> tuple[Array, Array, Array]:
     """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
     rows, cols = min(image.shape[0], crop_px), min(image.shape[1], crop_px)
     top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
     crop = image[top : top + rows, left : left + cols].astype(np.float64)
-    window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1])
+    window, ring, middle, count = _rings(rows, cols)
     crop = (crop - float(np.sum(crop * window) / window.sum())) * window
-    power = np.abs(scipy.fft.rfft2(crop)) ** 2 / float(np.sum(window**2))
-    radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None, :])
-    ring = np.minimum((radius / np.sqrt(0.5) * _BINS).astype(int), _BINS - 1).ravel()
-    count = np.bincount(ring, minlength=_BINS).astype(np.float64)
-    total = np.bincount(ring, weights=power.ravel(), minlength=_BINS)
-    middle = 2.0 * np.pi * np.sqrt(0.5) * (np.arange(_BINS) + 0.5) / _BINS
+    spectrum = scipy.fft.rfft2(crop).ravel()
+    power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
+    total = np.bincount(ring, weights=power, minlength=_BINS)
     filled = count > 0
     return middle[filled], (total[filled] / count[filled]), count[filled]
 
@@ -71,13 +80,16 @@ def _floor(w: Array, power: Array, count: Array) -> float:
     return float(np.average(power[corners], weights=count[corners]))
 
 
-def noise_variance(image: Image) -> float:
+def noise_variance(image: NDArray[np.generic]) -> float:
     """Variance of the white part of ``image`` per pixel, from its middle."""
     return _floor(*_radial_spectrum(image, _NOISE_CROP_PX))
 
 
-def picture_statistics(image: Image) -> PictureStatistics:
+def picture_statistics(image: NDArray[np.generic], averaged: float = 1.0) -> PictureStatistics:
     """Noise, signal and the best smoothing of ``image`` (at least 16 x 16 px).
+
+    ``averaged`` is the number of pictures that ``image`` is the mean of: another single picture has
+    so many times its noise variance.
 
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; a picture with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
@@ -91,7 +103,8 @@ def picture_statistics(image: Image) -> PictureStatistics:
     if signal_variance <= 0.0 or noise <= 0.0:
         return PictureStatistics(noise, signal_variance, 0.0)
     psi = np.exp(-np.outer(_SIGMAS_PX**2, w**2))
-    numerator = psi**2 @ (count * w**2 * (2.0 * signal * noise + noise**2))
+    single = noise * averaged
+    numerator = psi**2 @ (count * w**2 * ((noise + single) * signal + noise * single))
     denominator = psi @ (count * w**2 * signal)
     best = int(np.argmin(numerator / denominator**2))
     return PictureStatistics(noise, signal_variance, float(_SIGMAS_PX[best]))

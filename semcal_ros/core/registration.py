@@ -13,17 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.alignment import Alignment, align, block_energies
-from semcal_ros.core.correlation import CoarsePeak, coarse_peaks
+from semcal_ros.core.alignment import Alignment, align, tile_energies
+from semcal_ros.core.correlation import CoarsePeak, CoarseReference, coarse_peaks
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.prefilter import (
-    gaussian_taps,
-    noise_variance,
-    picture_statistics,
-    smoothed,
-)
-from semcal_ros.core.subpixel import derivative_taps, gradients
-from semcal_ros.core.template import Template
+from semcal_ros.core.prefilter import gaussian_taps, noise_variance, picture_statistics
+from semcal_ros.core.tiles import Level, Pyramid, make_level
 
 __all__ = [
     "Reference",
@@ -35,11 +29,16 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+Picture = NDArray[np.generic]
 #: Valid rectangle (left, top, right, bottom) in px, right and bottom exclusive.
 Region = tuple[int, int, int, int]
 
 _SMALLEST_PX = 48
+# Levels of the pyramid keep at least that many px along the shorter side.
+_SMALLEST_LEVEL_PX = 160
+_SATURATION_SAMPLES = 256
+_NATIVE = ("uint8", "uint16", "float32")
+_NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,11 @@ class Registration:
     covariance
         (2, 2) of ``shift_px`` in px^2, from the noise of both pictures; infinite where nothing
         could be measured.
+    joint_px, joint_covariance
+        (4,) shift of the image's middle row, and by how much more the last row of the image is
+        shifted than the first (what drifts during a scan is sheared and stretched), estimated
+        together, and their (4, 4) covariance; NaN and infinite where too few rows are compared.
+        ``shift_px`` is the better shift where there is no shear.
     gain, offset
         Image grey levels per reference grey level, and at reference level 0.
     residual_rms
@@ -99,6 +103,8 @@ class Registration:
 
     shift_px: Array
     covariance: Array
+    joint_px: Array
+    joint_covariance: Array
     gain: float
     offset: float
     residual_rms: float
@@ -115,30 +121,43 @@ class Reference:
     """A reference picture with everything about it that does not depend on the image.
 
     Made by :func:`prepare_reference`.
+
+    Attributes
+    ----------
+    region
+        The part of the picture that is compared.
+    coarse
+        Its side of the search over all shifts.
+    levels
+        Its tiles from the coarsest resolution to the finest.
+    noise_variance
+        Of its white part per pixel.
+    complaint
+        Why nothing can be registered against it, or an empty string.
     """
 
     region: Region
-    plain: Image
-    template: Template | None
+    coarse: CoarseReference
+    levels: tuple[Level, ...]
     noise_variance: float
     complaint: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)
 
 
-def _gray(image: ArrayLike) -> tuple[Image, NDArray[np.generic]]:
+def _gray(image: ArrayLike) -> Picture:
     picture = np.asarray(image)
     if picture.ndim == 3 and picture.shape[2] == 3:
-        return picture.mean(axis=2, dtype=np.float32), picture
+        return np.asarray(picture.mean(axis=2, dtype=np.float32))
     if picture.ndim != 2 or picture.dtype.kind not in "uif":
         raise InvalidValueError(
             f"an image of shape {picture.shape} and type {picture.dtype}",
             expected="a 2-D image, or one with three channels, of numbers",
         )
-    return np.asarray(picture, dtype=np.float32), picture
+    return picture if picture.dtype.name in _NATIVE else picture.astype(np.float32)
 
 
-def _cropped(image: ArrayLike, region: Region | None) -> tuple[Image, NDArray[np.generic], Region]:
-    gray, picture = _gray(image)
+def _cropped(image: ArrayLike, region: Region | None) -> tuple[Picture, Region]:
+    gray = _gray(image)
     height, width = gray.shape
     if region is None:
         region = (0, 0, width, height)
@@ -148,29 +167,46 @@ def _cropped(image: ArrayLike, region: Region | None) -> tuple[Image, NDArray[np
             f"region {region} of an image of {width} x {height} px",
             expected="(left, top, right, bottom) inside of the image",
         )
-    return gray[top:bottom, left:right], picture[top:bottom, left:right], region
+    return gray[top:bottom, left:right], region
 
 
-def _complaint(gray: Image, picture: NDArray[np.generic], settings: RegistrationSettings) -> str:
+def _complaint(gray: Picture, settings: RegistrationSettings) -> str:
     """Why a picture alone cannot be registered, or an empty string."""
     if min(gray.shape) < _SMALLEST_PX:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
-    lowest, highest = float(gray.min()), float(gray.max())
-    if not np.isfinite(lowest + highest):
+    if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
         return "picture holds values that are not finite"
-    if highest == lowest:
+    stride = max(1, min(gray.shape) // _SATURATION_SAMPLES)
+    some = np.ascontiguousarray(gray[::stride, ::stride])
+    lowest, highest = some.min(), some.max()
+    if lowest == highest:
         return f"blank picture (all pixels at {highest:g})"
     for end in (lowest, highest):
-        share = float(np.count_nonzero(gray == np.float32(end))) / gray.size
+        share = float(np.count_nonzero(some == end)) / some.size
         if share > settings.max_saturated:
             return f"saturated picture ({100.0 * share:.0f} % of the pixels at {end:g})"
     return ""
 
 
 def prepare_reference(
-    image: ArrayLike, *, region: Region | None = None, settings: RegistrationSettings | None = None
+    image: ArrayLike,
+    *,
+    region: Region | None = None,
+    settings: RegistrationSettings | None = None,
+    averaged: float = 1.0,
 ) -> Reference:
     """Precompute what :func:`register` needs of a reference that is used many times.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3) picture.
+    region
+        Its valid rectangle; None for all of it.
+    settings
+        Limits of acceptance.
+    averaged
+        Number of pictures that ``image`` is the mean of, at least 1.
 
     Raises
     ------
@@ -178,27 +214,49 @@ def prepare_reference(
         If the image is no picture, or the region does not lie in it.
     """
     limits = settings or RegistrationSettings()
-    gray, picture, inside = _cropped(image, region)
-    complaint = _complaint(gray, picture, limits)
+    gray, inside = _cropped(image, region)
+    pyramid = Pyramid(gray)
+    coarse = CoarseReference(pyramid, limits.min_overlap)
+    complaint = _complaint(gray, limits)
     if complaint:
-        return Reference(inside, gray, None, 0.0, complaint, limits)
-    statistics = picture_statistics(gray)
-    sigma = statistics.sigma_px
-    smooth = smoothed(gray, sigma)
-    dx, dy = gradients(smooth)
-    taps = gaussian_taps(sigma)
-    sloped = np.convolve(taps, derivative_taps())
-    gradient_noise = statistics.noise_variance * float(np.sum(sloped**2) * np.sum(taps**2))
-    noise = statistics.noise_variance * float(np.sum(taps**2)) ** 2
-    template = Template(smooth, dx, dy, sigma, noise, gradient_noise)
-    return Reference(inside, gray, template, statistics.noise_variance, "", limits)
+        return Reference(inside, coarse, (), 0.0, complaint, limits)
+    statistics = picture_statistics(gray, averaged)
+    levels = []
+    for factor in _factors(gray.shape):
+        level = make_level(pyramid, factor, statistics.sigma_px / factor)
+        if level is not None:
+            levels.append(level)
+    if not levels:
+        complaint = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
+    return Reference(inside, coarse, tuple(levels), statistics.noise_variance, complaint, limits)
+
+
+def _factors(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Reductions from the coarsest level to full resolution."""
+    factor, factors = 1, [1]
+    while min(shape) // (2 * factor) >= _SMALLEST_LEVEL_PX:
+        factor *= 2
+        factors.insert(0, factor)
+    return tuple(factors)
 
 
 def _refused(reason: str) -> Registration:
     nan = float("nan")
     nothing = np.full(2, np.nan)
     return Registration(
-        nothing, np.full((2, 2), np.inf), nan, nan, nan, nan, 0.0, False, 0, False, reason
+        shift_px=nothing,
+        covariance=np.full((2, 2), np.inf),
+        joint_px=np.full(4, np.nan),
+        joint_covariance=np.full((4, 4), np.inf),
+        gain=nan,
+        offset=nan,
+        residual_rms=nan,
+        likeness=nan,
+        overlap=0.0,
+        converged=False,
+        iterations=0,
+        accepted=False,
+        reason=reason,
     )
 
 
@@ -244,36 +302,39 @@ def register(
     else:
         prepared = prepare_reference(reference, region=reference_region, settings=settings)
     limits = prepared.settings
-    gray, picture, inside = _cropped(image, image_region)
+    gray, inside = _cropped(image, image_region)
     for name, complaint in (
         ("reference", prepared.complaint),
-        ("image", _complaint(gray, picture, limits)),
+        ("image", _complaint(gray, limits)),
     ):
         if complaint:
             return _refused(f"{name}: {complaint}")
-    template = prepared.template
-    assert template is not None
     origin = np.subtract(inside[:2], prepared.region[:2]).astype(np.float64)
     guess = np.asarray(guess_px, dtype=np.float64) - origin
-    peaks = coarse_peaks(prepared.plain, gray, limits.min_overlap, guess)
+    pyramid = Pyramid(gray)
+    peaks = coarse_peaks(prepared.coarse, pyramid, guess)
     if not peaks:
         return _refused("no shift stands out: featureless, or another place")
-    smooth = smoothed(gray, template.sigma_px)
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    found = _choose(template, limits, smooth, peaks, guess, spread)
-    if isinstance(found, str):
-        return _refused(found)
-    return _judged(prepared, gray, *found, origin)
+    peak = _choose(prepared, pyramid, peaks, guess, spread)
+    if isinstance(peak, str):
+        return _refused(peak)
+    fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
+    if fine is None:
+        return _refused(_NOTHING)
+    return _judged(prepared, gray, peak, fine, origin)
 
 
 def _judged(
-    reference: Reference, gray: Image, peak: CoarsePeak, fine: Alignment, origin: Array
+    reference: Reference, gray: Picture, peak: CoarsePeak, fine: Alignment, origin: Array
 ) -> Registration:
     likeness = _likeness(reference, gray, fine)
     reason = _objection(reference.settings, peak, fine, likeness)
     return Registration(
         shift_px=fine.shift_px + origin,
         covariance=fine.covariance,
+        joint_px=fine.joint_px + np.append(origin, [0.0, 0.0]),
+        joint_covariance=fine.joint_covariance,
         gain=fine.gain,
         offset=fine.offset,
         residual_rms=fine.residual_rms,
@@ -286,11 +347,10 @@ def _judged(
     )
 
 
-def _likeness(reference: Reference, gray: Image, fine: Alignment) -> float:
+def _likeness(reference: Reference, gray: Picture, fine: Alignment) -> float:
     """Correlation that the noise-free pictures would have."""
-    assert reference.template is not None
-    passed = float(np.sum(gaussian_taps(reference.template.sigma_px) ** 2)) ** 2
-    noise = reference.template.noise
+    passed = float(np.sum(gaussian_taps(reference.levels[-1].sigma_px) ** 2)) ** 2
+    noise = reference.noise_variance * passed
     image_noise = noise_variance(gray) * passed
     signal_reference = max(fine.reference_variance - noise, 0.02 * fine.reference_variance)
     signal_image = max(fine.image_variance - image_noise, 0.02 * fine.image_variance)
@@ -321,36 +381,45 @@ def _objection(
 
 
 def _choose(
-    template: Template,
-    limits: RegistrationSettings,
-    smooth: Image,
+    reference: Reference,
+    pyramid: Pyramid,
     peaks: list[CoarsePeak],
     guess: Array,
     spread: Array | None,
-) -> tuple[CoarsePeak, Alignment] | str:
-    """The peak to believe with its refinement, or the reason why none can be believed."""
+) -> CoarsePeak | str:
+    """The peak to believe, or the reason why none can be believed."""
+    limits, level = reference.settings, reference.levels[0]
     rivals = [p for p in peaks if p.correlation >= limits.rival_height * peaks[0].correlation]
     if len(rivals) > 1 and spread is not None:
         near = [p for p in rivals if _within(p, guess, spread)]
         # Only rivals that the prediction allows count, as long as it allows any.
         rivals = near or rivals
-    first = align(template, smooth, np.array(rivals[0].shift_px))
-    if first is None:
-        return "nothing to compare: featureless in one direction, or too little overlap"
-    best = (rivals[0], first)
-    for peak in rivals[1:]:
-        other = align(template, smooth, np.array(peak.shift_px))
-        if other is None or _same(best[1], other):
+    best = rivals[0]
+    if len(rivals) == 1:
+        return best
+    aligned = [align([level], pyramid, np.array(p.shift_px)) for p in rivals]
+    candidates = [
+        (p, found.shift_px)
+        for p, found in zip(rivals, aligned, strict=True)
+        if found is not None and found.converged
+    ]
+    if not candidates:
+        return _NOTHING
+    best, shift = candidates[0]
+    energies = tile_energies(level, pyramid, shift)
+    for peak, other in candidates[1:]:
+        if float(np.max(np.abs(other - shift))) < 0.5 * level.factor:
             continue
-        verdict = _paired(*(block_energies(template, smooth, a) for a in (best[1], other)))
+        theirs = tile_energies(level, pyramid, other)
+        verdict = _paired(energies, theirs)
         if abs(verdict) < limits.rival_deviations:
-            a, b = best[1].shift_px, other.shift_px
             return (
-                f"ambiguous: shifts ({a[0]:.1f}, {a[1]:.1f}) and ({b[0]:.1f}, {b[1]:.1f}) px"
+                f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
+                f" ({other[0]:.1f}, {other[1]:.1f}) px"
                 " explain the picture equally well"
             )
         if verdict < 0.0:
-            best = (peak, other)
+            best, shift, energies = peak, other, theirs
     return best
 
 
@@ -359,10 +428,6 @@ def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:
     away = np.asarray(peak.shift_px) - guess
     widened = spread + np.eye(2) * (0.5 * peak.step_px) ** 2
     return float(away @ np.linalg.solve(widened, away)) <= 9.0
-
-
-def _same(a: Alignment, b: Alignment) -> bool:
-    return float(np.max(np.abs(a.shift_px - b.shift_px))) < 0.5
 
 
 def _paired(first: Array | None, second: Array | None) -> float:

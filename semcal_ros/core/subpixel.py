@@ -10,12 +10,13 @@ version 4 rounds float maps to 1/32 px.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MARGIN", "derivative_taps", "gradients", "shifted_patch"]
+__all__ = ["MARGIN", "derivative_taps", "gradients", "sampled"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -71,27 +72,53 @@ def gradients(image: Image) -> tuple[Image, Image]:
     return np.asarray(dx, dtype=np.float32), np.asarray(dy, dtype=np.float32)
 
 
-def shifted_patch(
-    image: Image, left: int, top: int, width: int, height: int, fraction: tuple[float, float]
+def sampled(
+    image: NDArray[np.generic],
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    fraction: Array,
+    taps: tuple[Array, Array],
+    delta: float,
 ) -> Image:
-    """``image`` sampled at ``(left + col + fraction[0], top + row + fraction[1])``.
+    """``image`` filtered and sampled at ``corner + (col, row) + fraction``, plus ``delta``.
 
-    The patch must lie at least :data:`MARGIN` px inside the image on all sides; the fractions lie
-    in [-1, 1].
+    Parameters
+    ----------
+    image
+        (h, w) of uint8, uint16 or float32.
+    corner, size
+        (left, top) and (width, height) of the patch, which must lie inside of the image.
+    fraction
+        (2,) sub-pixel shift (x, y), each in [-1, 1].
+    taps
+        Odd numbers of weights of the filter along x and along y.
+    delta
+        Added to the result.
+
+    Notes
+    -----
+    What the filters reach outside of the image is mirrored.
     """
-    whole = np.floor(fraction).astype(int)
-    x0, y0 = left + int(whole[0]), top + int(whole[1])
-    source = image[
-        max(y0 + _FIRST_TAP, 0) : y0 + height + MARGIN,
-        max(x0 + _FIRST_TAP, 0) : x0 + width + MARGIN,
+    left, top = corner
+    width, height = size
+    below = np.floor(fraction).astype(int)
+    kernels = [
+        np.convolve(tap, _shift_taps(float(part)))
+        for tap, part in zip(taps, fraction - below, strict=True)
     ]
+    before = [-_FIRST_TAP + len(tap) // 2 for tap in taps]
+    after = [len(k) - 1 - b for k, b in zip(kernels, before, strict=True)]
+    x0, y0 = left + int(below[0]), top + int(below[1])
+    from_x, from_y = max(x0 - before[0], 0), max(y0 - before[1], 0)
+    source = image[from_y : y0 + height + after[1], from_x : x0 + width + after[0]]
     filtered = cv2.sepFilter2D(
-        source,
+        cast("Image", source),
         cv2.CV_32F,
-        _shift_taps(fraction[0] - float(whole[0])),
-        _shift_taps(fraction[1] - float(whole[1])),
-        anchor=(-_FIRST_TAP, -_FIRST_TAP),
+        kernels[0],
+        kernels[1],
+        anchor=(before[0], before[1]),
+        delta=delta,
         borderType=cv2.BORDER_REFLECT_101,
     )
-    x, y = min(-_FIRST_TAP, x0), min(-_FIRST_TAP, y0)
-    return np.asarray(filtered[y : y + height, x : x + width], dtype=np.float32)
+    patch = filtered[y0 - from_y : y0 - from_y + height, x0 - from_x : x0 - from_x + width]
+    return np.asarray(patch, dtype=np.float32)

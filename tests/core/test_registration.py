@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration import Registration, prepare_reference, register
-from semcal_ros.core.subpixel import gradients, shifted_patch
+from semcal_ros.core.subpixel import gradients, sampled
 
 SIZE = 192
 TEXTURE = Texture(1)
@@ -211,6 +211,7 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures() -> None:
     assert float(np.sqrt(np.mean((dx - exact_x)[inner] ** 2))) < 8e-4
     assert float(np.sqrt(np.mean((dy - exact_y)[inner] ** 2))) < 8e-4
     for fraction in ((0.3, -0.4), (0.5, 0.5), (-0.9, 0.0)):
-        patch = shifted_patch(picture, 10, 12, 100, 90, fraction)
+        plain = np.array([1.0])
+        patch = sampled(picture, (10, 12), (100, 90), np.array(fraction), (plain, plain), 0.0)
         moved = TEXTURE.view((-fraction[0], -fraction[1]), 128)[12:102, 10:110]
         assert float(np.sqrt(np.mean((patch - moved) ** 2))) < 2e-3

@@ -1,0 +1,266 @@
+"""What the commands that follow the drift of a recording share."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NoReturn
+
+import click
+import numpy as np
+
+from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.calibration import Calibration
+from semcal_ros.cli.common import progress
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift_path import DriftPath, path_of_updates
+from semcal_ros.core.drift_types import DriftUpdate
+from semcal_ros.core.errors import BagError
+from semcal_ros.files.recordings import Frame, Recording
+
+__all__ = [
+    "Job",
+    "Survey",
+    "camera_of",
+    "echo_nominal_unit",
+    "echo_states",
+    "kind_of",
+    "live_option",
+    "rate_text",
+    "recording_path",
+    "start_time_s",
+    "surveyed",
+]
+
+_LISTED = 12
+# Grey levels of more than 8 bits are shown with these quantiles as black and white.
+_BLACK_WHITE = (0.001, 0.999)
+_NUMBER = re.compile(r"-?\d[\d.]*")
+
+live_option = click.option(
+    "--live", is_flag=True, help="What was known live, without hindsight of later frames."
+)
+
+
+def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig) -> ScanCamera:
+    """The calibrated camera of a frame, or the nominal one of the display width."""
+    height, width = frame.image.shape[:2]
+    if model is None:
+        return ScanCamera.nominal(frame.magnification, width, height, config.display_width_m)
+    return model.at(frame.magnification).resized(width, height)
+
+
+def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
+    """Start of the acquisition in seconds after the first frame's stamp."""
+    return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
+
+
+def recording_path(updates: Sequence[DriftUpdate], *, live: bool) -> DriftPath:
+    """Drift of a whole recording from what the tracker said at each frame.
+
+    Parameters
+    ----------
+    updates
+        Of all frames, in their order.
+    live
+        What was known at each frame when it came, without hindsight.
+    """
+    return path_of_updates(updates)
+
+
+def kind_of(update: DriftUpdate) -> str:
+    """The status without the numbers of the single frame, so that frames can be counted by kind."""
+    return _NUMBER.sub("…", update.status)
+
+
+def echo_states(states: Counter[str]) -> None:
+    """Print how many frames had which kind of drift."""
+    for kind, count in states.most_common():
+        click.echo(f"{count} frames {kind}")
+
+
+def echo_nominal_unit(config: MicroscopeConfig, what: str) -> None:
+    """Tell that lengths rest on the display width only."""
+    click.echo(
+        f"note: without --calibration {what} the nominal pixel size of the display width "
+        f"{config.display_width_m:g} m",
+        err=True,
+    )
+
+
+def rate_text(path: DriftPath) -> str:
+    """The drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
+    if len(path) < 2:
+        return ""
+    rate, sigma = 1e9 * path.velocity_m_s[-1], 1e9 * path.velocity_sigma_m_s[-1]
+    known = float(np.min(sigma))
+    # Two digits of the smaller uncertainty.
+    digits = int(np.clip(1 - np.floor(np.log10(known)), 0, 9)) if known > 0.0 else 3
+    parts = [f"{v:.{digits}f} +- {s:.{digits}f}" for v, s in zip(rate, sigma, strict=True)]
+    return f"final drift rate: x {parts[0]}, y {parts[1]} nm/s"
+
+
+# -- frames of one magnification ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """How the frames of a recording are to be read.
+
+    Attributes
+    ----------
+    model
+        Calibration, or None for nominal cameras.
+    microscope
+        Configuration.
+    at
+        The magnification to choose; None where there must be one only.
+    tracker
+        Tracks the chosen frames; None for no drift.
+    """
+
+    model: Calibration | None
+    microscope: MicroscopeConfig
+    at: float | None = None
+    tracker: DriftTracker | None = None
+
+    def camera(self, frame: Frame) -> ScanCamera:
+        """Of a frame."""
+        return camera_of(frame, self.model, self.microscope)
+
+
+@dataclass
+class Survey:
+    """The frames of one magnification, size and encoding in a recording, and their drift.
+
+    Attributes
+    ----------
+    camera
+        Of the first frame.
+    dtype, size
+        Type of the grey levels; (width, height) in px.
+    first_stamp_ns
+        Stamp of the first frame.
+    chosen
+        Numbers of the frames as the recording gives them.
+    times_s
+        Starts of their acquisitions, s after the first stamp.
+    updates
+        Their drift; empty without a tracker.
+    levels
+        Grey levels of each that are shown as black and white, where asked for.
+    other_kind
+        How many frames of the magnification have another size or encoding.
+    """
+
+    camera: ScanCamera
+    dtype: np.dtype[Any]
+    size: tuple[int, int]
+    first_stamp_ns: int
+    chosen: list[int] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+    updates: list[DriftUpdate] = field(default_factory=list)
+    levels: list[tuple[float, float]] = field(default_factory=list)
+    other_kind: int = 0
+
+    @cached_property
+    def path(self) -> DriftPath | None:
+        """Drift of the chosen frames; None without a tracker. For a finished survey."""
+        return recording_path(self.updates, live=False) if self.updates else None
+
+
+def surveyed(
+    opened: Recording, job: Job, *, on_first: Callable[[Frame], None], levels: bool
+) -> Survey:
+    """Read a recording for the first time: choose its frames and track their drift.
+
+    Parameters
+    ----------
+    opened
+        The recording.
+    job
+        What to choose.
+    on_first
+        Called with the first chosen frame, to refuse it before any work is done.
+    levels
+        Whether black and white are wanted.
+
+    Raises
+    ------
+    BagError
+        There are several magnifications and none is chosen, the chosen one is not there, or time
+        runs backwards.
+    """
+    counts: Counter[str] = Counter()
+    wanted = None if job.at is None else _label(job.at)
+    survey: Survey | None = None
+    kind: tuple[object, ...] = ()
+    with progress(opened.frame_count, "drift" if job.tracker else "reading") as bar:
+        for index, frame in enumerate(opened.frames()):
+            bar.update(1)
+            label = _label(frame.magnification)
+            counts[label] += 1
+            if label != (wanted or label) or (wanted is None and len(counts) > 1):
+                continue  # to be refused, or of no interest: only the magnification matters
+            if survey is None:
+                on_first(frame)
+                survey, kind = _begun(frame, job), _kind(frame)
+            if _kind(frame) != kind:
+                survey.other_kind += 1
+                continue
+            _add(survey, index, frame, job)
+            if levels:
+                low, high = np.quantile(frame.image[::4, ::4], _BLACK_WHITE)
+                survey.levels.append((float(low), float(high)))
+    if survey is None or (wanted is None and len(counts) > 1):
+        _refuse_magnifications(opened, job, counts)
+    return survey
+
+
+def _label(magnification: float) -> str:
+    """A magnification as people read it: what a topic repeats may differ in the last digits."""
+    return f"{magnification:.6g}"
+
+
+def _kind(frame: Frame) -> tuple[object, ...]:
+    return (*frame.image.shape, frame.encoding)
+
+
+def _begun(frame: Frame, job: Job) -> Survey:
+    height, width = frame.image.shape[:2]
+    return Survey(job.camera(frame), frame.image.dtype, (width, height), frame.stamp_ns)
+
+
+def _add(survey: Survey, index: int, frame: Frame, job: Job) -> None:
+    time_s = start_time_s(frame, survey.first_stamp_ns, job.microscope)
+    if survey.times_s and time_s < survey.times_s[-1]:
+        raise BagError(
+            f"image {index + 1} was taken {survey.times_s[-1] - time_s:g} s before the one before",
+            expected="images in the order of time",
+            do="record each pass of a replay to a recording of its own",
+        )
+    survey.chosen.append(index)
+    survey.times_s.append(time_s)
+    if job.tracker is not None:
+        update = job.tracker.update(frame.image, time_s, job.camera(frame), job.microscope.scan)
+        survey.updates.append(update)
+
+
+def _refuse_magnifications(opened: Recording, job: Job, counts: Counter[str]) -> NoReturn:
+    labels = sorted(counts, key=float)
+    listed = ", ".join(labels[:_LISTED]) + (f", ... {labels[-1]}" if len(labels) > _LISTED else "")
+    if job.at is None:
+        raise BagError(
+            f"{opened.path} has frames at {len(labels)} magnifications: {listed}",
+            expected="frames of one magnification",
+            do="choose one with --at G",
+        )
+    raise BagError(
+        f"--at {job.at:g}: {opened.path} has no such frames",
+        expected=f"one of {listed}",
+        do="choose one of these magnifications",
+    )

@@ -1,0 +1,342 @@
+"""``semcal stack``."""
+
+from __future__ import annotations
+
+import io
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.cli.common import (
+    config_option,
+    configured,
+    magnification_option,
+    progress,
+    require_folder,
+)
+from semcal_ros.cli.drift_common import (
+    Job,
+    Survey,
+    echo_nominal_unit,
+    echo_states,
+    kind_of,
+    surveyed,
+)
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift_types import DriftSettings
+from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.core.stack import Stack, StackedImage, trusted_frames
+from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.files.recordings import Frame, Recording, open_recording
+
+__all__ = ["command"]
+
+_TIFF = (".tif", ".tiff")
+_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+
+
+@click.command("stack")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Average: .tif (32-bit, with the pixel size) or .png (as deep as the recording).",
+)
+@click.option("--calibration", type=click.Path(path_type=Path), help="Undo distortion, too.")
+@click.option("--sigma", type=click.Path(path_type=Path), help=".tif of its standard error.")
+@click.option("--video", type=click.Path(path_type=Path), help="Stabilised video: .mp4 or .avi.")
+@click.option(
+    "--fps",
+    type=click.FloatRange(0.1, 240.0),
+    default=10.0,
+    show_default=True,
+    help="Of the video.",
+)
+@click.option("--at", type=float, metavar="G", help="Take the frames of this magnification.")
+@click.option("--no-drift", is_flag=True, help="Average the frames where they are.")
+@click.option(
+    "--interpolation",
+    type=click.Choice(["linear", "cubic", "lanczos4"]),
+    default="cubic",
+    show_default=True,
+)
+@config_option
+@magnification_option
+def command(
+    recording: Path,
+    output: Path,
+    calibration: Path | None,
+    sigma: Path | None,
+    video: Path | None,
+    fps: float,
+    at: float | None,
+    no_drift: bool,
+    interpolation: str,
+    config: str,
+    magnification: float | None,
+) -> None:
+    """Average of the frames of RECORDING, each moved to where the specimen was in the first one.
+
+    Frames whose drift is not known are left out.
+
+    \b
+    Example:
+      semcal stack recordings/gold --calibration cal.yaml -o gold.tif --video gold.mp4
+    """
+    _check_outputs(recording, output, sigma, video)
+    model = None if calibration is None else Calibration.load(calibration)
+    microscope = configured(config, model)
+    job = Job(model, microscope, at, None if no_drift else DriftTracker())
+    with open_recording(recording, microscope, magnification=magnification) as opened:
+        survey = surveyed(
+            opened, job, on_first=lambda f: _check_first(f, output), levels=video is not None
+        )
+        usable = _usable(survey)
+        stack = Stack(survey.size, interpolation)
+        with _video(video, survey, fps) as film:
+            _add_frames(opened, job, survey, usable, stack, film)
+            image = stack.result()
+            _write(image, survey, output, sigma)
+        notes = opened.notes
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+    _report(survey, usable, image, job)
+    for name, path in (("average", output), ("standard error", sigma), ("video", video)):
+        if path is not None:
+            click.echo(f"{name}: {path}")
+
+
+# -- outputs --------------------------------------------------------------------------------------
+
+
+def _check_outputs(recording: Path, output: Path, sigma: Path | None, video: Path | None) -> None:
+    """Refuse names that cannot be written, before any work is done for them."""
+    wanted = (
+        (output, (*_TIFF, ".png"), "-o"),
+        (sigma, _TIFF, "--sigma"),
+        (video, tuple(_CODECS), "--video"),
+    )
+    seen: set[Path] = set()
+    source = recording.resolve()
+    for path, suffixes, option in wanted:
+        if path is None:
+            continue
+        if path.suffix.lower() not in suffixes:
+            raise InvalidValueError(
+                f"{option} {path}",
+                expected="a name that ends in " + " or ".join(suffixes),
+                do="choose one of these suffixes",
+            )
+        require_folder(path)
+        target = path.resolve()
+        if target in seen or target == source or source in target.parents:
+            raise InvalidValueError(
+                f"{option} {path} is another output, or belongs to the recording",
+                expected="a file of its own outside of the recording",
+            )
+        seen.add(target)
+
+
+def _check_first(frame: Frame, output: Path) -> None:
+    if output.suffix.lower() not in _TIFF and frame.image.dtype.kind != "u":
+        raise InvalidValueError(
+            f"-o {output} for {frame.encoding} frames",
+            expected="a .tif, which holds grey levels of 32 bits",
+        )
+
+
+def _write(image: StackedImage, survey: Survey, output: Path, sigma: Path | None) -> None:
+    if sigma is not None:
+        atomic_write_bytes(sigma, _tiff(image.standard_error, survey.camera))
+    if output.suffix.lower() in _TIFF:
+        data = _tiff(image.mean, survey.camera)
+    else:
+        top = np.iinfo(survey.dtype).max
+        levels = np.clip(np.rint(np.nan_to_num(image.mean)), 0, top).astype(survey.dtype)
+        data = bytes(cv2.imencode(".png", levels)[1])
+    atomic_write_bytes(output, data)
+
+
+def _tiff(values: NDArray[np.float32], camera: ScanCamera) -> bytes:
+    """A file of 32-bit grey levels whose pixel size ImageJ understands."""
+    per_um = [1e-6 / size for size in camera.pixel_size_m]
+    file = io.BytesIO()
+    tifffile.imwrite(
+        file,
+        values,
+        imagej=True,
+        resolution=(per_um[0], per_um[1]),
+        metadata={"axes": "YX", "unit": "um"},
+    )
+    return file.getvalue()
+
+
+# -- average and video ----------------------------------------------------------------------------
+
+
+def _usable(survey: Survey) -> NDArray[np.bool_]:
+    """Which of the chosen frames go into the average, (n,) bool."""
+    if survey.path is None:
+        return np.ones(len(survey.chosen), dtype=bool)
+    usable = trusted_frames(survey.path, DriftSettings().lost_after)
+    if not usable.any():
+        raise BagError(
+            f"{len(usable)} frames and none with a known drift, the first: {survey.path.status[0]}",
+            expected="a specimen with structure",
+            do="look at `semcal drift`, or average the frames where they are with --no-drift",
+        )
+    return usable
+
+
+def _add_frames(
+    opened: Recording,
+    job: Job,
+    survey: Survey,
+    usable: NDArray[np.bool_],
+    stack: Stack,
+    film: _Film | None,
+) -> None:
+    number_of = {index: number for number, index in enumerate(survey.chosen)}
+    with progress(opened.frame_count, "averaging") as bar:
+        for index, frame in enumerate(opened.frames()):
+            bar.update(1)
+            number = number_of.get(index)
+            if number is None or not (usable[number] or film):
+                continue
+            drift = None if survey.path is None else survey.path.raster(number)
+            grey = to_gray(frame.image, frame.encoding)
+            picture, valid = stack.rectified(grey, job.camera(frame), drift, job.microscope.scan)
+            if usable[number]:
+                stack.add(picture, valid)
+            if film is not None:
+                film.write(picture, number, bool(usable[number]))
+
+
+class _Film:
+    """Frames of a video with their number and time."""
+
+    def __init__(self, path: Path, survey: Survey, fps: float) -> None:
+        self._survey = survey
+        self._low, self._high = (0.0, 255.0)
+        if survey.dtype != np.uint8:
+            low, high = np.median(survey.levels, axis=0)
+            self._low, self._high = float(low), max(float(high), float(low) + 1e-6)
+        # Encoders want even numbers.
+        self._size = tuple(n + n % 2 for n in survey.size)
+        codec = _CODECS[path.suffix.lower()]
+        before = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(0)  # what it would print is said below in one line
+        try:
+            self._writer = cv2.VideoWriter(
+                str(path), cv2.VideoWriter.fourcc(*codec), fps, self._size, True
+            )
+        finally:
+            cv2.utils.logging.setLogLevel(before)
+        if not self._writer.isOpened():
+            raise InvalidValueError(
+                f"no encoder {codec} for {path.suffix} in OpenCV {cv2.__version__}",
+                expected="a build of OpenCV with FFmpeg",
+                do="try the other of " + " and ".join(_CODECS),
+            )
+
+    def write(self, picture: NDArray[np.float32], number: int, used: bool) -> None:
+        scale = 255.0 / (self._high - self._low)
+        grey = np.clip(np.rint((np.nan_to_num(picture) - self._low) * scale), 0, 255)
+        right, bottom = (self._size[k] - self._survey.size[k] for k in (0, 1))
+        padded = cv2.copyMakeBorder(
+            grey.astype(np.uint8), 0, bottom, 0, right, cv2.BORDER_CONSTANT, value=0
+        )
+        frame = cv2.cvtColor(padded, cv2.COLOR_GRAY2BGR)
+        survey = self._survey
+        text = (
+            f"{number + 1}/{len(survey.chosen)}  {survey.times_s[number] - survey.times_s[0]:.1f} s"
+        )
+        _label_frame(frame, text if used else f"{text}  not tracked")
+        self._writer.write(frame)
+
+    def close(self) -> None:
+        self._writer.release()
+
+
+def _label_frame(frame: NDArray[Any], text: str) -> None:
+    scale = max(0.35, 0.5 * frame.shape[0] / 512)
+    place = (round(12 * scale), frame.shape[0] - round(14 * scale))
+    for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+        thickness = max(1, round(2 * width * scale)) if width > 1 else max(1, round(1.5 * scale))
+        cv2.putText(
+            frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, thickness, cv2.LINE_AA
+        )
+
+
+@contextmanager
+def _video(path: Path | None, survey: Survey, fps: float) -> Iterator[_Film | None]:
+    """A video that gets its name only once it is complete."""
+    if path is None:
+        yield None
+        return
+    target = path.resolve()
+    with tempfile.TemporaryDirectory(
+        prefix=f".{target.name}.", suffix=".tmp", dir=target.parent
+    ) as scratch:
+        file = Path(scratch) / f"video{target.suffix.lower()}"
+        film = _Film(file, survey, fps)
+        try:
+            yield film
+        finally:
+            film.close()
+        _check_video(file, path, len(survey.chosen))
+        os.replace(file, target)
+
+
+def _check_video(file: Path, path: Path, frames: int) -> None:
+    """The encoder reports no errors, such as a full disk: look whether all is there."""
+    reader = cv2.VideoCapture(str(file))
+    found = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    reader.release()
+    if found != frames:
+        raise BagError(
+            f"{path} came out with {found} of {frames} frames",
+            expected="space for the whole video",
+            do="free space or choose another place",
+        )
+
+
+# -- what a person reads --------------------------------------------------------------------------
+
+
+def _report(survey: Survey, usable: NDArray[np.bool_], image: StackedImage, job: Job) -> None:
+    if job.model is None:
+        echo_nominal_unit(job.microscope, "the pixel size is")
+    elif not survey.camera.in_range:
+        click.echo("warning: the frames are outside of the calibrated range", err=True)
+    if survey.other_kind:
+        click.echo(
+            f"note: {survey.other_kind} frames of another size or encoding are left out", err=True
+        )
+    echo_states(Counter(kind_of(u) for u in survey.updates))
+    nm = 1e9 * np.array(survey.camera.pixel_size_m)
+    click.echo(
+        f"{image.frames} of {len(usable)} frames averaged, {nm[0]:.6g} x {nm[1]:.6g} nm per px"
+    )
+    lost = 0 if survey.path is None else int((survey.path.accepted & ~usable).sum())
+    if lost:
+        click.echo(f"{lost} tracked frames are left out: tracking was lost before them", err=True)
+    known = np.isfinite(image.standard_error)
+    if known.any():
+        error = float(np.median(image.standard_error[known]))
+        click.echo(f"standard error: {error:.4g} grey levels (median of the pixels)")
