@@ -12,18 +12,15 @@ from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, progress, require_folder
 from semcal_ros.cli.drift_common import (
+    Follower,
     camera_of,
     echo_nominal_unit,
     echo_states,
-    kind_of,
     live_option,
     rate_text,
-    recording_path,
     start_time_s,
 )
-from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.drift_path import DriftPath
-from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
@@ -64,17 +61,17 @@ def command(
     model = None if calibration is None else Calibration.load(calibration)
     microscope = configured(config, model)
     with open_recording(recording, microscope) as opened:
-        stamps_ns, updates = _tracked(opened, model, microscope)
+        stamps_ns, follower = _followed(opened, model, microscope)
         notes = opened.notes
-    path = recording_path(updates, live=live)
+    path = follower.path(live=live)
     write_csv(output, DRIFT_COLUMNS, _rows(stamps_ns, path))
     if plot is not None:
         _write_plot(path, plot)
     for note in notes:
         click.echo(f"note: {note}", err=True)
     if model is None:
-        echo_nominal_unit(microscope, "drift is in raw pixels, scaled by")
-    echo_states(Counter(kind_of(u) for u in updates))
+        echo_nominal_unit(microscope, "drift is in raw pixels, scaled by the nominal pixel size")
+    echo_states(Counter(u.kind for u in follower.updates))
     if len(path) > 1:
         click.echo(rate_text(path))
     click.echo(f"drift: {output}")
@@ -96,21 +93,20 @@ def _check_plot(plot: Path | None, output: Path) -> None:
     require_folder(plot)
 
 
-def _tracked(
+def _followed(
     opened: Recording, model: Calibration | None, microscope: MicroscopeConfig
-) -> tuple[list[int], list[DriftUpdate]]:
-    """Stamp and drift of every frame."""
-    tracker = DriftTracker()
+) -> tuple[list[int], Follower]:
+    """Stamps of all frames, and their drift."""
+    follower = Follower()
     stamps_ns: list[int] = []
-    updates: list[DriftUpdate] = []
     with progress(opened.frame_count, "drift") as bar:
         for frame in opened.frames():
             stamps_ns.append(frame.stamp_ns)
             camera = camera_of(frame, model, microscope)
             time_s = start_time_s(frame, stamps_ns[0], microscope)
-            updates.append(tracker.update(frame.image, time_s, camera, microscope.scan))
+            follower.update(frame, time_s, camera, microscope.scan)
             bar.update(1)
-    return stamps_ns, updates
+    return stamps_ns, follower
 
 
 def _rows(stamps_ns: Sequence[int], path: DriftPath) -> list[tuple[object, ...]]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NoReturn
@@ -17,21 +16,22 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import progress
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_path import DriftPath, path_of_updates
 from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.errors import BagError
+from semcal_ros.core.raster import ScanTiming
 from semcal_ros.files.recordings import Frame, Recording
 
 __all__ = [
+    "Follower",
     "Job",
     "Survey",
     "camera_of",
     "echo_nominal_unit",
     "echo_states",
-    "kind_of",
     "live_option",
     "rate_text",
-    "recording_path",
     "start_time_s",
     "surveyed",
 ]
@@ -39,7 +39,6 @@ __all__ = [
 _LISTED = 12
 # Grey levels of more than 8 bits are shown with these quantiles as black and white.
 _BLACK_WHITE = (0.001, 0.999)
-_NUMBER = re.compile(r"-?\d[\d.]*")
 
 live_option = click.option(
     "--live", is_flag=True, help="What was known live, without hindsight of later frames."
@@ -59,22 +58,29 @@ def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) ->
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
 
 
-def recording_path(updates: Sequence[DriftUpdate], *, live: bool) -> DriftPath:
-    """Drift of a whole recording from what the tracker said at each frame.
+class Follower:
+    """Tracks the drift of a recording and looks at it once more with hindsight."""
 
-    Parameters
-    ----------
-    updates
-        Of all frames, in their order.
-    live
-        What was known at each frame when it came, without hindsight.
-    """
-    return path_of_updates(updates)
+    def __init__(self) -> None:
+        self.history = DriftHistory()
+        self.tracker = DriftTracker(history=self.history)
+        self.updates: list[DriftUpdate] = []
 
+    def update(
+        self, frame: Frame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
+    ) -> None:
+        """The next frame."""
+        self.updates.append(self.tracker.update(frame.image, time_s, camera, scan))
 
-def kind_of(update: DriftUpdate) -> str:
-    """The status without the numbers of the single frame, so that frames can be counted by kind."""
-    return _NUMBER.sub("…", update.status)
+    def path(self, *, live: bool) -> DriftPath:
+        """Drift of all frames.
+
+        Parameters
+        ----------
+        live
+            What was known at each frame when it came, without hindsight.
+        """
+        return path_of_updates(self.updates) if live else self.history.smoothed()
 
 
 def echo_states(states: Counter[str]) -> None:
@@ -86,8 +92,7 @@ def echo_states(states: Counter[str]) -> None:
 def echo_nominal_unit(config: MicroscopeConfig, what: str) -> None:
     """Tell that lengths rest on the display width only."""
     click.echo(
-        f"note: without --calibration {what} the nominal pixel size of the display width "
-        f"{config.display_width_m:g} m",
+        f"note: without --calibration {what} of the display width {config.display_width_m:g} m",
         err=True,
     )
 
@@ -119,14 +124,14 @@ class Job:
         Configuration.
     at
         The magnification to choose; None where there must be one only.
-    tracker
+    follower
         Tracks the chosen frames; None for no drift.
     """
 
     model: Calibration | None
     microscope: MicroscopeConfig
     at: float | None = None
-    tracker: DriftTracker | None = None
+    follower: Follower | None = None
 
     def camera(self, frame: Frame) -> ScanCamera:
         """Of a frame."""
@@ -145,12 +150,12 @@ class Survey:
         Type of the grey levels; (width, height) in px.
     first_stamp_ns
         Stamp of the first frame.
+    follower
+        Their drift; None where it is not wanted.
     chosen
         Numbers of the frames as the recording gives them.
     times_s
         Starts of their acquisitions, s after the first stamp.
-    updates
-        Their drift; empty without a tracker.
     levels
         Grey levels of each that are shown as black and white, where asked for.
     other_kind
@@ -161,16 +166,16 @@ class Survey:
     dtype: np.dtype[Any]
     size: tuple[int, int]
     first_stamp_ns: int
+    follower: Follower | None
     chosen: list[int] = field(default_factory=list)
     times_s: list[float] = field(default_factory=list)
-    updates: list[DriftUpdate] = field(default_factory=list)
     levels: list[tuple[float, float]] = field(default_factory=list)
     other_kind: int = 0
 
     @cached_property
     def path(self) -> DriftPath | None:
-        """Drift of the chosen frames; None without a tracker. For a finished survey."""
-        return recording_path(self.updates, live=False) if self.updates else None
+        """Drift of the chosen frames; None where it is not wanted. For a finished survey."""
+        return None if self.follower is None else self.follower.path(live=False)
 
 
 def surveyed(
@@ -199,7 +204,7 @@ def surveyed(
     wanted = None if job.at is None else _label(job.at)
     survey: Survey | None = None
     kind: tuple[object, ...] = ()
-    with progress(opened.frame_count, "drift" if job.tracker else "reading") as bar:
+    with progress(opened.frame_count, "drift" if job.follower else "reading") as bar:
         for index, frame in enumerate(opened.frames()):
             bar.update(1)
             label = _label(frame.magnification)
@@ -214,8 +219,7 @@ def surveyed(
                 continue
             _add(survey, index, frame, job)
             if levels:
-                low, high = np.quantile(frame.image[::4, ::4], _BLACK_WHITE)
-                survey.levels.append((float(low), float(high)))
+                survey.levels.append(_black_white(frame))
     if survey is None or (wanted is None and len(counts) > 1):
         _refuse_magnifications(opened, job, counts)
     return survey
@@ -230,9 +234,18 @@ def _kind(frame: Frame) -> tuple[object, ...]:
     return (*frame.image.shape, frame.encoding)
 
 
+def _black_white(frame: Frame) -> tuple[float, float]:
+    values = frame.image[::4, ::4]
+    if values.dtype.kind == "f":
+        values = values[np.isfinite(values)]
+    low, high = np.quantile(values, _BLACK_WHITE) if values.size else (0.0, 1.0)
+    return float(low), float(high)
+
+
 def _begun(frame: Frame, job: Job) -> Survey:
     height, width = frame.image.shape[:2]
-    return Survey(job.camera(frame), frame.image.dtype, (width, height), frame.stamp_ns)
+    size = width, height
+    return Survey(job.camera(frame), frame.image.dtype, size, frame.stamp_ns, job.follower)
 
 
 def _add(survey: Survey, index: int, frame: Frame, job: Job) -> None:
@@ -245,9 +258,8 @@ def _add(survey: Survey, index: int, frame: Frame, job: Job) -> None:
         )
     survey.chosen.append(index)
     survey.times_s.append(time_s)
-    if job.tracker is not None:
-        update = job.tracker.update(frame.image, time_s, job.camera(frame), job.microscope.scan)
-        survey.updates.append(update)
+    if job.follower is not None:
+        job.follower.update(frame, time_s, job.camera(frame), job.microscope.scan)
 
 
 def _refuse_magnifications(opened: Recording, job: Job, counts: Counter[str]) -> NoReturn:

@@ -16,7 +16,7 @@ from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
-from semcal_ros.cli.drift_common import camera_of, echo_states, kind_of, start_time_s
+from semcal_ros.cli.drift_common import camera_of, echo_states, start_time_s
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker, DriftUpdate
 from semcal_ros.core.rectify import Rectifier
@@ -138,7 +138,7 @@ def command(
             if tracker is not None:
                 time_s = start_time_s(frame, first, microscope)
                 update = tracker.update(frame.image, time_s, camera, microscope.scan)
-                states[kind_of(update)] += 1
+                states[update.kind] += 1
             image = rectifier.rectify(
                 frame.image, camera, None if update is None else update.raster, microscope.scan
             )

@@ -27,18 +27,16 @@ from semcal_ros.cli.common import (
     require_folder,
 )
 from semcal_ros.cli.drift_common import (
+    Follower,
     Job,
     Survey,
     echo_nominal_unit,
     echo_states,
-    kind_of,
     surveyed,
 )
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.drift_types import DriftSettings
 from semcal_ros.core.errors import BagError, InvalidValueError
-from semcal_ros.core.stack import Stack, StackedImage, trusted_frames
+from semcal_ros.core.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.recordings import Frame, Recording, open_recording
 
@@ -101,7 +99,7 @@ def command(
     _check_outputs(recording, output, sigma, video)
     model = None if calibration is None else Calibration.load(calibration)
     microscope = configured(config, model)
-    job = Job(model, microscope, at, None if no_drift else DriftTracker())
+    job = Job(model, microscope, at, None if no_drift else Follower())
     with open_recording(recording, microscope, magnification=magnification) as opened:
         survey = surveyed(
             opened, job, on_first=lambda f: _check_first(f, output), levels=video is not None
@@ -110,9 +108,9 @@ def command(
         stack = Stack(survey.size, interpolation)
         with _video(video, survey, fps) as film:
             _add_frames(opened, job, survey, usable, stack, film)
-            image = stack.result()
-            _write(image, survey, output, sigma)
         notes = opened.notes
+    image = stack.result()
+    _write(image, survey, output, sigma)
     for note in notes:
         click.echo(f"note: {note}", err=True)
     _report(survey, usable, image, job)
@@ -193,7 +191,7 @@ def _usable(survey: Survey) -> NDArray[np.bool_]:
     """Which of the chosen frames go into the average, (n,) bool."""
     if survey.path is None:
         return np.ones(len(survey.chosen), dtype=bool)
-    usable = trusted_frames(survey.path, DriftSettings().lost_after)
+    usable = survey.path.trusted
     if not usable.any():
         raise BagError(
             f"{len(usable)} frames and none with a known drift, the first: {survey.path.status[0]}",
@@ -216,7 +214,7 @@ def _add_frames(
         for index, frame in enumerate(opened.frames()):
             bar.update(1)
             number = number_of.get(index)
-            if number is None or not (usable[number] or film):
+            if number is None or (film is None and not usable[number]):
                 continue
             drift = None if survey.path is None else survey.path.raster(number)
             grey = to_gray(frame.image, frame.encoding)
@@ -262,10 +260,8 @@ class _Film:
             grey.astype(np.uint8), 0, bottom, 0, right, cv2.BORDER_CONSTANT, value=0
         )
         frame = cv2.cvtColor(padded, cv2.COLOR_GRAY2BGR)
-        survey = self._survey
-        text = (
-            f"{number + 1}/{len(survey.chosen)}  {survey.times_s[number] - survey.times_s[0]:.1f} s"
-        )
+        times_s = self._survey.times_s
+        text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
         _label_frame(frame, text if used else f"{text}  not tracked")
         self._writer.write(frame)
 
@@ -276,11 +272,10 @@ class _Film:
 def _label_frame(frame: NDArray[Any], text: str) -> None:
     scale = max(0.35, 0.5 * frame.shape[0] / 512)
     place = (round(12 * scale), frame.shape[0] - round(14 * scale))
-    for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        thickness = max(1, round(2 * width * scale)) if width > 1 else max(1, round(1.5 * scale))
-        cv2.putText(
-            frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, thickness, cv2.LINE_AA
-        )
+    thin = max(1, round(1.5 * scale))
+    # White with a black edge can be read on any specimen.
+    for color, width in (((0, 0, 0), thin + 2), ((255, 255, 255), thin)):
+        cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
 
 
 @contextmanager
@@ -321,21 +316,22 @@ def _check_video(file: Path, path: Path, frames: int) -> None:
 
 def _report(survey: Survey, usable: NDArray[np.bool_], image: StackedImage, job: Job) -> None:
     if job.model is None:
-        echo_nominal_unit(job.microscope, "the pixel size is")
+        echo_nominal_unit(job.microscope, "the pixel size is the nominal one")
     elif not survey.camera.in_range:
         click.echo("warning: the frames are outside of the calibrated range", err=True)
     if survey.other_kind:
         click.echo(
             f"note: {survey.other_kind} frames of another size or encoding are left out", err=True
         )
-    echo_states(Counter(kind_of(u) for u in survey.updates))
+    if survey.follower is not None:
+        echo_states(Counter(u.kind for u in survey.follower.updates))
     nm = 1e9 * np.array(survey.camera.pixel_size_m)
     click.echo(
         f"{image.frames} of {len(usable)} frames averaged, {nm[0]:.6g} x {nm[1]:.6g} nm per px"
     )
     lost = 0 if survey.path is None else int((survey.path.accepted & ~usable).sum())
     if lost:
-        click.echo(f"{lost} tracked frames are left out: tracking was lost before them", err=True)
+        click.echo(f"note: tracking was lost: {lost} frames after that are left out", err=True)
     known = np.isfinite(image.standard_error)
     if known.any():
         error = float(np.median(image.standard_error[known]))

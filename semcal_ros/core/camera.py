@@ -111,11 +111,19 @@ class ScanCamera:
     def nominal(
         cls, magnification: float, width: int, height: int, display_width_m: float
     ) -> ScanCamera:
-        """The camera that the display width alone predicts: parallel projection, no distortion, no covariance."""
+        """The camera that the display width alone predicts: parallel projection, no distortion.
+
+        Its covariance is that of an instrument that nobody has calibrated: a scale good to 3 %, an
+        axis within 3 % of the width from the middle, an unknown distortion of a few tenths of a
+        per cent (1-sigma).
+        """
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
+        m = magnification * width / display_width_m
+        sigmas = np.array([0.03 * m, 0.01, 0.01, *[0.03 * width] * 2, 50.0, 5e-3, 2e-3])
+        covariance = np.diag(np.append(sigmas, [0.05 * width] * 2) ** 2)
         return cls(
             magnification=magnification,
-            m=magnification * width / display_width_m,
+            m=m,
             aspect=1.0,
             skew=0.0,
             px=cx,
@@ -128,6 +136,7 @@ class ScanCamera:
             norm_px=0.5 * width,
             width=width,
             height=height,
+            covariance=covariance,
             in_range=False,
         )
 

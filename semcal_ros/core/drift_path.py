@@ -39,6 +39,8 @@ class DriftPath:
         n texts as in :class:`~semcal_ros.core.drift_types.DriftUpdate`.
     accepted
         (n,) bool: whether the drift rests on the frame's own picture.
+    restarted
+        (n,) bool: whether tracking went on from the frame at a drift that was only predicted.
     calibrated
         False where no camera was given.
     """
@@ -52,10 +54,16 @@ class DriftPath:
     residual: Array
     status: tuple[str, ...]
     accepted: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]
     calibrated: bool
 
     def __len__(self) -> int:
         return len(self.status)
+
+    @property
+    def trusted(self) -> NDArray[np.bool_]:
+        """(n,) bool: accepted, and tracked all the way back to the first frame."""
+        return np.asarray(self.accepted & ~np.logical_or.accumulate(self.restarted))
 
     @property
     def sigma_m(self) -> Array:
@@ -86,5 +94,6 @@ def path_of_updates(updates: Sequence[DriftUpdate]) -> DriftPath:
         residual=np.array([u.residual for u in updates]),
         status=tuple(u.status for u in updates),
         accepted=np.array([u.accepted for u in updates], dtype=bool),
+        restarted=np.array([u.restarted for u in updates], dtype=bool),
         calibrated=all(u.calibrated for u in updates),
     )

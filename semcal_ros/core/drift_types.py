@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,9 +12,11 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectify import RasterDrift
 from semcal_ros.core.registration import RegistrationSettings
 
-__all__ = ["DriftSettings", "DriftUpdate"]
+__all__ = ["DriftForecast", "DriftSettings", "DriftUpdate"]
 
 Array = NDArray[np.float64]
+
+_NUMBER = re.compile(r"-?\d[\d.]*")
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,10 @@ class DriftSettings:
         predicted drift.
     acceleration_psd
         Process noise, m^2/s^3 (px^2/s^3 without a camera); None adapts it to the stream.
+    average
+        Whether frames are added to their keyframe, so that its noise does not limit what follows.
+    max_keyframes, max_keyframe_bytes
+        How many pictures are kept to come back to, and their memory.
     interpolation
         Of the rectification before registration.
     """
@@ -49,6 +56,9 @@ class DriftSettings:
     max_ratio: float = 2.5
     lost_after: int = 8
     acceleration_psd: float | None = None
+    average: bool = True
+    max_keyframes: int = 48
+    max_keyframe_bytes: int = 1 << 28
     interpolation: str = "cubic"
 
     def __post_init__(self) -> None:
@@ -58,6 +68,7 @@ class DriftSettings:
             ("first_step_px", self.first_step_px > 0.0, "a positive number of px"),
             ("max_ratio", self.max_ratio >= 1.0, "at least 1"),
             ("lost_after", self.lost_after >= 2, "at least 2 frames"),
+            ("max_keyframes", self.max_keyframes >= 2, "at least 2"),
             ("acceleration_psd", (self.acceleration_psd or 0.0) >= 0.0, "a number >= 0 or None"),
         )
         for name, good, expected in checks:
@@ -77,7 +88,8 @@ class DriftUpdate:
         (2,) drift since the first frame in the sem frame, and its rate. In px and px/s of the raw
         image where ``calibrated`` is false.
     covariance
-        (4, 4) of ``[x, y, vx, vy]`` in those units.
+        (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all pictures on the way and
+        from what the camera's own covariance leaves open of the scale.
     status
         ``"keyframe"``, ``"tracked"`` or ``"coasting: <reason>"``.
     accepted, reason
@@ -90,6 +102,15 @@ class DriftUpdate:
         Fraction of the picture that was compared with the keyframe.
     calibrated
         False where no camera was given.
+    restarted
+        Whether tracking went on from here at a drift that was only predicted: the frames from here
+        on are consistent with each other, but may show another place than those before.
+    shear_px, shear_covariance
+        (2,) by how much more the last row is shifted against the keyframe than the first, what
+        was known of it taken out before, and its (2, 2) covariance; NaN and infinite where it was
+        not measured.
+    keyframe_time_s
+        Time of the keyframe that the frame was compared with; NaN where there was none.
     """
 
     time_s: float
@@ -103,6 +124,17 @@ class DriftUpdate:
     px_from_unit: Array
     overlap: float
     calibrated: bool
+    restarted: bool
+    shear_px: Array
+    shear_covariance: Array
+    keyframe_time_s: float
+
+    @property
+    def kind(self) -> str:
+        """The status without the numbers of the single frame, so that frames can be counted by
+        kind.
+        """
+        return _NUMBER.sub("\u2026", self.status)
 
     @property
     def units(self) -> str:
@@ -118,3 +150,23 @@ class DriftUpdate:
     def raster(self) -> RasterDrift:
         """The drift during this frame, as :class:`~semcal_ros.core.rectify.Rectifier` wants it."""
         return RasterDrift(self.drift_m, self.velocity_m_s)
+
+
+@dataclass(frozen=True)
+class DriftForecast:
+    """Drift at another time, from what is known now.
+
+    Attributes
+    ----------
+    time_s
+        Time of the forecast.
+    drift_m, velocity_m_s
+        (2,) as in :class:`DriftUpdate`.
+    covariance
+        (4, 4) of ``[x, y, vx, vy]``.
+    """
+
+    time_s: float
+    drift_m: Array
+    velocity_m_s: Array
+    covariance: Array

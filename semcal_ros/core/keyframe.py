@@ -1,4 +1,9 @@
-"""The picture that drift is measured against, and its journey through a change of magnification."""
+"""The pictures that drift is measured against.
+
+The noise of a reference limits every registration against it, above all in noisy pictures. So each
+frame that was registered well is added to its keyframe, shifted to where the keyframe lies, until
+the noise of the mean no longer matters; then it stays as it is, so that it cannot wander.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.rectify import RasterDrift, Rectifier, raw_from_output
 from semcal_ros.core.registration import (
     Reference,
     Region,
+    Registration,
     RegistrationSettings,
     prepare_reference,
 )
+from semcal_ros.core.subpixel import sampled
 
-__all__ = ["Keyframe", "Shot", "carried", "make_keyframe", "picture_of", "scale_ratio"]
+__all__ = [
+    "Keyframe",
+    "Shot",
+    "carried",
+    "keyframe_of",
+    "make_keyframe",
+    "picture_of",
+    "resampleable",
+    "scale_ratio",
+]
 
 Array = NDArray[np.float64]
 
@@ -57,22 +74,73 @@ class Shot:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A reference picture with the drift at its time.
+    """A reference picture.
 
     Attributes
     ----------
-    shot, velocity
-        The frame, and the drift velocity (unit per s) by which its shear was removed.
-    reference
-        Its picture, prepared for registration.
-    drift
-        (2,) drift at which it was taken, as estimated then.
+    shot
+        The frame it began with.
+    removed
+        Drift velocity (unit per s) whose shear was removed from that frame.
+    mean
+        (h, w) float32 mean of the frames, in ideal pixels of the camera.
+    region
+        The part of it that was scanned.
+    time_s
+        Time of the first frame.
+    averaged
+        Number of frames in the mean.
     """
 
     shot: Shot
-    velocity: Array
-    reference: Reference
-    drift: Array
+    removed: Array
+    mean: NDArray[np.float32]
+    region: Region
+    time_s: float
+    averaged: int = 1
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of its pictures."""
+        return self.mean.nbytes + self.shot.image.nbytes
+
+    def reference(self, settings: RegistrationSettings) -> Reference:
+        """Everything that a registration needs of it."""
+        return prepare_reference(
+            self.mean, region=self.region, settings=settings, averaged=float(self.averaged)
+        )
+
+    def with_frame(
+        self, picture: NDArray[np.generic], region: Region, registration: Registration
+    ) -> Keyframe:
+        """The keyframe with another frame in its mean, where the two overlap."""
+        gray = _gray(picture)
+        shift = registration.shift_px
+        whole = np.floor(shift).astype(int)
+        spans = []
+        for axis in (0, 1):
+            # The interpolation needs a neighbour.
+            first = max(self.region[axis], region[axis] - int(whole[axis]))
+            last = min(self.region[axis + 2], region[axis + 2] - int(whole[axis]) - 1)
+            spans.append((first, last))
+        (left, right), (top, bottom) = spans
+        if right - left < 8 or bottom - top < 8:
+            return self
+        plain = np.array([1.0])
+        corner = left + int(whole[0]), top + int(whole[1])
+        size = right - left, bottom - top
+        moved = sampled(gray, corner, size, shift - whole, (plain, plain), -registration.offset)
+        mean = self.mean.copy()
+        part = mean[top:bottom, left:right]
+        share = np.float32(1.0 / (self.averaged + 1))
+        part += (moved * np.float32(1.0 / registration.gain) - part) * share
+        return replace(self, mean=mean, averaged=self.averaged + 1)
+
+
+def _gray(picture: NDArray[np.generic]) -> NDArray[np.float32]:
+    if picture.ndim == 3:
+        return np.asarray(picture.mean(axis=2), dtype=np.float32)
+    return np.asarray(picture, dtype=np.float32)
 
 
 def picture_of(
@@ -133,17 +201,35 @@ def _scanned(
     return left, top, right, bottom
 
 
-def make_keyframe(
-    shot: Shot,
-    drift: Array,
-    velocity: Array,
-    rectifier: Rectifier,
-    settings: RegistrationSettings,
+def make_keyframe(shot: Shot, velocity: Array, rectifier: Rectifier, time_s: float) -> Keyframe:
+    """A keyframe of a frame from which the shear of a velocity (2,) is removed."""
+    return keyframe_of(shot, velocity, *picture_of(shot, velocity, rectifier), time_s)
+
+
+def keyframe_of(
+    shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
 ) -> Keyframe:
-    """A keyframe of a frame whose drift is known or defined."""
-    picture, region = picture_of(shot, velocity, rectifier)
-    reference = prepare_reference(picture, region=region, settings=settings)
-    return Keyframe(shot, velocity.copy(), reference, drift.copy())
+    """A keyframe of a frame whose picture without the shear of ``removed`` (2,) is known."""
+    return Keyframe(shot, removed.copy(), _gray(picture).copy(), region, time_s)
+
+
+def resampleable(image: NDArray[np.generic]) -> NDArray[np.generic]:
+    """The image in a type that can be resampled.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no picture.
+    """
+    shape = image.shape
+    if image.dtype.kind not in "uif" or not (
+        len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
+    ):
+        raise InvalidValueError(
+            f"an image of shape {shape} and type {image.dtype}",
+            expected="(h, w) or (h, w, 3) of integers or floats",
+        )
+    return image if image.dtype.name in ("uint8", "uint16", "float32") else image.astype(np.float32)
 
 
 def scale_ratio(before: Shot, now: Shot) -> float:
@@ -158,9 +244,7 @@ def scale_ratio(before: Shot, now: Shot) -> float:
     return float(max(stretch.max(), 1.0 / stretch.min()))
 
 
-def carried(
-    key: Keyframe, now: Shot, rectifier: Rectifier, settings: RegistrationSettings
-) -> Keyframe:
+def carried(key: Keyframe, now: Shot) -> Keyframe:
     """The keyframe as the camera of ``now`` would show it.
 
     Both cameras must be known. Ideal pixels of two magnifications are related by the affine map of
@@ -169,13 +253,10 @@ def carried(
     before, after = key.shot.camera, now.camera
     if before is None or after is None:
         return key
-    picture, region = picture_of(key.shot, key.velocity, rectifier)
     matrix = now.px_from_unit @ np.linalg.inv(key.shot.px_from_unit)
     offset = np.array([after.px, after.py]) - matrix @ np.array([before.px, before.py])
     shrink = float(np.sqrt(abs(np.linalg.det(matrix))))
-    gray = np.asarray(picture, dtype=np.float32)
-    if gray.ndim == 3:
-        gray = gray.mean(axis=2)
+    gray = key.mean
     if shrink < 0.95:
         # Structure finer than the new pixels would alias.
         sigma = 0.45 * float(np.sqrt(1.0 / shrink**2 - 1.0))
@@ -183,10 +264,9 @@ def carried(
     warp = np.column_stack([matrix, offset])
     width, height = now.size
     new = cv2.warpAffine(gray, warp, (width, height), flags=cv2.INTER_CUBIC)
-    reference = prepare_reference(
-        new, region=_image_of(region, matrix, offset, now.size), settings=settings
-    )
-    return replace(key, reference=reference)
+    region = _image_of(key.region, matrix, offset, now.size)
+    mean = np.asarray(new, dtype=np.float32)
+    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged)
 
 
 def _image_of(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:

@@ -15,18 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift_path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.rectify import RasterDrift, Rectifier
 
-__all__ = ["Stack", "StackedImage", "scanned", "trusted_frames"]
+__all__ = ["Stack", "StackedImage", "scanned"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Rows or columns that an interpolation takes beyond the two nearest ones.
 _REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}
+# As accurate as the maps are; a pixel at the very edge must not drop out by rounding.
+_EDGE_PX = 1e-3
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class StackedImage:
         (h, w) float32 grey levels; NaN where no frame was scanned.
     standard_error
         (h, w) float32 1-sigma of ``mean`` from the scatter of the frames, grey levels; NaN where
-        fewer than two frames were scanned.
+        fewer than two frames were scanned. Of each pixel on its own: interpolation makes the noise
+        of neighbours dependent. What all frames share, such as a blur, is not in it.
     count
         (h, w) int32 number of frames in each pixel.
     frames
@@ -173,34 +175,9 @@ def scanned(
         3 for lanczos4.
     """
     width, height = size
-    inside_x = (map_x >= reach) & (map_x <= width - 1 - reach)
-    return np.asarray(inside_x & (map_y >= reach) & (map_y <= height - 1 - reach))
-
-
-def trusted_frames(path: DriftPath, lost_after: int) -> Mask:
-    """Which frames can be averaged, (n,) bool: tracked, and tracked back to the first frame.
-
-    After ``lost_after`` frames in a row that could not be matched the tracker starts anew at a drift
-    that it can only guess: what follows is consistent in itself but may show another place.
-
-    Parameters
-    ----------
-    path
-        Drift of the frames.
-    lost_after
-        As in :class:`~semcal_ros.core.drift_types.DriftSettings`.
-    """
-    trusted = path.accepted.copy()
-    begun, misses = False, 0
-    for index, status in enumerate(path.status):
-        if path.accepted[index]:
-            begun, misses = True, 0
-        elif begun and not status.startswith("coasting: image:"):
-            misses += 1
-        if misses >= lost_after:
-            trusted[index:] = False
-            break
-    return trusted
+    low = reach - _EDGE_PX
+    inside_x = (map_x >= low) & (map_x <= width - 1 - low)
+    return np.asarray(inside_x & (map_y >= low) & (map_y <= height - 1 - low))
 
 
 def _grey(image: NDArray[np.generic], size: tuple[int, int]) -> NDArray[np.float32]:

@@ -204,7 +204,7 @@ def _plane(
 
 def _square(axes: Axes, x: Array, y: Array) -> None:
     """Both axes at one scale, y down as in the picture, with room for the texts at the ends."""
-    half = 0.63 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
+    half = 0.67 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
     middle_x, middle_y = 0.5 * float(x.min() + x.max()), 0.5 * float(y.min() + y.max())
     axes.set_xlim(middle_x - half, middle_x + half)
     axes.set_ylim(middle_y + half, middle_y - half)
@@ -217,7 +217,7 @@ def _dot_area(frames: int) -> float:
 
 
 def _away(x: Array, y: Array, at: int) -> tuple[float, float]:
-    """Direction on the page from the neighbours of an end to it, where its text is free of the path."""
+    """Direction on the page from the neighbours of an end to it: where the path is not."""
     near = slice(0, max(2, len(x) // 8)) if at == 0 else slice(-max(2, len(x) // 8), None)
     dx, dy = float(x[at] - x[near].mean()), float(y[at] - y[near].mean())
     length = float(np.hypot(dx, dy))

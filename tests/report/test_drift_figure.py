@@ -50,6 +50,7 @@ def sample(
         residual=np.where(accepted, 5.0, np.nan),
         status=tuple(status),
         accepted=accepted,
+        restarted=np.zeros(frames, dtype=bool),
         calibrated=True,
     )
 

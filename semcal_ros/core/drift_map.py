@@ -1,0 +1,359 @@
+"""Drift and the positions of its keyframes, estimated together.
+
+The state holds the drift p and its velocity v, and for each keyframe j where its picture lies: the
+drift m_j at which it seems to have been taken, and the velocity w_j by which it still is sheared.
+A frame with noise n that is registered against keyframe j has
+
+    shift = p - m_j + n,        shear = T v - T_j w_j + n'
+
+with the frame times T. All of this is linear, so one Kalman filter holds it, with every correlation:
+the noise of a keyframe is shared by all frames that were registered against it and does not average
+out, and coming back to an old keyframe undoes what was lost on the way. A frame that becomes a
+keyframe itself seems to lie at ``m_new = m_j + shift`` exactly, noise and all, so that a chain of
+keyframes is no more than copies of the state.
+
+Between frames the drift moves at constant velocity with white acceleration of power spectral
+density q (length^2 / s^3; Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2,
+doi:10.1002/0471221279). Each operation is an object that can be done again with another q, and
+undone backwards (:mod:`semcal_ros.core.drift_smoothing`). Any length unit will do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "Carry",
+    "DriftMap",
+    "Drop",
+    "Linear",
+    "Measure",
+    "MeasureOutcome",
+    "Move",
+    "Operation",
+    "Reshear",
+    "Settle",
+    "Widen",
+    "still",
+]
+
+Array = NDArray[np.float64]
+
+_OWN = 4
+_EACH = 4
+
+
+@dataclass(frozen=True)
+class DriftMap:
+    """State at one time.
+
+    Attributes
+    ----------
+    time_s
+        Time of the state, s.
+    mean
+        (4 + 4 k,) ``[x, y, vx, vy]``, then ``[mx, my, wx, wy]`` of each of the k keyframes.
+    covariance
+        Of ``mean``.
+    keys
+        Numbers of the keyframes, in the order of the state.
+    """
+
+    time_s: float
+    mean: Array
+    covariance: Array
+    keys: tuple[int, ...] = ()
+
+    @property
+    def position(self) -> Array:
+        """(2,) drift."""
+        return self.mean[:2]
+
+    @property
+    def velocity(self) -> Array:
+        """(2,) drift velocity, per s."""
+        return self.mean[2:4]
+
+    @property
+    def own(self) -> Array:
+        """(4, 4) covariance of drift and velocity."""
+        return self.covariance[:_OWN, :_OWN]
+
+    def of(self, key: int) -> slice:
+        """Where a keyframe's four numbers stand."""
+        start = _OWN + _EACH * self.keys.index(key)
+        return slice(start, start + _EACH)
+
+    def where(self, key: int) -> Array:
+        """(4,) ``[mx, my, wx, wy]`` of a keyframe."""
+        return self.mean[self.of(key)]
+
+    def shift_from(self, key: int) -> tuple[Array, Array]:
+        """Expected shift (2,) of a frame taken now against a keyframe, and its covariance (2, 2)."""
+        row = np.zeros((2, self.mean.size))
+        at = self.of(key).start
+        row[:, :2], row[:, at : at + 2] = np.eye(2), -np.eye(2)
+        return row @ self.mean, row @ self.covariance @ row.T
+
+
+def still(time_s: float) -> DriftMap:
+    """The beginning: no drift, by definition, and no velocity known yet."""
+    return DriftMap(time_s, np.zeros(_OWN), np.zeros((_OWN, _OWN)))
+
+
+@dataclass(frozen=True)
+class Linear:
+    """``new = matrix old + offset`` plus noise of ``covariance``, at ``time_s`` with ``keys``."""
+
+    matrix: Array
+    offset: Array
+    covariance: Array
+    time_s: float
+    keys: tuple[int, ...]
+
+    def of(self, state: DriftMap) -> DriftMap:
+        """The new state."""
+        covariance = self.matrix @ state.covariance @ self.matrix.T + self.covariance
+        mean = self.matrix @ state.mean + self.offset
+        return DriftMap(self.time_s, mean, 0.5 * (covariance + covariance.T), self.keys)
+
+
+def _same(state: DriftMap) -> Linear:
+    size = state.mean.size
+    return Linear(np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys)
+
+
+class Operation:
+    """Something that happens to the state and is linear."""
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """Its matrices for a state."""
+        raise NotImplementedError
+
+    def __call__(self, state: DriftMap, acceleration_psd: float = 0.0) -> DriftMap:
+        """The state after it."""
+        return self.linear(state, acceleration_psd).of(state)
+
+
+@dataclass(frozen=True)
+class Move(Operation):
+    """Time goes on until ``time_s``."""
+
+    time_s: float
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described in the module.
+
+        Raises
+        ------
+        InvalidValueError
+            If the time is earlier than the state's, or the noise density is negative.
+        """
+        dt = self.time_s - state.time_s
+        if not (dt >= 0.0 and acceleration_psd >= 0.0):
+            raise InvalidValueError(
+                f"a prediction from {state.time_s} s to {self.time_s} s with an acceleration noise"
+                f" of {acceleration_psd}",
+                expected="a later time and a number >= 0",
+            )
+        step = _same(state)
+        step.matrix[0, 2] = step.matrix[1, 3] = dt
+        one = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        step.covariance[:_OWN, :_OWN] = np.kron(one, np.eye(2)) * acceleration_psd
+        return replace(step, time_s=self.time_s)
+
+
+@dataclass(frozen=True)
+class Widen(Operation):
+    """Drift and velocity become more uncertain: noise of ``covariance`` (4, 4) is added."""
+
+    covariance: Array
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described."""
+        step = _same(state)
+        step.covariance[:_OWN, :_OWN] = self.covariance
+        return step
+
+
+@dataclass(frozen=True)
+class Settle(Operation):
+    """The frame of now becomes keyframe ``key`` without having been measured.
+
+    Its picture lies at the drift with its own noise ``noise`` (4, 4); ``removed`` (2,) is the
+    velocity whose shear was taken out of it.
+    """
+
+    key: int
+    removed: Array
+    noise: Array
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described."""
+        size = state.mean.size
+        matrix = np.vstack([np.eye(size), np.eye(_EACH, size)])
+        covariance = np.zeros((size + _EACH, size + _EACH))
+        covariance[size:, size:] = self.noise
+        offset = np.zeros(size + _EACH)
+        offset[size + 2 :] = -self.removed
+        return Linear(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
+
+
+@dataclass(frozen=True)
+class Carry(Operation):
+    """The frame of now becomes keyframe ``key``, as it was measured against ``parent``.
+
+    ``shift`` (4,) is what was measured: shift, and shear over the frame time; ``time_ratio`` is the
+    frame time of the parent over that of the frame; ``noise`` (4, 4) is added.
+    """
+
+    key: int
+    parent: int
+    shift: Array
+    time_ratio: float
+    noise: Array
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described."""
+        size = state.mean.size
+        matrix = np.vstack([np.eye(size), np.zeros((_EACH, size))])
+        at = state.of(self.parent)
+        matrix[size:, at] = np.diag([1.0, 1.0, self.time_ratio, self.time_ratio])
+        covariance = np.zeros((size + _EACH, size + _EACH))
+        covariance[size:, size:] = self.noise
+        offset = np.append(np.zeros(size), self.shift)
+        return Linear(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
+
+
+@dataclass(frozen=True)
+class Reshear(Operation):
+    """The shear of another velocity ``removed`` (2,) was taken out of keyframe ``key``."""
+
+    key: int
+    removed: Array
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described."""
+        step = _same(state)
+        at = state.of(self.key)
+        step.offset[at.start + 2 : at.stop] = -self.removed
+        return step
+
+
+@dataclass(frozen=True)
+class Drop(Operation):
+    """Keyframe ``key`` is forgotten."""
+
+    key: int
+
+    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+        """As described."""
+        size, at = state.mean.size, state.of(self.key)
+        kept = np.delete(np.arange(size), np.arange(at.start, at.stop))
+        keys = tuple(k for k in state.keys if k != self.key)
+        matrix = np.eye(size)[kept]
+        empty = np.zeros((kept.size, kept.size))
+        return Linear(matrix, np.zeros(kept.size), empty, state.time_s, keys)
+
+
+@dataclass(frozen=True)
+class MeasureOutcome:
+    """Outcome of :class:`Measure`.
+
+    Attributes
+    ----------
+    state
+        The updated state.
+    innovation, innovation_covariance
+        Measurement minus prediction, and what prediction and noise lead one to expect of it.
+    nis
+        Normalised innovation squared of the shift alone; chi-square with 2 degrees of freedom when
+        all is well.
+    shear_nis
+        That of the shear, given the shift; 0 where there is none.
+    """
+
+    state: DriftMap
+    innovation: Array
+    innovation_covariance: Array
+    nis: float
+    shear_nis: float
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A registration against keyframe ``key``.
+
+    Attributes
+    ----------
+    shift
+        (2,) shift, or (4,) shift and shear as a velocity (the shear over the frame time, plus the
+        velocity whose shear was taken out before).
+    covariance
+        Of ``shift``: the noise of the frame alone.
+    time_ratio
+        Frame time of the keyframe over that of the frame.
+    """
+
+    key: int
+    shift: Array
+    covariance: Array
+    time_ratio: float = 1.0
+
+    def row(self, state: DriftMap) -> Array:
+        """(2 or 4, n) derivative of the measurement by the state."""
+        count, at = self.shift.size, state.of(self.key).start
+        row = np.zeros((count, state.mean.size))
+        row[:, :count] = np.eye(count)
+        factors = [1.0, 1.0, self.time_ratio, self.time_ratio]
+        row[:, at : at + count] = -np.diag(factors[:count])
+        return row
+
+    def __call__(self, state: DriftMap) -> MeasureOutcome:
+        """The state with the measurement used.
+
+        Raises
+        ------
+        InvalidValueError
+            If the measurement is not finite or its covariance not positive definite.
+        """
+        row = self.row(state)
+        innovation = self.shift - row @ state.mean
+        mixed = state.covariance @ row.T
+        expected = row @ mixed + self.covariance
+        expected = 0.5 * (expected + expected.T)
+        unit = np.sqrt(np.maximum(np.diag(expected), 0.0))
+        if not (np.all(np.isfinite(innovation)) and np.all(unit > 0.0)):
+            raise InvalidValueError(
+                f"measured shift {self.shift.tolist()} with covariance {self.covariance.tolist()}",
+                expected="finite numbers and a positive definite covariance",
+            )
+        # Metres and metres per second differ by orders of magnitude.
+        scaled = np.linalg.inv(expected / np.outer(unit, unit))
+        inverse = scaled / np.outer(unit, unit)
+        gain = mixed @ inverse
+        # Joseph's form stays symmetric and positive when the measurement is much sharper than the
+        # prediction.
+        keep = np.eye(state.mean.size) - gain @ row
+        covariance = keep @ state.covariance @ keep.T + gain @ self.covariance @ gain.T
+        new = replace(
+            state,
+            mean=state.mean + gain @ innovation,
+            covariance=0.5 * (covariance + covariance.T),
+        )
+        nis = _square(innovation[:2], expected[:2, :2])
+        both = float(innovation @ inverse @ innovation)
+        return MeasureOutcome(new, innovation, expected, nis, max(both - nis, 0.0))
+
+    def of_shift(self) -> Measure:
+        """The measurement without its shear."""
+        return replace(self, shift=self.shift[:2], covariance=self.covariance[:2, :2])
+
+
+def _square(vector: Array, covariance: Array) -> float:
+    return float(vector @ np.linalg.solve(covariance, vector))

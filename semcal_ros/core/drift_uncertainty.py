@@ -1,0 +1,66 @@
+"""What the calibration does not know, in the drift."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+
+__all__ = ["carry_covariance", "relative_scale_sigma", "scale_covariance"]
+
+Array = NDArray[np.float64]
+
+# Places of the parameters in ScanCamera.covariance.
+_SCALES, _CENTRE = slice(0, 3), slice(3, 5)
+
+
+def _scale_jacobian(camera: ScanCamera, vector: Array) -> Array:
+    """(2, 3) derivative by m, aspect and skew of a length in the sem frame that spans given
+    pixels.
+    """
+    m, a, s = camera.m, camera.aspect, camera.skew
+    x, y = vector
+    by_m = np.array([a * x + s * y, y / a])
+    by_aspect = m * np.array([x, -y / a**2])
+    by_skew = m * np.array([y, 0.0])
+    pixels = np.stack([by_m, by_aspect, by_skew], axis=1)
+    return np.asarray(-np.linalg.solve(camera.ideal_from_sem_jacobian, pixels))
+
+
+def scale_covariance(camera: ScanCamera | None, drift: Array, velocity: Array) -> Array:
+    """(4, 4) covariance of drift and velocity from that of the camera's scale, aspect and skew.
+
+    Zero without a camera (the drift is in pixels) and for a camera that is known exactly.
+    """
+    if camera is None or camera.covariance is None:
+        return np.zeros((4, 4))
+    jacobian = np.vstack([_scale_jacobian(camera, drift), _scale_jacobian(camera, velocity)])
+    return np.asarray(jacobian @ camera.covariance[_SCALES, _SCALES] @ jacobian.T)
+
+
+def relative_scale_sigma(camera: ScanCamera | None) -> float:
+    """1-sigma of the camera's scale as a fraction of it; 0 where it is known exactly."""
+    if camera is None or camera.covariance is None:
+        return 0.0
+    return float(np.sqrt(max(camera.covariance[0, 0], 0.0))) / camera.m
+
+
+def carry_covariance(before: ScanCamera, after: ScanCamera) -> Array:
+    """(2, 2) covariance in m^2 of the step that a change of magnification seems to make.
+
+    The zoom is about the principal point, which the calibration has for all magnifications at once:
+    an error of it by e px moves the specimen by ``(1/m_after - 1/m_before) e``. Errors of the two
+    scales move it in proportion to the distance of the image's middle from the principal point.
+    """
+    metres = [np.linalg.inv(c.ideal_from_sem_jacobian) for c in (before, after)]
+    covariance = np.zeros((2, 2))
+    moved = metres[1] - metres[0]
+    centres = [c.covariance[_CENTRE, _CENTRE] for c in (before, after) if c.covariance is not None]
+    if centres:
+        covariance += moved @ max(centres, key=lambda c: float(np.trace(c))) @ moved.T
+    for camera, inverse in zip((before, after), metres, strict=True):
+        middle = 0.5 * np.array([camera.width - 1.0, camera.height - 1.0])
+        from_centre = inverse @ (middle - np.array([camera.px, camera.py]))
+        covariance += scale_covariance(camera, from_centre, np.zeros(2))[:2, :2]
+    return covariance
