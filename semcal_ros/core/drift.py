@@ -78,6 +78,7 @@ class DriftTracker:
         self._misses = 0
         self._surprises = Surprises()
         self._last: tuple[Shot, float] | None = None
+        self._doubt = np.zeros((2, 2))
 
     def update(
         self,
@@ -172,6 +173,7 @@ class DriftTracker:
 
     def _followed(self, drift: DriftFilter, shot: Shot) -> DriftUpdate:
         limits = self.settings
+        self._doubt = np.zeros((2, 2))
         candidates = self._store.candidates(
             drift.state, shot, limits.rekey_overlap, limits.max_ratio
         )
@@ -211,6 +213,9 @@ class DriftTracker:
             )
             widened = self._surprises.believed(state, seen, reach, state.time_s - since_s)
             if widened is None:
+                # Either is wrong, and the one who reads this has to be warned.
+                doubt = (seen - state.position) / 3.0
+                self._doubt = np.outer(doubt, doubt)
                 return f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
             drift.do(widened)
         if found.candidate.rescaled:
@@ -315,14 +320,15 @@ class DriftTracker:
         assert self._filter is not None
         state = self._filter.state
         reason = status.removeprefix("coasting: ") if status.startswith("coasting") else ""
-        scale = scale_covariance(shot.camera, state.position, state.velocity)
+        open_ = scale_covariance(shot.camera, state.position, state.velocity)
+        open_[:2, :2] += self._doubt
         joint = np.full(4, np.nan) if registration is None else registration.joint_px
         spread = np.full((4, 4), np.inf) if registration is None else registration.joint_covariance
         return DriftUpdate(
             time_s=state.time_s,
             drift_m=state.position.copy(),
             velocity_m_s=state.velocity.copy(),
-            covariance=state.own + scale,
+            covariance=state.own + open_,
             status=status,
             accepted=not reason,
             reason=reason,

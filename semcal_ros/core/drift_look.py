@@ -19,7 +19,9 @@ __all__ = ["Found", "look"]
 
 Array = NDArray[np.float64]
 
-_LOOKS = 3
+_LOOKS = 4
+# Part of the picture's height by which drift may shear it.
+_LARGEST_SHEAR = 0.03
 
 
 @dataclass(frozen=True)
@@ -113,11 +115,13 @@ def _once(
         guess_px=px_from_unit @ shift,
         guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
         image_region=region,
+        max_shear_px=0.0 if shot.timing is None else _LARGEST_SHEAR * shot.size[1],
     )
     if not registration.accepted:
         return registration
     averaged = np.inf if candidate.rescaled else float(store.averaged(key))
-    measure = measure_of(key, store[key].shot, shot, registration, velocity, averaged)
+    before = store[key].shot
+    measure = measure_of(key, before, shot, registration, velocity, averaged, drift.psd)
     if drift.pending == key:
         drift.settle(keyframe_noise(measure))
     return Found(candidate, registration, picture, region, velocity, measure)

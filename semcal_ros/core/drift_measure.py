@@ -41,7 +41,13 @@ def bends(velocity: Array, shot: Shot) -> bool:
 
 
 def measure_of(
-    key: int, before: Shot, now: Shot, registration: Registration, removed: Array, averaged: float
+    key: int,
+    before: Shot,
+    now: Shot,
+    registration: Registration,
+    removed: Array,
+    averaged: float,
+    acceleration_psd: float,
 ) -> Measure:
     """Measurement by a registration of ``now`` against a keyframe that began with ``before``.
 
@@ -58,12 +64,22 @@ def measure_of(
     averaged
         Number of frames in the keyframe's mean. Its noise is the keyframe's own and not part of
         the measurement's.
+    acceleration_psd
+        How restless the drift is. While the frame is scanned it leaves the straight line: a random
+        acceleration of density q over the time T moves the mean of the drift by ``q T^3 / 320``
+        (variance) from the drift at the middle, and the mean of the velocity by ``q T / 12``.
     """
     unit = np.linalg.inv(now.px_from_unit)
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
     covariance = share * registration.covariance + np.eye(2) * _SHIFT_FLOOR_PX**2
+    scan_s = 0.0 if now.timing is None else now.timing.acquisition_time_s
+    restless = np.eye(2) * acceleration_psd * scan_s
     if now.timing is None or not np.all(np.isfinite(registration.joint_px)):
-        return Measure(key, unit @ registration.shift_px, unit @ covariance @ unit.T)
+        return Measure(
+            key,
+            unit @ registration.shift_px,
+            unit @ covariance @ unit.T + restless * scan_s**2 / 320.0,
+        )
     frame_s = now.timing.frame_time_s
     both = np.kron(np.diag([1.0, 1.0 / frame_s]), unit)
     part = max(_SHEAR_OF_SHIFT, relative_scale_sigma(now.camera) / 3.0)
@@ -73,7 +89,10 @@ def measure_of(
     joint = share * registration.joint_covariance + floor
     shift = both @ registration.joint_px + np.append(np.zeros(2), removed)
     ratio = 1.0 if before.timing is None else before.timing.frame_time_s / frame_s
-    return Measure(key, shift, both @ joint @ both.T, ratio)
+    total = both @ joint @ both.T
+    total[:2, :2] += restless * scan_s**2 / 320.0
+    total[2:, 2:] += restless / 12.0
+    return Measure(key, shift, total, ratio)
 
 
 def keyframe_noise(measure: Measure) -> Array:

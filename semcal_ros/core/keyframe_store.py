@@ -155,7 +155,7 @@ class KeyframeStore:
         for key, keyframe in self._frames.items():
             ratio = scale_ratio(keyframe.shot, shot)
             if ratio <= max_ratio and key in state.keys:
-                shift = shot.px_from_unit @ state.shift_from(key)[0]
+                shift = shot.px_from_unit @ (state.position - state.where(key)[:2])
                 left = np.clip(1.0 - np.abs(shift) / np.array(shot.size), 0.0, 1.0)
                 found.append(Candidate(key, ratio, float(left[0] * left[1])))
 

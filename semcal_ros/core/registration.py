@@ -269,6 +269,7 @@ def register(
     reference_region: Region | None = None,
     image_region: Region | None = None,
     settings: RegistrationSettings | None = None,
+    max_shear_px: float = 0.0,
 ) -> Registration:
     """Measure the shift of ``image`` against ``reference``.
 
@@ -286,6 +287,9 @@ def register(
         Valid rectangles; None for all of the picture.
     settings
         Limits of acceptance.
+    max_shear_px
+        Largest shear that may be due to drift during the scan. Up to it the upper and the lower
+        half of the picture may disagree in proportion.
 
     Returns
     -------
@@ -322,14 +326,19 @@ def register(
     fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
     if fine is None:
         return _refused(_NOTHING)
-    return _judged(prepared, gray, peak, fine, origin)
+    return _judged(prepared, gray, peak, fine, origin, max_shear_px)
 
 
 def _judged(
-    reference: Reference, gray: Picture, peak: CoarsePeak, fine: Alignment, origin: Array
+    reference: Reference,
+    gray: Picture,
+    peak: CoarsePeak,
+    fine: Alignment,
+    origin: Array,
+    max_shear_px: float,
 ) -> Registration:
     likeness = _likeness(reference, gray, fine)
-    reason = _objection(reference.settings, peak, fine, likeness)
+    reason = _objection(reference.settings, peak, fine, likeness, max_shear_px)
     return Registration(
         shift_px=fine.shift_px + origin,
         covariance=fine.covariance,
@@ -358,7 +367,11 @@ def _likeness(reference: Reference, gray: Picture, fine: Alignment) -> float:
 
 
 def _objection(
-    limits: RegistrationSettings, peak: CoarsePeak, fine: Alignment, likeness: float
+    limits: RegistrationSettings,
+    peak: CoarsePeak,
+    fine: Alignment,
+    likeness: float,
+    max_shear_px: float,
 ) -> str:
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(fine.covariance))))
     if not worst <= limits.max_sigma_px:
@@ -374,6 +387,10 @@ def _objection(
         return f"pictures differ (likeness {likeness:.2f})"
     # Halves of a picture whose distortion is not removed differ by more than their noise.
     allowed = 5.0 * np.sqrt(fine.look_variance) + 0.3
+    shear = np.abs(fine.joint_px[2:])
+    if np.all(shear <= max_shear_px):
+        # What is left to the second look is how far the halves are from one line.
+        allowed[1] += shear
     if np.any(np.abs(fine.look_difference_px) > allowed):
         apart = float(np.max(np.abs(fine.look_difference_px)))
         return f"halves of the picture disagree by {apart:.1f} px"
