@@ -78,7 +78,7 @@ class Alignment:
     reference_variance, image_variance, common_covariance
         Second moments over the overlap.
     overlap
-        Fraction of the smaller picture that was compared.
+        Fraction of the smaller picture that both show.
     converged, iterations
         Whether the last step left nothing that matters, and the number of steps.
     """
@@ -232,7 +232,6 @@ def _finished(look: _Look, covariance: Array, converged: bool, passes: int) -> A
     gain = float(look.fit.gain[0])
     difference, variance = _halves(look, covariance)
     joint, joint_covariance = _with_shear(look)
-    smaller = min(level.size[0] * level.size[1], look.image_size[0] * look.image_size[1])
     factor = level.factor
     return Alignment(
         shift_px=look.improved * factor,
@@ -247,10 +246,17 @@ def _finished(look: _Look, covariance: Array, converged: bool, passes: int) -> A
         reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels,
         image_variance=float(look.sums.energy.sum() - seen[3] ** 2 / pixels) / pixels,
         common_covariance=float(seen[2] - whole[2, 3] * seen[3] / pixels) / pixels,
-        overlap=pixels / smaller,
+        overlap=_overlap(level.size, look.image_size, look.improved),
         converged=converged,
         iterations=passes,
     )
+
+
+def _overlap(reference: tuple[int, int], image: tuple[int, int], shift: Array) -> float:
+    both = 1.0
+    for a, b, s in zip(reference, image, shift, strict=True):
+        both *= max(0.0, min(float(a), b - float(s)) - max(0.0, -float(s)))
+    return both / min(reference[0] * reference[1], image[0] * image[1])
 
 
 def _weights(look: _Look) -> Array:

@@ -18,7 +18,7 @@ from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_look import Found, look
 from semcal_ros.core.drift_map import Drop, Measure, Move
-from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, loosened
+from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, bow_s2, loosened
 from semcal_ros.core.drift_surprise import Surprises
 from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
 from semcal_ros.core.drift_uncertainty import carry_covariance, scale_covariance
@@ -43,9 +43,11 @@ _LIKE_ENOUGH = 0.75
 _LIKE_ENOUGH_TO_ADD = 0.85
 _GAINS_TO_ADD = (0.5, 2.0)
 _SHEAR_TO_ADD_PX = 0.1
-# A frame's position as a keyframe is that which was measured, noise and all, but for so much of the
-# noise's variance and that of the part which did not overlap.
-_COPY_NOISE = 1e-4
+# A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
+# noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
+# frame's noise, this much, and this much times the part that did not overlap, as seen in the closure
+# of triples of frames.
+_COPY_NOISE, _COPY_NOISE_BESIDE = 0.15, 5.0
 
 
 class DriftTracker:
@@ -140,7 +142,7 @@ class DriftTracker:
         self._filter = DriftFilter(centre_s, self.settings.acceleration_psd, history=kept)
         if self._history is not None:
             self._history.begin(self._filter)
-        complaint = self._new_key(self._filter, shot, np.zeros(2))
+        complaint = self._new_key(self._filter, shot, np.zeros(4))
         if complaint:
             # Nothing can be measured against such a picture: wait for a better one.
             return self._report(shot, f"coasting: {complaint}", None, np.nan)
@@ -154,7 +156,7 @@ class DriftTracker:
         complaint = keyframe.reference(self.settings.registration).complaint
         if not complaint:
             key, gone = self._store.add(keyframe)
-            drift.settle_later(key, removed)
+            drift.settle_later(key, removed, bow_s2(shot))
             for old in gone:
                 drift.do(Drop(old))
         return complaint
@@ -166,7 +168,7 @@ class DriftTracker:
             # gets in a frame; a tenth of that is how much the pace is expected to change.
             unit_from_px = np.linalg.inv(shot.px_from_unit)
             step = self.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
-            drift.first_velocity(step / dt, (0.1 * step) ** 2 / dt**3)
+            drift.first_velocity(step / dt, (0.1 * step) ** 2 / dt**3, dt)
         drift.do(Move(centre_s))
 
     # -- measuring --------------------------------------------------------------------------------
@@ -201,16 +203,18 @@ class DriftTracker:
         away_px = np.abs(shot.px_from_unit @ (measure.shift[:2] - expected))
         if np.any(away_px > self.settings.max_jump * np.array(shot.size)):
             return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
-        outcome = (loosened(measure, before, shot) if found.candidate.rescaled else measure)(state)
+        loose = loosened(measure, before, shot) if found.candidate.rescaled else measure
+        outcome = loose(state, drift.restlessness)
         if outcome.shear_nis > _GATE:
             measure = measure.of_shift()
         since_s = state.time_s - (self._last[1] if self._last else state.time_s)
         # The first step has only a guessed prior, which must not refuse what two looks agree on.
         if drift.measured > 0 and outcome.nis > _GATE:
             seen = measure.shift[:2] + state.where(measure.key)[:2]
-            reach = np.asarray(
-                _REACH * self.settings.first_step_px * np.linalg.inv(shot.px_from_unit)
-            )
+            # What moves fast may also turn fast.
+            step_px = float(np.hypot(*(shot.px_from_unit @ state.velocity))) * since_s
+            reach_px = max(_REACH * self.settings.first_step_px, step_px)
+            reach = np.asarray(reach_px * np.linalg.inv(shot.px_from_unit))
             widened = self._surprises.believed(state, seen, reach, state.time_s - since_s)
             if widened is None:
                 # Either is wrong, and the one who reads this has to be warned.
@@ -220,7 +224,7 @@ class DriftTracker:
             drift.do(widened)
         if found.candidate.rescaled:
             measure = self._carried(drift, shot, found, measure)
-        drift.accept(measure, measure(drift.state))
+        drift.accept(measure)
         drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
         return ""
 
@@ -262,7 +266,7 @@ class DriftTracker:
         if unlike or overlap < enough:
             following = self._store.candidates(drift.state, shot, enough, 1.0)
             if unlike or following[0].overlap < enough:
-                share = 1.0 - min(overlap, 1.0) + _COPY_NOISE
+                share = _COPY_NOISE + _COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
                 noise = found.measure.covariance[:2, :2] * share
                 self._rekey(drift, shot, found, found.measure, noise)
                 status = "keyframe"
@@ -300,7 +304,7 @@ class DriftTracker:
 
     def _restarted(self, drift: DriftFilter, shot: Shot, reason: str) -> DriftUpdate:
         """Go on from the predicted drift with this frame as keyframe."""
-        complaint = self._new_key(drift, shot, drift.state.velocity)
+        complaint = self._new_key(drift, shot, drift.state.motion)
         if not complaint:
             self._misses = 0
             self._surprises.forget()
@@ -328,6 +332,7 @@ class DriftTracker:
             time_s=state.time_s,
             drift_m=state.position.copy(),
             velocity_m_s=state.velocity.copy(),
+            acceleration_m_s2=state.acceleration.copy(),
             covariance=state.own + open_,
             status=status,
             accepted=not reason,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from semcal_ros.core.drift_map import (
     DriftMap,
     Measure,
-    MeasureOutcome,
     Move,
     Operation,
+    Restlessness,
     Settle,
     Widen,
     still,
 )
-from semcal_ros.core.drift_smoothing import Event, Mark
+from semcal_ros.core.drift_smoothing import Event, Mark, likely_restlessness, replayed
 
 __all__ = ["DriftFilter"]
 
@@ -29,14 +29,18 @@ _LARGEST_NIS = 6.0
 # Process noise that moves the drift by less than this part of a measurement's sigma between two
 # frames is as good as none.
 _LEAST_MOTION = 0.02
+# Frames in which an acceleration is taken to fade: a longer memory follows a smooth drift more
+# closely and overshoots when a rough one turns.
+_MEMORY = 1.0
+# Numbers of measurements after which the restlessness is estimated anew from all of them.
+_LEARNT = (4, 8, 16)
 
 
 @dataclass
 class _Pending:
     """A keyframe whose own noise is known only when something is registered against it."""
 
-    key: int
-    removed: Array
+    settle: Settle
     index: int
     before: DriftMap
 
@@ -58,7 +62,7 @@ class DriftFilter:
         self.start = still(time_s)
         self.state = self.start
         self.events: list[Event] = []
-        self.psd = acceleration_psd or 0.0
+        self.restlessness = Restlessness(acceleration_psd or 0.0)
         self.measured = 0
         self._adapts = acceleration_psd is None
         self._history = history
@@ -67,42 +71,49 @@ class DriftFilter:
     @property
     def pending(self) -> int | None:
         """The keyframe that nothing was registered against yet."""
-        return None if self._pending is None else self._pending.key
+        return None if self._pending is None else self._pending.settle.key
 
     def do(self, operation: Operation) -> None:
         """Something happens to the state."""
-        self.state = operation(self.state, self.psd)
+        self.state = operation(self.state, self.restlessness)
         self.events.append(operation)
 
     def mark(self) -> None:
         """The state of now is that of a frame."""
         if self._history:
             self.events.append(Mark())
-        elif self._pending is None:
+        elif self._pending is None and self.measured >= _LEARNT[-1]:
             self.events.clear()
 
-    def settle_later(self, key: int, removed: Array) -> None:
-        """The frame of now becomes a keyframe that was not measured; its noise is told later."""
-        self._pending = _Pending(key, removed, len(self.events), self.state)
-        self.do(Settle(key, removed, np.zeros((4, 4))))
+    def settle_later(self, key: int, removed: Array, bow: float) -> None:
+        """The frame of now becomes a keyframe that was not measured; its noise is told later.
 
-    def first_velocity(self, sigma: float, psd: float) -> None:
-        """Prior of the velocity: the keyframe of the first frame was taken at it, too."""
+        The arguments are those of :class:`~semcal_ros.core.drift_map.Settle`.
+        """
+        settle = Settle(key, removed, bow, np.zeros((4, 4)), 0.0)
+        self._pending = _Pending(settle, len(self.events), self.state)
+        self.do(settle)
+
+    def first_velocity(self, sigma: float, psd: float, interval_s: float) -> None:
+        """Prior of the velocity, and of how restless the drift is; the keyframe of the first frame
+        was taken at that velocity, too.
+        """
         pending = self._pending
         assert pending is not None
-        widened = Widen(np.diag([0.0, 0.0, sigma**2, sigma**2]))
+        given = self.restlessness.psd
+        self.restlessness = Restlessness(psd if self._adapts else given, _MEMORY * interval_s)
+        variances = [0.0, sigma**2, self.restlessness.acceleration_variance]
+        widened = Widen(np.diag(np.repeat(variances, 2)))
         self.events.insert(pending.index, widened)
         pending.index += 1
-        pending.before = widened(pending.before)
-        if self._adapts:
-            self.psd = psd
+        pending.before = widened(pending.before, self.restlessness)
         self._again()
 
-    def settle(self, noise: Array) -> None:
-        """The noise (4, 4) of the keyframe that was pending."""
+    def settle(self, noise: Array, scan_s: float) -> None:
+        """The noise (4, 4) of the keyframe that was pending, and the time it took."""
         pending = self._pending
         if pending is not None:
-            self.events[pending.index] = Settle(pending.key, pending.removed, noise)
+            self.events[pending.index] = replace(pending.settle, noise=noise, scan_s=scan_s)
             self._again()
 
     def _again(self) -> None:
@@ -112,15 +123,20 @@ class DriftFilter:
         state = pending.before
         for event in self.events[pending.index :]:
             if isinstance(event, Operation):
-                state = event(state, self.psd)
+                state = event(state, self.restlessness)
         self.state = state
 
-    def accept(self, measure: Measure, outcome: MeasureOutcome) -> None:
+    def accept(self, measure: Measure) -> None:
         """A measurement is used."""
-        self.state = outcome.state
+        self.state = measure(self.state, self.restlessness).state
         self.events.append(measure)
         self._pending = None
         self.measured += 1
+        if self._adapts and self.measured in _LEARNT:
+            # The guess that all began with is worth less than what was seen since.
+            near = self.restlessness
+            self.restlessness = likely_restlessness(self.start, self.events, near, (1.0,))
+            self.state = replayed(self.start, self.events, self.restlessness)
 
     def adapt(self, nis: float, noise: Array, dt_s: float) -> None:
         """Nudge the process noise until innovations are as large as predicted (2 on average).
@@ -131,8 +147,9 @@ class DriftFilter:
             return
         excess = float(np.clip(0.5 * nis, 0.0, _LARGEST_NIS)) - 1.0
         least = 3.0 * _LEAST_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
-        self.psd = max(self.psd * float(np.exp(_PACE * excess)), least)
+        psd = max(self.restlessness.psd * float(np.exp(_PACE * excess)), least)
+        self.restlessness = replace(self.restlessness, psd=psd)
 
     def forecast(self, time_s: float) -> DriftMap:
         """The state at a later time, from what is known now."""
-        return Move(time_s)(self.state, self.psd)
+        return Move(time_s)(self.state, self.restlessness)

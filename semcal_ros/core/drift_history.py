@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_path import DriftPath, path_of_updates
-from semcal_ros.core.drift_smoothing import likely_acceleration_psd, smoothed
+from semcal_ros.core.drift_smoothing import likely_restlessness, smoothed
 from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.drift_uncertainty import scale_covariance
 from semcal_ros.core.errors import InvalidValueError
@@ -39,13 +39,10 @@ class DriftHistory:
         self._stretches[-1][1].append(update)
         self._cameras.append(camera)
 
-    def smoothed(self, acceleration_psd: float | None = None) -> DriftPath:
+    def smoothed(self) -> DriftPath:
         """The drift of all frames so far, each with the knowledge of all of its stretch.
 
-        Parameters
-        ----------
-        acceleration_psd
-            Process noise, length^2 / s^3; None takes the most likely one.
+        How restless it is, is what makes the measurements most likely.
 
         Raises
         ------
@@ -56,10 +53,10 @@ class DriftHistory:
             raise InvalidValueError("no frames", expected="at least one", do="track some first")
         updates: list[DriftUpdate] = []
         for drift, stretch in self._stretches:
-            psd = acceleration_psd
-            if psd is None:
-                psd = likely_acceleration_psd(drift.start, drift.events, max(drift.psd, 1e-60))
-            states = smoothed(drift.start, drift.events, psd)
+            restlessness = drift.restlessness
+            if restlessness.psd > 0.0:
+                restlessness = likely_restlessness(drift.start, drift.events, restlessness)
+            states = smoothed(drift.start, drift.events, restlessness)
             for update, state in zip(stretch, states, strict=True):
                 camera = self._cameras[len(updates)]
                 scale = scale_covariance(camera, state.position, state.velocity)
@@ -68,6 +65,7 @@ class DriftHistory:
                         update,
                         drift_m=state.position,
                         velocity_m_s=state.velocity,
+                        acceleration_m_s2=state.acceleration,
                         covariance=state.own + scale,
                     )
                 )

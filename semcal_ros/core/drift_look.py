@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_map import DriftMap, Measure, Reshear
-from semcal_ros.core.drift_measure import bends, keyframe_noise, measure_of
+from semcal_ros.core.drift_measure import bends, bow_s2, keyframe_noise, measure_of
 from semcal_ros.core.keyframe import Shot, make_keyframe, picture_of
 from semcal_ros.core.keyframe_store import Candidate, KeyframeStore
 from semcal_ros.core.rectify import Rectifier
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 _LOOKS = 4
 # Part of the picture's height by which drift may shear it.
-_LARGEST_SHEAR = 0.03
+_LARGEST_SHEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Found:
     picture, region
         The frame as it was compared, and the part of it that was scanned.
     removed
-        (2,) drift velocity whose shear was removed from it.
+        (4,) drift velocity and acceleration that were removed from it.
     measure
         What it says of the drift.
     """
@@ -62,20 +62,32 @@ def look(
     Found or Registration
         The latter where it was refused.
     """
-    velocity = drift.state.velocity
-    found = _once(drift, store, candidate, shot, rectifier, velocity)
+    motion = drift.state.motion
+    first = motion if _removable(motion, shot) else np.zeros(4)
+    found = _once(drift, store, candidate, shot, rectifier, first)
     for _ in range(_LOOKS - 1):
         if isinstance(found, Registration):
             break
-        state = found.measure(drift.state).state
-        bent = _straightened(drift, store, candidate, state, rectifier)
-        if not bent and not bends(state.velocity - found.removed, shot):
+        state = found.measure(drift.state, drift.restlessness).state
+        if not _removable(state.motion, shot):
+            # A jump, not a drift: it is for the filter to judge.
             break
-        again = _once(drift, store, candidate, shot, rectifier, state.velocity)
+        bent = _straightened(drift, store, candidate, state, rectifier)
+        if not bent and not bends(state.motion - found.removed, shot):
+            break
+        again = _once(drift, store, candidate, shot, rectifier, state.motion)
         if isinstance(again, Registration):
             break
         found = again
     return found
+
+
+def _removable(motion: Array, shot: Shot) -> bool:
+    """Whether a motion can be that of a specimen during a frame."""
+    if shot.timing is None:
+        return True
+    way_px = np.abs(shot.px_from_unit @ motion[:2]) * shot.timing.frame_time_s
+    return float(np.max(way_px)) <= _LARGEST_SHEAR * shot.size[1]
 
 
 def _straightened(
@@ -87,12 +99,12 @@ def _straightened(
 ) -> bool:
     """Whether the keyframe was sheared, and now no longer is; only a single frame can be."""
     keyframe = store[candidate.key]
-    left = state.where(candidate.key)[2:]
+    left = np.append(state.where(candidate.key)[2:], np.zeros(2))
     if candidate.rescaled or keyframe.averaged > 1 or not bends(left, keyframe.shot):
         return False
     removed = keyframe.removed + left
     store.replace(candidate.key, make_keyframe(keyframe.shot, removed, rectifier, keyframe.time_s))
-    drift.do(Reshear(candidate.key, left))
+    drift.do(Reshear(candidate.key, left, bow_s2(keyframe.shot)))
     return True
 
 
@@ -102,10 +114,10 @@ def _once(
     candidate: Candidate,
     shot: Shot,
     rectifier: Rectifier,
-    velocity: Array,
+    motion: Array,
 ) -> Found | Registration:
     key = candidate.key
-    picture, region = picture_of(shot, velocity, rectifier)
+    picture, region = picture_of(shot, motion, rectifier)
     reference = store.carried(key, shot) if candidate.rescaled else store.reference(key)
     shift, covariance = drift.state.shift_from(key)
     px_from_unit = shot.px_from_unit
@@ -121,7 +133,7 @@ def _once(
         return registration
     averaged = np.inf if candidate.rescaled else float(store.averaged(key))
     before = store[key].shot
-    measure = measure_of(key, before, shot, registration, velocity, averaged, drift.psd)
+    measure = measure_of(key, before, shot, registration, motion, averaged)
     if drift.pending == key:
-        drift.settle(keyframe_noise(measure))
-    return Found(candidate, registration, picture, region, velocity, measure)
+        drift.settle(keyframe_noise(measure), measure.scan_s)
+    return Found(candidate, registration, picture, region, motion, measure)

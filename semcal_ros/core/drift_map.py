@@ -1,21 +1,23 @@
 """Drift and the positions of its keyframes, estimated together.
 
-The state holds the drift p and its velocity v, and for each keyframe j where its picture lies: the
-drift m_j at which it seems to have been taken, and the velocity w_j by which it still is sheared.
-A frame with noise n that is registered against keyframe j has
+The state holds the drift p, its velocity v and acceleration a, and for each keyframe j where its
+picture lies: the drift m_j at which it seems to have been taken, and the velocity w_j by which it
+still is sheared. A frame with noise n that is registered against keyframe j has
 
-    shift = p - m_j + n,        shear = T v - T_j w_j + n'
+    shift = p + a b - m_j + n,        shear = T v - T_j w_j + n'
 
-with the frame times T. All of this is linear, so one Kalman filter holds it, with every correlation:
+with the frame times T, and with b = A^2 / 24 for an acquisition that takes A: so far the mean of an
+accelerated drift is from its middle. All of this is linear, so one Kalman filter holds it, with every correlation:
 the noise of a keyframe is shared by all frames that were registered against it and does not average
 out, and coming back to an old keyframe undoes what was lost on the way. A frame that becomes a
 keyframe itself seems to lie at ``m_new = m_j + shift`` exactly, noise and all, so that a chain of
 keyframes is no more than copies of the state.
 
-Between frames the drift moves at constant velocity with white acceleration of power spectral
-density q (length^2 / s^3; Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2,
-doi:10.1002/0471221279). Each operation is an object that can be done again with another q, and
-undone backwards (:mod:`semcal_ros.core.drift_smoothing`). Any length unit will do.
+Between frames the acceleration is random and fades with a time constant (Singer 1970,
+doi:10.1109/TAES.1970.310128; with none it is white, and the drift has a constant velocity but for
+that: Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2, doi:10.1002/0471221279). Each operation is
+an object that can be done again with another restlessness, and undone backwards
+(:mod:`semcal_ros.core.drift_smoothing`). Any length unit will do.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
@@ -37,6 +40,7 @@ __all__ = [
     "Move",
     "Operation",
     "Reshear",
+    "Restlessness",
     "Settle",
     "Widen",
     "still",
@@ -44,8 +48,65 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_OWN = 4
+_OWN = 6
 _EACH = 4
+
+
+@dataclass(frozen=True)
+class Restlessness:
+    """How the drift changes by itself.
+
+    Attributes
+    ----------
+    psd
+        Power spectral density of the acceleration at low frequencies, length^2 / s^3.
+    memory_s
+        Time in which an acceleration fades; 0 for a white one.
+    """
+
+    psd: float
+    memory_s: float = 0.0
+
+    @property
+    def acceleration_variance(self) -> float:
+        """Of each component in the long run; 0 for a white one, whose variance says nothing."""
+        return 0.5 * self.psd / self.memory_s if self.memory_s > 0.0 else 0.0
+
+    def within(self, scan_s: float) -> Array:
+        """(4, 4) covariance of the mean drift and the mean velocity over an acquisition, given drift,
+        velocity and acceleration at its middle.
+
+        A white acceleration of density q gives ``q A^3 / 320`` and ``q A / 12`` over A seconds; of
+        one that lasts longer, the state knows a part.
+        """
+        unknown = self.psd
+        if self.memory_s > 0.0:
+            unknown *= min(1.0, 0.5 * scan_s / self.memory_s)
+        return np.diag(np.repeat([unknown * scan_s**3 / 320.0, unknown * scan_s / 12.0], 2))
+
+    def over(self, dt_s: float) -> tuple[Array, Array]:
+        """(3, 3) transition of ``[x, v, a]`` of one axis over an interval, and its noise."""
+        if not self.memory_s > 0.0:
+            move = np.array([[1.0, dt_s, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+            noise = np.zeros((3, 3))
+            noise[0, :2] = dt_s**3 / 3.0, dt_s**2 / 2.0
+            noise[1, :2] = dt_s**2 / 2.0, dt_s
+            return move, noise * self.psd
+        # Both at once from one matrix exponential (Van Loan 1978, doi:10.1109/TAC.1978.1101743).
+        rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / self.memory_s]])
+        driving = np.zeros((3, 3))
+        driving[2, 2] = 1.0 / self.memory_s**2
+        # In units in which the interval is 1.
+        unit = np.array([1.0, 1.0 / max(dt_s, 1e-300), 1.0 / max(dt_s, 1e-300) ** 2])
+        scaled = rates * dt_s / unit[:, None] * unit[None, :]
+        noise = driving * dt_s / np.outer(unit, unit)
+        both = scipy.linalg.expm(np.block([[-scaled, noise], [np.zeros((3, 3)), scaled.T]]))
+        move = both[3:, 3:].T
+        spread = move @ both[:3, 3:]
+        return (
+            np.asarray(move * unit[:, None] / unit[None, :]),
+            np.asarray(0.5 * (spread + spread.T) * np.outer(unit, unit) * self.psd),
+        )
 
 
 @dataclass(frozen=True)
@@ -57,7 +118,7 @@ class DriftMap:
     time_s
         Time of the state, s.
     mean
-        (4 + 4 k,) ``[x, y, vx, vy]``, then ``[mx, my, wx, wy]`` of each of the k keyframes.
+        (6 + 4 k,) ``[x, y, vx, vy, ax, ay]``, then ``[mx, my, wx, wy]`` of each of the k keyframes.
     covariance
         Of ``mean``.
     keys
@@ -80,9 +141,19 @@ class DriftMap:
         return self.mean[2:4]
 
     @property
+    def acceleration(self) -> Array:
+        """(2,) drift acceleration, per s^2."""
+        return self.mean[4:6]
+
+    @property
+    def motion(self) -> Array:
+        """(4,) velocity and acceleration."""
+        return self.mean[2:6]
+
+    @property
     def own(self) -> Array:
         """(4, 4) covariance of drift and velocity."""
-        return self.covariance[:_OWN, :_OWN]
+        return self.covariance[:4, :4]
 
     def of(self, key: int) -> slice:
         """Where a keyframe's four numbers stand."""
@@ -131,13 +202,13 @@ def _same(state: DriftMap) -> Linear:
 class Operation:
     """Something that happens to the state and is linear."""
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """Its matrices for a state."""
         raise NotImplementedError
 
-    def __call__(self, state: DriftMap, acceleration_psd: float = 0.0) -> DriftMap:
+    def __call__(self, state: DriftMap, restlessness: Restlessness) -> DriftMap:
         """The state after it."""
-        return self.linear(state, acceleration_psd).of(state)
+        return self.linear(state, restlessness).of(state)
 
 
 @dataclass(frozen=True)
@@ -146,35 +217,37 @@ class Move(Operation):
 
     time_s: float
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described in the module.
 
         Raises
         ------
         InvalidValueError
-            If the time is earlier than the state's, or the noise density is negative.
+            If the time is earlier than the state's, or the restlessness negative.
         """
         dt = self.time_s - state.time_s
-        if not (dt >= 0.0 and acceleration_psd >= 0.0):
+        if not (dt >= 0.0 and restlessness.psd >= 0.0 and restlessness.memory_s >= 0.0):
             raise InvalidValueError(
-                f"a prediction from {state.time_s} s to {self.time_s} s with an acceleration noise"
-                f" of {acceleration_psd}",
-                expected="a later time and a number >= 0",
+                f"a prediction from {state.time_s} s to {self.time_s} s with {restlessness}",
+                expected="a later time and numbers >= 0",
             )
         step = _same(state)
-        step.matrix[0, 2] = step.matrix[1, 3] = dt
-        one = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-        step.covariance[:_OWN, :_OWN] = np.kron(one, np.eye(2)) * acceleration_psd
+        if dt > 0.0:
+            move, noise = restlessness.over(dt)
+            step.matrix[:_OWN, :_OWN] = np.kron(move, np.eye(2))
+            step.covariance[:_OWN, :_OWN] = np.kron(noise, np.eye(2))
         return replace(step, time_s=self.time_s)
 
 
 @dataclass(frozen=True)
 class Widen(Operation):
-    """Drift and velocity become more uncertain: noise of ``covariance`` (4, 4) is added."""
+    """Drift, velocity and acceleration become more uncertain: noise of ``covariance`` (6, 6) is
+    added.
+    """
 
     covariance: Array
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         step = _same(state)
         step.covariance[:_OWN, :_OWN] = self.covariance
@@ -185,22 +258,27 @@ class Widen(Operation):
 class Settle(Operation):
     """The frame of now becomes keyframe ``key`` without having been measured.
 
-    Its picture lies at the drift with its own noise ``noise`` (4, 4); ``removed`` (2,) is the
-    velocity whose shear was taken out of it.
+    Its picture lies at the drift with its own noise ``noise`` (4, 4); ``removed`` (4,) is the
+    velocity and the acceleration that were taken out of it, ``bow`` is b of the module, ``scan_s``
+    the time it took.
     """
 
     key: int
     removed: Array
+    bow: float
     noise: Array
+    scan_s: float
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         size = state.mean.size
         matrix = np.vstack([np.eye(size), np.eye(_EACH, size)])
+        matrix[size : size + 2, 4:6] = self.bow * np.eye(2)
         covariance = np.zeros((size + _EACH, size + _EACH))
-        covariance[size:, size:] = self.noise
+        covariance[size:, size:] = self.noise + restlessness.within(self.scan_s)
         offset = np.zeros(size + _EACH)
-        offset[size + 2 :] = -self.removed
+        offset[size : size + 2] = -self.bow * self.removed[2:]
+        offset[size + 2 :] = -self.removed[:2]
         return Linear(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
 
 
@@ -218,7 +296,7 @@ class Carry(Operation):
     time_ratio: float
     noise: Array
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         size = state.mean.size
         matrix = np.vstack([np.eye(size), np.zeros((_EACH, size))])
@@ -232,16 +310,18 @@ class Carry(Operation):
 
 @dataclass(frozen=True)
 class Reshear(Operation):
-    """The shear of another velocity ``removed`` (2,) was taken out of keyframe ``key``."""
+    """Another velocity and acceleration ``removed`` (4,) were taken out of keyframe ``key``."""
 
     key: int
     removed: Array
+    bow: float
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         step = _same(state)
         at = state.of(self.key)
-        step.offset[at.start + 2 : at.stop] = -self.removed
+        step.offset[at.start : at.start + 2] = -self.bow * self.removed[2:]
+        step.offset[at.start + 2 : at.stop] = -self.removed[:2]
         return step
 
 
@@ -251,7 +331,7 @@ class Drop(Operation):
 
     key: int
 
-    def linear(self, state: DriftMap, acceleration_psd: float) -> Linear:
+    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         size, at = state.mean.size, state.of(self.key)
         kept = np.delete(np.arange(size), np.arange(at.start, at.stop))
@@ -292,29 +372,37 @@ class Measure:
     Attributes
     ----------
     shift
-        (2,) shift, or (4,) shift and shear as a velocity (the shear over the frame time, plus the
-        velocity whose shear was taken out before).
+        (2,) shift, or (4,) shift and shear as a velocity (the shear over the frame time). What was
+        taken out of the frame before is added: the velocity, and to the shift b times the
+        acceleration.
     covariance
         Of ``shift``: the noise of the frame alone.
     time_ratio
         Frame time of the keyframe over that of the frame.
+    bow
+        b of the module.
+    scan_s
+        Time that the frame took.
     """
 
     key: int
     shift: Array
     covariance: Array
     time_ratio: float = 1.0
+    bow: float = 0.0
+    scan_s: float = 0.0
 
     def row(self, state: DriftMap) -> Array:
         """(2 or 4, n) derivative of the measurement by the state."""
         count, at = self.shift.size, state.of(self.key).start
         row = np.zeros((count, state.mean.size))
         row[:, :count] = np.eye(count)
+        row[:2, 4:6] = self.bow * np.eye(2)
         factors = [1.0, 1.0, self.time_ratio, self.time_ratio]
         row[:, at : at + count] = -np.diag(factors[:count])
         return row
 
-    def __call__(self, state: DriftMap) -> MeasureOutcome:
+    def __call__(self, state: DriftMap, restlessness: Restlessness) -> MeasureOutcome:
         """The state with the measurement used.
 
         Raises
@@ -323,9 +411,11 @@ class Measure:
             If the measurement is not finite or its covariance not positive definite.
         """
         row = self.row(state)
+        count = self.shift.size
+        noise = self.covariance + restlessness.within(self.scan_s)[:count, :count]
         innovation = self.shift - row @ state.mean
         mixed = state.covariance @ row.T
-        expected = row @ mixed + self.covariance
+        expected = row @ mixed + noise
         expected = 0.5 * (expected + expected.T)
         unit = np.sqrt(np.maximum(np.diag(expected), 0.0))
         if not (np.all(np.isfinite(innovation)) and np.all(unit > 0.0)):
@@ -340,7 +430,7 @@ class Measure:
         # Joseph's form stays symmetric and positive when the measurement is much sharper than the
         # prediction.
         keep = np.eye(state.mean.size) - gain @ row
-        covariance = keep @ state.covariance @ keep.T + gain @ self.covariance @ gain.T
+        covariance = keep @ state.covariance @ keep.T + gain @ noise @ gain.T
         new = replace(
             state,
             mean=state.mean + gain @ innovation,

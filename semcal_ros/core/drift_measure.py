@@ -16,6 +16,7 @@ __all__ = [
     "at_itself",
     "becoming_keyframe",
     "bends",
+    "bow_s2",
     "keyframe_noise",
     "loosened",
     "measure_of",
@@ -32,12 +33,23 @@ _SHEAR_OF_SHIFT = 1e-3
 _SHEAR_PX = 0.1
 
 
-def bends(velocity: Array, shot: Shot) -> bool:
-    """Whether drift at a velocity bends a frame by more than its shift is to be known to."""
+def bends(motion: Array, shot: Shot) -> bool:
+    """Whether drift with a velocity and an acceleration (4,) bends a frame by more than its shift
+    is to be known to.
+    """
     if shot.timing is None:
         return False
-    bend_px = np.abs(shot.px_from_unit @ velocity) * shot.timing.frame_time_s
-    return float(np.max(bend_px)) > _SHEAR_PX
+    time_s = shot.timing.frame_time_s
+    shear_px = np.abs(shot.px_from_unit @ motion[:2]) * time_s
+    bow_px = np.abs(shot.px_from_unit @ motion[2:]) * time_s**2 / 8.0
+    return float(np.max(np.maximum(shear_px, bow_px))) > _SHEAR_PX
+
+
+def bow_s2(shot: Shot) -> float:
+    """By how much the mean of an accelerated drift over a frame is from its middle, per unit of
+    acceleration.
+    """
+    return 0.0 if shot.timing is None else shot.timing.acquisition_time_s**2 / 24.0
 
 
 def measure_of(
@@ -47,7 +59,6 @@ def measure_of(
     registration: Registration,
     removed: Array,
     averaged: float,
-    acceleration_psd: float,
 ) -> Measure:
     """Measurement by a registration of ``now`` against a keyframe that began with ``before``.
 
@@ -60,26 +71,19 @@ def measure_of(
     registration
         Shift in px of ``now``.
     removed
-        (2,) drift velocity whose shear was removed from ``now``.
+        (4,) drift velocity and acceleration that were removed from ``now``.
     averaged
         Number of frames in the keyframe's mean. Its noise is the keyframe's own and not part of
         the measurement's.
-    acceleration_psd
-        How restless the drift is. While the frame is scanned it leaves the straight line: a random
-        acceleration of density q over the time T moves the mean of the drift by ``q T^3 / 320``
-        (variance) from the drift at the middle, and the mean of the velocity by ``q T / 12``.
     """
     unit = np.linalg.inv(now.px_from_unit)
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
     covariance = share * registration.covariance + np.eye(2) * _SHIFT_FLOOR_PX**2
+    bow = bow_s2(now)
     scan_s = 0.0 if now.timing is None else now.timing.acquisition_time_s
-    restless = np.eye(2) * acceleration_psd * scan_s
     if now.timing is None or not np.all(np.isfinite(registration.joint_px)):
-        return Measure(
-            key,
-            unit @ registration.shift_px,
-            unit @ covariance @ unit.T + restless * scan_s**2 / 320.0,
-        )
+        shift = unit @ registration.shift_px + bow * removed[2:]
+        return Measure(key, shift, unit @ covariance @ unit.T, bow=bow, scan_s=scan_s)
     frame_s = now.timing.frame_time_s
     both = np.kron(np.diag([1.0, 1.0 / frame_s]), unit)
     part = max(_SHEAR_OF_SHIFT, relative_scale_sigma(now.camera) / 3.0)
@@ -87,12 +91,9 @@ def measure_of(
     shear_floor = _SHEAR_FLOOR_PX**2 + (part * distance) ** 2
     floor = np.diag([_SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
     joint = share * registration.joint_covariance + floor
-    shift = both @ registration.joint_px + np.append(np.zeros(2), removed)
+    shift = both @ registration.joint_px + np.append(bow * removed[2:], removed[:2])
     ratio = 1.0 if before.timing is None else before.timing.frame_time_s / frame_s
-    total = both @ joint @ both.T
-    total[:2, :2] += restless * scan_s**2 / 320.0
-    total[2:, 2:] += restless / 12.0
-    return Measure(key, shift, total, ratio)
+    return Measure(key, shift, both @ joint @ both.T, ratio, bow, scan_s)
 
 
 def keyframe_noise(measure: Measure) -> Array:
@@ -116,15 +117,17 @@ def becoming_keyframe(
 ) -> Carry:
     """The measured frame becomes keyframe ``key``.
 
-    ``noise`` (2, 2) is what its position as a keyframe may differ from the measured one.
+    ``removed`` (4,) is what was taken out of it; by ``noise`` (2, 2) its position as a keyframe may
+    differ from the measured one.
     """
     full = np.zeros((4, 4))
     full[:2, :2] = noise
+    bow = measure.bow * removed[2:]
     if measure.shift.size == 4:
-        shift = measure.shift - np.append(np.zeros(2), removed)
+        shift = measure.shift - np.append(bow, removed[:2])
         full[2:, 2:] = measure.covariance[2:, 2:] * 0.01
     else:
-        shift = np.append(measure.shift, np.zeros(2))
+        shift = np.append(measure.shift - bow, np.zeros(2))
         full[2:, 2:] = state.own[2:, 2:]
     return Carry(key, measure.key, shift, measure.time_ratio, full)
 
@@ -133,5 +136,5 @@ def at_itself(key: int, measure: Measure, removed: Array) -> Measure:
     """What the frame that became keyframe ``key`` says of its own drift: it lies there but for its
     noise.
     """
-    shift = np.append(np.zeros(2), removed)[: measure.shift.size]
+    shift = np.append(measure.bow * removed[2:], removed[:2])[: measure.shift.size]
     return replace(measure, key=key, shift=shift, time_ratio=1.0)

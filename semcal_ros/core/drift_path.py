@@ -24,9 +24,9 @@ class DriftPath:
     ----------
     time_s
         (n,) centres of the acquisitions.
-    drift_m, velocity_m_s
-        (n, 2) drift since the first frame in the sem frame, and its rate; px and px/s where
-        ``calibrated`` is false.
+    drift_m, velocity_m_s, acceleration_m_s2
+        (n, 2) drift since the first frame in the sem frame, its rate, and the rate of that; px,
+        px/s and px/s^2 where ``calibrated`` is false.
     covariance
         (n, 4, 4) of ``[x, y, vx, vy]``.
     drift_px
@@ -48,6 +48,7 @@ class DriftPath:
     time_s: Array
     drift_m: Array
     velocity_m_s: Array
+    acceleration_m_s2: Array
     covariance: Array
     drift_px: Array
     sigma_px: Array
@@ -77,7 +78,8 @@ class DriftPath:
 
     def raster(self, index: int) -> RasterDrift:
         """The drift during one frame, as :class:`~semcal_ros.core.rectify.Rectifier` wants it."""
-        return RasterDrift(self.drift_m[index], self.velocity_m_s[index])
+        found = (self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
+        return RasterDrift(*(values[index] for values in found))
 
 
 def path_of_updates(updates: Sequence[DriftUpdate]) -> DriftPath:
@@ -88,6 +90,7 @@ def path_of_updates(updates: Sequence[DriftUpdate]) -> DriftPath:
         time_s=np.array([u.time_s for u in updates]),
         drift_m=np.array([u.drift_m for u in updates]).reshape(-1, 2),
         velocity_m_s=np.array([u.velocity_m_s for u in updates]).reshape(-1, 2),
+        acceleration_m_s2=np.array([u.acceleration_m_s2 for u in updates]).reshape(-1, 2),
         covariance=covariance,
         drift_px=np.array([u.drift_px for u in updates]).reshape(-1, 2),
         sigma_px=np.sqrt([np.diag(c) for c in px_covariance]).reshape(-1, 2),

@@ -4,7 +4,7 @@ What happened to the :class:`~semcal_ros.core.drift_map.DriftMap` while a record
 done again with the acceleration noise that makes the measurements most likely, and then undone
 backwards by the Rauch-Tung-Striebel recursion (Rauch, Tung and Striebel 1965, doi:10.2514/3.3166).
 With white acceleration the result is the cubic smoothing spline through the measurements (Wahba
-1978, doi:10.1111/j.2517-6161.1978.tb01050.x).
+1978, doi:10.1111/j.2517-6161.1978.tb01050.x), with one that lasts a stiffer one.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_map import DriftMap, Linear, Measure, Operation
+from semcal_ros.core.drift_map import DriftMap, Linear, Measure, Operation, Restlessness
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Event", "Mark", "likely_acceleration_psd", "smoothed"]
+__all__ = ["Event", "Mark", "likely_restlessness", "replayed", "smoothed"]
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class _Node:
 
 
 def _forwards(
-    start: DriftMap, events: Sequence[Event], psd: float
+    start: DriftMap, events: Sequence[Event], restlessness: Restlessness
 ) -> tuple[list[_Node], float, int]:
     """Nodes at all measurements and marks; minus twice the log likelihood of the measurements, and
     their number.
@@ -57,13 +57,13 @@ def _forwards(
     nodes = []
     for event in events:
         if isinstance(event, Operation):
-            linear = event.linear(state, psd)
+            linear = event.linear(state, restlessness)
             state = linear.of(state)
             step = _after(step, linear)
             continue
         predicted = state
         if isinstance(event, Measure):
-            outcome = event(state)
+            outcome = event(state, restlessness)
             state = outcome.state
             count += 1
             if count > 2:
@@ -87,7 +87,20 @@ def _after(first: Linear, second: Linear) -> Linear:
     return Linear(matrix, offset, covariance, second.time_s, second.keys)
 
 
-def smoothed(start: DriftMap, events: Sequence[Event], acceleration_psd: float) -> list[DriftMap]:
+def replayed(start: DriftMap, events: Sequence[Event], restlessness: Restlessness) -> DriftMap:
+    """The state after everything happened again."""
+    nodes, _, _ = _forwards(start, events, restlessness)
+    state = nodes[-1].filtered if nodes else start
+    last = max((k for k, e in enumerate(events) if not isinstance(e, Operation)), default=-1)
+    for event in events[last + 1 :]:
+        if isinstance(event, Operation):
+            state = event(state, restlessness)
+    return state
+
+
+def smoothed(
+    start: DriftMap, events: Sequence[Event], restlessness: Restlessness
+) -> list[DriftMap]:
     """States at the marks, each with the knowledge of all measurements.
 
     Parameters
@@ -96,15 +109,15 @@ def smoothed(start: DriftMap, events: Sequence[Event], acceleration_psd: float) 
         State before the first event.
     events
         What happened.
-    acceleration_psd
-        Power spectral density of the acceleration, length^2 / s^3.
+    restlessness
+        Of the drift.
 
     Raises
     ------
     InvalidValueError
-        If a time goes back or the density is negative.
+        If a time goes back or the restlessness is negative.
     """
-    nodes, _, _ = _forwards(start, events, acceleration_psd)
+    nodes, _, _ = _forwards(start, events, restlessness)
     found: list[DriftMap] = []
     after: DriftMap | None = None
     for k in range(len(nodes) - 1, -1, -1):
@@ -133,31 +146,50 @@ def _stepped_back(filtered: DriftMap, node: _Node, after: DriftMap) -> DriftMap:
     return replace(filtered, mean=mean, covariance=0.5 * (covariance + covariance.T))
 
 
-def likely_acceleration_psd(start: DriftMap, events: Sequence[Event], near: float) -> float:
-    """The acceleration noise that makes the measurements most likely.
+def likely_restlessness(
+    start: DriftMap,
+    events: Sequence[Event],
+    near: Restlessness,
+    memories: Sequence[float] = (0.0, 2.0, 8.0),
+) -> Restlessness:
+    """The restlessness that makes the measurements most likely.
 
     Parameters
     ----------
     start, events
         As for :func:`smoothed`; from a long recording the first part is taken.
     near
-        A value that is right within some orders of magnitude, greater than 0.
+        One whose density is right within some orders of magnitude, greater than 0, and whose
+        memory is that of few frames.
+    memories
+        Multiples of that memory to choose from; 0 is a white acceleration.
 
     Raises
     ------
     InvalidValueError
-        If ``near`` is not positive.
+        If the density of ``near`` is not positive.
     """
-    if not near > 0.0:
-        raise InvalidValueError(f"an acceleration noise of {near}", expected="a positive number")
+    if not near.psd > 0.0:
+        raise InvalidValueError(f"{near}", expected="a positive density")
     part = list(events)[: 4 * _MAX_FOR_LIKELIHOOD]
     if sum(isinstance(event, Measure) for event in part) < 4:
         return near
+    found = [_likely_psd(start, part, near.psd, m * near.memory_s) for m in memories]
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _likely_psd(
+    start: DriftMap, events: Sequence[Event], near: float, memory_s: float
+) -> tuple[float, Restlessness]:
+    """Minus twice the log likelihood of the best density, and it."""
+
+    def of(log_psd: float) -> Restlessness:
+        return Restlessness(near * float(np.exp(log_psd)), memory_s)
 
     def cost(log_psd: float) -> float:
-        return _forwards(start, part, near * float(np.exp(log_psd)))[1]
+        return _forwards(start, events, of(log_psd))[1]
 
-    grid = np.linspace(*_LOG_RANGE, 11)
+    grid = np.linspace(*_LOG_RANGE, 9)
     costs = [cost(float(v)) for v in grid]
     best = int(np.argmin(costs))
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
@@ -174,4 +206,4 @@ def likely_acceleration_psd(start: DriftMap, events: Sequence[Event], near: floa
             low, a, cost_a = a, b, cost_b
             b = low + ratio * (high - low)
             cost_b = cost(b)
-    return near * float(np.exp(0.5 * (low + high)))
+    return min(cost_a, cost_b), of(0.5 * (low + high))

@@ -48,10 +48,10 @@ class Surprises:
             return bool(np.linalg.norm(np.linalg.solve(reach, seen - expected)) <= 1.0)
 
         since_s = max(state.time_s - (earlier[-1][0] if earlier else last_s), 1e-9)
-        covariance = np.zeros((4, 4))
+        covariance = np.zeros((6, 6))
         covariance[:2, :2] = np.eye(2) * float(np.sum((seen - state.position) ** 2))
         if near(state.position):
-            covariance[2:, 2:] = covariance[:2, :2] / since_s**2
+            covariance[2:4, 2:4] = covariance[:2, :2] / since_s**2
             return Widen(covariance)
         paces = [state.velocity] if earlier else []
         if len(earlier) == 2:
@@ -59,6 +59,6 @@ class Surprises:
         for pace in paces:
             if near(earlier[-1][1] + pace * since_s):
                 turn = float(np.sum((pace - state.velocity) ** 2))
-                covariance[2:, 2:] = reach @ reach.T / since_s**2 + np.eye(2) * turn
+                covariance[2:4, 2:4] = reach @ reach.T / since_s**2 + np.eye(2) * turn
                 return Widen(covariance)
         return None

@@ -84,9 +84,9 @@ class DriftUpdate:
     ----------
     time_s
         Centre of the frame's acquisition.
-    drift_m, velocity_m_s
-        (2,) drift since the first frame in the sem frame, and its rate. In px and px/s of the raw
-        image where ``calibrated`` is false.
+    drift_m, velocity_m_s, acceleration_m_s2
+        (2,) drift since the first frame in the sem frame, its rate, and the rate of that. In px,
+        px/s and px/s^2 of the raw image where ``calibrated`` is false.
     covariance
         (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all pictures on the way and
         from what the camera's own covariance leaves open of the scale.
@@ -116,6 +116,7 @@ class DriftUpdate:
     time_s: float
     drift_m: Array
     velocity_m_s: Array
+    acceleration_m_s2: Array
     covariance: Array
     status: str
     accepted: bool
@@ -149,7 +150,7 @@ class DriftUpdate:
     @property
     def raster(self) -> RasterDrift:
         """The drift during this frame, as :class:`~semcal_ros.core.rectify.Rectifier` wants it."""
-        return RasterDrift(self.drift_m, self.velocity_m_s)
+        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
 
 
 @dataclass(frozen=True)

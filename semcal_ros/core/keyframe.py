@@ -81,7 +81,7 @@ class Keyframe:
     shot
         The frame it began with.
     removed
-        Drift velocity (unit per s) whose shear was removed from that frame.
+        (4,) drift velocity and acceleration (unit per s and s^2) that were removed from that frame.
     mean
         (h, w) float32 mean of the frames, in ideal pixels of the camera.
     region
@@ -144,22 +144,26 @@ def _gray(picture: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def picture_of(
-    shot: Shot, velocity: Array, rectifier: Rectifier
+    shot: Shot, motion: Array, rectifier: Rectifier
 ) -> tuple[NDArray[np.generic], Region]:
     """The frame in ideal pixels as if scanned in the instant of its centre, and the rectangle of
     it that was scanned.
+
+    ``motion`` (4,) is drift velocity and acceleration, unit per s and s^2.
     """
     width, height = shot.size
     camera = None if shot.rectified else shot.camera
     # The rectifier takes px where it is given no camera.
-    speed = velocity if camera is not None else shot.px_from_unit @ velocity
-    within_frame = np.abs(shot.px_from_unit @ velocity)
-    moving = (
-        shot.timing is not None and float(np.max(within_frame)) * shot.timing.frame_time_s > 1e-3
-    )
-    if camera is None and not moving:
+    unit = np.eye(2) if camera is not None else shot.px_from_unit
+    drift = None
+    if shot.timing is not None:
+        time_s = shot.timing.acquisition_time_s
+        bent = np.abs(shot.px_from_unit @ motion[:2]) * time_s
+        bent += np.abs(shot.px_from_unit @ motion[2:]) * time_s**2
+        if float(np.max(bent)) > 1e-3:
+            drift = RasterDrift(np.zeros(2), unit @ motion[:2], unit @ motion[2:])
+    if camera is None and drift is None:
         return shot.image, (0, 0, width, height)
-    drift = RasterDrift(np.zeros(2), speed) if moving else None
     region = _scanned(shot.size, camera, drift, shot.timing)
     return rectifier.rectify(shot.image, camera, drift, shot.timing), region
 
@@ -201,15 +205,15 @@ def _scanned(
     return left, top, right, bottom
 
 
-def make_keyframe(shot: Shot, velocity: Array, rectifier: Rectifier, time_s: float) -> Keyframe:
-    """A keyframe of a frame from which the shear of a velocity (2,) is removed."""
-    return keyframe_of(shot, velocity, *picture_of(shot, velocity, rectifier), time_s)
+def make_keyframe(shot: Shot, motion: Array, rectifier: Rectifier, time_s: float) -> Keyframe:
+    """A keyframe of a frame from which velocity and acceleration (4,) are removed."""
+    return keyframe_of(shot, motion, *picture_of(shot, motion, rectifier), time_s)
 
 
 def keyframe_of(
     shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
 ) -> Keyframe:
-    """A keyframe of a frame whose picture without the shear of ``removed`` (2,) is known."""
+    """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
     return Keyframe(shot, removed.copy(), _gray(picture).copy(), region, time_s)
 
 

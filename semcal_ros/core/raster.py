@@ -60,6 +60,11 @@ class ScanTiming:
         """Seconds from the stamp (start of the first pass) to the centre of the acquisition."""
         return 0.5 * self.acquisition_time_s
 
+    @property
+    def pass_variance_s2(self) -> float:
+        """Variance of the times at which the passes see one pixel, s^2."""
+        return self.frame_time_s**2 * (self.averages**2 - 1) / 12.0
+
     def pixel_offset_s(
         self, row: ArrayLike, col: ArrayLike, rows: int, cols: int
     ) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 The specimen drifts before it is projected and distorted, so an output pixel u, which is an ideal
 pixel of the camera with the specimen at zero drift, is found in the raw frame at
 
-    raw = distort(u + J d(t(raw))),    d(t) = d_centre + v (t - t_centre)
+    raw = distort(u + J d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
 
 with ``J`` the derivative of ideal pixels by sem-frame coordinates and ``t(raw)`` the time at which
 that raw pixel was scanned. The map is smooth, so it is evaluated exactly at a few Chebyshev nodes
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar, cast
 
 import cv2
@@ -61,11 +61,14 @@ class RasterDrift:
         (2,) drift at the centre of the acquisition: m in the sem frame, or px of the image where
         there is no camera.
     velocity
-        (2,) drift velocity, the same unit per s.
+        (2,) drift velocity at that moment, the same unit per s.
+    acceleration
+        (2,) its rate of change, the same unit per s^2.
     """
 
     position: Array
     velocity: Array
+    acceleration: Array = field(default_factory=lambda: np.zeros(2))
 
 
 def raw_from_output(
@@ -96,13 +99,17 @@ def raw_from_output(
     at_centre = xy + jacobian @ np.asarray(drift.position, dtype=np.float64)
     raw = at_centre if camera is None else camera.distort(at_centre)
     velocity = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
-    if timing is None or not np.any(velocity):
+    acceleration = jacobian @ np.asarray(drift.acceleration, dtype=np.float64)
+    if timing is None or not (np.any(velocity) or np.any(acceleration)):
         return raw
     width, height = size
     for _ in range(_MAX_STEPS):
         # A contraction as long as the drift moves by much less than a row while a row is scanned.
         offset_s = timing.pixel_offset_s(raw[:, 1], raw[:, 0], height, width)
-        moved = at_centre + (offset_s - timing.centre_offset_s)[:, None] * velocity
+        since_s = (offset_s - timing.centre_offset_s)[:, None]
+        # The mean over the passes of the square of the time.
+        square = since_s**2 + timing.pass_variance_s2
+        moved = at_centre + since_s * velocity + 0.5 * square * acceleration
         new = moved if camera is None else camera.distort(moved)
         change = np.abs(new - raw)
         raw = new
@@ -369,8 +376,10 @@ def _check_image(image: NDArray[np.generic]) -> None:
 def _check_drift(drift: RasterDrift | None) -> None:
     if drift is None:
         return
-    values = np.concatenate([np.ravel(drift.position), np.ravel(drift.velocity)])
-    if values.shape != (4,) or not np.all(np.isfinite(values)):
+    parts = (drift.position, drift.velocity, drift.acceleration)
+    values = np.concatenate([np.ravel(part) for part in parts])
+    if values.shape != (6,) or not np.all(np.isfinite(values)):
         raise InvalidValueError(
-            f"drift {values.tolist()}", expected="two finite positions and two finite velocities"
+            f"drift {values.tolist()}",
+            expected="two finite positions, velocities and accelerations each",
         )

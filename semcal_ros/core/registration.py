@@ -94,7 +94,7 @@ class Registration:
         Correlation of the two pictures over the overlap after the noise has been accounted for, at
         most 1.
     overlap
-        Compared fraction of the smaller picture.
+        Fraction of the smaller picture that both show.
     converged, iterations
         Of the refinement.
     accepted, reason

@@ -103,7 +103,8 @@ def test_rekeys_before_the_overlap_is_lost_and_chains_the_uncertainty() -> None:
     assert np.hypot(*updates[-1].drift_px) > 192.0
     error, sigma = np.array(run.errors_px), np.array(run.sigmas_px)
     assert np.all(np.abs(error) < 4.5 * sigma + 0.03)
-    assert sigma[-1, 0] > 1.5 * sigma[2, 0]
+    # Each of the keyframes on the way adds something.
+    assert sigma[-1, 0] > 1.5 * sigma[6, 0]
 
 
 def test_carries_drift_through_changes_of_magnification() -> None:
