@@ -43,7 +43,11 @@ test: lint ## everything that is checked: style, types, tests
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
 	@$(VENV_PYTHON) examples/demo.py
 
-bench: setup ## the benchmarks, as a table
+# Where what they compare with cannot be installed, the tables say so.
+bench: setup ## the benchmarks, as a table (installs what they compare with into .venv)
+	@$(VENV_PYTHON) -m pip install --quiet --no-input --disable-pip-version-check --no-deps \
+	  --no-build-isolation --use-pep517 -r requirements/bench.txt || \
+	  echo "bench: requirements/bench.txt could not be installed; going on without" >&2
 	@$(VENV_PYTHON) benchmarks/run.py
 
 clean: ## remove what make and the tools made, .venv too

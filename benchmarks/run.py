@@ -9,8 +9,9 @@ calibration.py            calibration methods (joint with and without residual f
                           interpolations of separate calibrations, cv2.calibrateCamera) on five
                           simulated microscopes and the reference recordings, judged at magnifications
                           that none of them saw; the corner finder beside OpenCV's
-drift.py                  registration beside phase correlation, ECC and, where it is installed,
-                          scikit-image, and the Cramer-Rao bound
+drift.py                  registration beside phase correlation, ECC, scikit-image, imreg_dft and
+                          pystackreg where they are installed, and the Cramer-Rao bound; the time of
+                          the tracker, and what it leaves of a drift inside of the frames
 coverage.py               how often the stated uncertainty of a calibration holds the truth
 rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
 live.py                   the node stream_corrector over DDS beside a process that only relays
