@@ -121,6 +121,7 @@ def test_the_rate_is_given_with_two_digits_of_its_uncertainty():
         time_s=np.arange(2.0),
         drift_m=two,
         velocity_m_s=velocity,
+        acceleration_m_s2=two,
         covariance=covariance,
         drift_px=two,
         sigma_px=two,

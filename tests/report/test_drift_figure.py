@@ -44,6 +44,7 @@ def sample(
         time_s=50.0 + interval_s * np.arange(frames),
         drift_m=drift,
         velocity_m_s=np.gradient(drift, interval_s, axis=0) if frames > 1 else np.zeros((1, 2)),
+        acceleration_m_s2=np.zeros((frames, 2)),
         covariance=covariance,
         drift_px=drift / 40e-9,
         sigma_px=np.stack([sigma, sigma], axis=1) / 40e-9,
