@@ -230,8 +230,9 @@ def _finished(look: _Look, covariance: Array, converged: bool, passes: int) -> A
     pixels = float(whole[3, 3])
     error = float(residuals(look.geometry, look.sums, look.fit).sum())
     gain = float(look.fit.gain[0])
-    difference, variance = _halves(look, covariance)
-    joint, joint_covariance = _with_shear(look)
+    weights = _weights(look)
+    difference, variance = _halves(look, covariance, weights)
+    joint, joint_covariance = _with_shear(look, weights)
     factor = level.factor
     return Alignment(
         shift_px=look.improved * factor,
@@ -271,39 +272,36 @@ def _weights(look: _Look) -> Array:
     return np.asarray(tiles)
 
 
-def _halves(look: _Look, covariance: Array) -> tuple[Array, Array]:
+def _halves(look: _Look, covariance: Array, weights: Array) -> tuple[Array, Array]:
     """Differences of the shifts of opposite halves, and their variances."""
     difference, variance = np.zeros((2, 2)), np.full((2, 2), np.inf)
     if look.geometry.alone:
         # Of a lone particle no half tells anything without the other.
         return difference, variance
-    scores, weights = look.fit.scores, _weights(look)
     cols = look.window.cols.stop - look.window.cols.start
-    rows = len(scores) // cols
-    index = np.arange(len(scores))
-    # Neighbouring tiles of smoothed noise are not independent.
-    single = np.diag(_sandwich(scores, _inverse(look.fit.information)))
-    colour = np.maximum(np.diag(covariance) / single, 1.0)
-    for k, first in enumerate((index % cols < cols // 2, index // cols < rows // 2)):
-        halves = [weights[part].sum(axis=0) for part in (first, ~first)]
-        if not all(well_posed(half) for half in halves):
+    scores, shape = look.fit.scores, (-1, cols)
+    whole, total = look.fit.information, scores.sum(axis=0)
+    # How much larger than that of white noise the variance of the whole is, holds for its halves.
+    colour = np.diag(covariance) / np.diag(_inverse(whole))
+    left, upper = np.s_[:, : cols // 2], np.s_[: len(scores) // cols // 2]
+    for k, first in enumerate((left, upper)):
+        half = weights.reshape(*shape, 2, 2)[first].sum(axis=(0, 1))
+        if not (well_posed(half) and well_posed(whole - half)):
             continue
-        inverses = [_inverse(half) for half in halves]
-        parts = [scores[first], scores[~first]]
-        steps = [-inv @ part.sum(axis=0) for inv, part in zip(inverses, parts, strict=True)]
-        spreads = [np.diag(_sandwich(p, inv)) for inv, p in zip(inverses, parts, strict=True)]
-        difference[k] = steps[0] - steps[1]
-        variance[k] = (spreads[0] + spreads[1]) * colour
+        score = scores.reshape(*shape, 2)[first].sum(axis=(0, 1))
+        inverses = _inverse(half), _inverse(whole - half)
+        difference[k] = -inverses[0] @ score + inverses[1] @ (total - score)
+        variance[k] = (np.diag(inverses[0]) + np.diag(inverses[1])) * colour
     return difference, variance
 
 
-def _with_shear(look: _Look) -> tuple[Array, Array]:
+def _with_shear(look: _Look, weights: Array) -> tuple[Array, Array]:
     """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
     cols = look.window.cols.stop - look.window.cols.start
     y = np.repeat(look.window.y, cols)
     powers = np.stack([np.ones_like(y), y], axis=1)
     pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
-    whole = (_weights(look).reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
+    whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
     scaled = information / np.outer(scale, scale)

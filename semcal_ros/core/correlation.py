@@ -142,7 +142,7 @@ def coarse_peaks(reference: CoarseReference, image: Pyramid, guess_px: Array) ->
         peaks = _peaks_at(reference, image, factor, guess_px)
         if peaks and (not best or peaks[0].significance > best[0].significance):
             best = peaks
-        if (peaks and peaks[0].significance >= _SIGNIFICANT) or factor == 1:
+        if (peaks and peaks[0].significant) or factor == 1:
             break
     return best if best and best[0].significant else []
 
@@ -274,8 +274,11 @@ def _box_sums(
     rows: tuple[NDArray[np.intp], ...],
     cols: tuple[NDArray[np.intp], ...],
 ) -> Image:
-    strips = table[rows[1]] - table[rows[0]]
-    return np.asarray(strips[:, cols[1]] - strips[:, cols[0]], dtype=np.float32)
+    strips = np.take(table, rows[1], axis=0) - np.take(table, rows[0], axis=0)
+    # Columns are gathered as rows, which lie together in memory.
+    strips = np.ascontiguousarray(strips.T)
+    sums = np.take(strips, cols[1], axis=0) - np.take(strips, cols[0], axis=0)
+    return np.asarray(sums.T, dtype=np.float32)
 
 
 def _surface(reference: _Half, image: _Half, geometry: _Geometry) -> Image:

@@ -38,6 +38,8 @@ _SMALLEST_PX = 48
 _SMALLEST_LEVEL_PX = 160
 _SATURATION_SAMPLES = 256
 _NATIVE = ("uint8", "uint16", "float32")
+# Part of the residual by which two shifts must differ to be told apart.
+_DIFFERENT = 0.05
 _NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
 
 
@@ -404,40 +406,40 @@ def _choose(
     guess: Array,
     spread: Array | None,
 ) -> CoarsePeak | str:
-    """The peak to believe, or the reason why none can be believed."""
-    limits, level = reference.settings, reference.levels[0]
+    """The peak to believe, or the reason why none can be believed.
+
+    Rivals are compared at full resolution: reduced pictures differ by how their pixels happen to
+    fall.
+    """
+    limits, level = reference.settings, reference.levels[-1]
     rivals = [p for p in peaks if p.correlation >= limits.rival_height * peaks[0].correlation]
     if len(rivals) > 1 and spread is not None:
         near = [p for p in rivals if _within(p, guess, spread)]
         # Only rivals that the prediction allows count, as long as it allows any.
         rivals = near or rivals
-    best = rivals[0]
     if len(rivals) == 1:
-        return best
-    aligned = [align([level], pyramid, np.array(p.shift_px)) for p in rivals]
-    candidates = [
-        (p, found.shift_px)
-        for p, found in zip(rivals, aligned, strict=True)
-        if found is not None and found.converged
-    ]
-    if not candidates:
-        return _NOTHING
-    best, shift = candidates[0]
-    energies = tile_energies(level, pyramid, shift)
-    for peak, other in candidates[1:]:
-        if float(np.max(np.abs(other - shift))) < 0.5 * level.factor:
+        return rivals[0]
+    best: tuple[CoarsePeak, Array, Array | None] | None = None
+    for peak in rivals:
+        found = align(reference.levels, pyramid, np.array(peak.shift_px))
+        if found is None or not found.converged:
             continue
-        theirs = tile_energies(level, pyramid, other)
-        verdict = _paired(energies, theirs)
+        theirs = found.shift_px, tile_energies(level, pyramid, found.shift_px)
+        if best is None:
+            best = (peak, *theirs)
+            continue
+        shift, other = best[1], theirs[0]
+        if float(np.max(np.abs(other - shift))) < 0.5:
+            continue
+        verdict = _paired(best[2], theirs[1])
         if abs(verdict) < limits.rival_deviations:
             return (
                 f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
-                f" ({other[0]:.1f}, {other[1]:.1f}) px"
-                " explain the picture equally well"
+                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well"
             )
         if verdict < 0.0:
-            best, shift, energies = peak, other, theirs
-    return best
+            best = (peak, *theirs)
+    return _NOTHING if best is None else best[0]
 
 
 def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:
@@ -448,16 +450,22 @@ def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:
 
 
 def _paired(first: Array | None, second: Array | None) -> float:
-    """By how many standard errors the second shift explains the common blocks worse than the
-    first.
+    """By how many standard errors the second shift explains the common tiles worse than the first;
+    0 where the difference does not matter.
     """
     if second is None:
         return np.inf
     if first is None:
         return -np.inf
     difference = (second - first).ravel()
-    difference = difference[np.isfinite(difference)]
-    if difference.size < 16:
+    common = np.isfinite(difference)
+    if np.count_nonzero(common) < 16:
         return 0.0
-    error = float(difference.std(ddof=1)) / np.sqrt(difference.size)
-    return float(difference.mean() / max(error, 1e-30))
+    difference = difference[common]
+    mean = float(difference.mean())
+    smaller = min(float(first.ravel()[common].mean()), float(second.ravel()[common].mean()))
+    if abs(mean) < _DIFFERENT * smaller:
+        # The interpolation is not perfect, and differs between shifts.
+        return 0.0
+    error = difference.std(ddof=1) / np.sqrt(difference.size)
+    return mean / max(float(error), 1e-30)

@@ -1,6 +1,6 @@
 """Band-limited sub-pixel shifts and derivatives as short separable filters.
 
-A pure translation needs no general remap: the same eight weights serve every pixel of a row. The
+A pure translation needs no general remap: the same twelve weights serve every pixel of a row. The
 weights minimise the squared error over the band in which a blurred picture has its power
 (least-squares fractional delay, Laakso et al. 1996, doi:10.1109/79.482137), so the interpolation
 error stays below the noise and does not depend on the fraction. OpenCV's remap is no substitute:
@@ -22,19 +22,19 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 #: Pixels that the filters reach beyond the patch on each side.
-MARGIN = 4
+MARGIN = 6
 
-_TAPS = 8
-_FIRST_TAP = -3
-_BAND = 0.65 * np.pi
+_TAPS = 12
+_FIRST_TAP = -5
+_BAND = 0.72 * np.pi
 _FREQUENCIES = (np.arange(64) + 0.5) / 64.0 * _BAND
 # Pictures have most of their power at low frequencies, so errors there weigh more.
-_WEIGHTS = 1.0 / (0.05 + _FREQUENCIES**2) ** 2
+_WEIGHTS = 1.0 / (0.05 + _FREQUENCIES**2)
 
 
 @lru_cache(maxsize=1)
 def _fit() -> Array:
-    """(8, 8) inverse of the normal equations of the weights."""
+    """(12, 12) inverse of the normal equations of the weights."""
     offsets = np.arange(_TAPS) + _FIRST_TAP
     difference = offsets[:, None] - offsets[None, :]
     normal = np.tensordot(_WEIGHTS, np.cos(_FREQUENCIES[:, None, None] * difference), axes=1)
@@ -44,7 +44,7 @@ def _fit() -> Array:
 
 
 def _shift_taps(fraction: float) -> Array:
-    """(8,) weights w with ``f(x + fraction) = sum_k w[k] f(x - 3 + k)``, for a fraction in [0,
+    """(12,) weights w with ``f(x + fraction) = sum_k w[k] f(x - 5 + k)``, for a fraction in [0,
     1].
     """
     away = np.arange(_TAPS) + _FIRST_TAP - fraction
@@ -54,7 +54,7 @@ def _shift_taps(fraction: float) -> Array:
 
 @lru_cache(maxsize=1)
 def derivative_taps() -> Array:
-    """(9,) antisymmetric weights of the first derivative at the centre tap."""
+    """(13,) antisymmetric weights of the first derivative at the centre tap."""
     reach = np.arange(1, MARGIN + 1)
     sines = 2.0 * np.sin(_FREQUENCIES[:, None] * reach)
     weighted = sines * _WEIGHTS[:, None]

@@ -25,7 +25,7 @@ Image = NDArray[np.float32]
 Picture = NDArray[np.generic]
 
 _LEAST_TILES = 3
-_PIXELS_FOR_SLOPES = 24_000
+_PIXELS_FOR_SLOPES = 12_000
 _BANDS = 3
 
 
