@@ -283,12 +283,17 @@ def _halves(look: _Look, covariance: Array, weights: Array) -> tuple[Array, Arra
     whole, total = look.fit.information, scores.sum(axis=0)
     # How much larger than that of white noise the variance of the whole is, holds for its halves.
     colour = np.diag(covariance) / np.diag(_inverse(whole))
-    left, upper = np.s_[:, : cols // 2], np.s_[: len(scores) // cols // 2]
-    for k, first in enumerate((left, upper)):
-        half = weights.reshape(*shape, 2, 2)[first].sum(axis=(0, 1))
+    on_grid, scores_on_grid = weights.reshape(*shape, 2, 2), scores.reshape(*shape, 2)
+    rows = len(on_grid)
+    halves = (
+        (on_grid[:, : cols // 2], scores_on_grid[:, : cols // 2]),
+        (on_grid[: rows // 2], scores_on_grid[: rows // 2]),
+    )
+    for k, (half_weights, half_scores) in enumerate(halves):
+        half = half_weights.sum(axis=(0, 1))
         if not (well_posed(half) and well_posed(whole - half)):
             continue
-        score = scores.reshape(*shape, 2)[first].sum(axis=(0, 1))
+        score = half_scores.sum(axis=(0, 1))
         inverses = _inverse(half), _inverse(whole - half)
         difference[k] = -inverses[0] @ score + inverses[1] @ (total - score)
         variance[k] = (np.diag(inverses[0]) + np.diag(inverses[1])) * colour
