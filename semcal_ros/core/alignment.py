@@ -47,7 +47,7 @@ _CONTRACTION = 0.06
 _CURVATURE = 0.5
 _SIGMAS_LEFT = 0.12
 _LEAST_LEFT_PX = 5e-4
-_BLOCK_SIGMAS = 9.0
+_BLOCK_SIGMAS = 14.0
 _LEAST_BLOCKS = 36
 # Rows of tiles from which a change of the shift over the rows can be told.
 _LEAST_ROWS = 6
