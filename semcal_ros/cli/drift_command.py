@@ -12,13 +12,17 @@ from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, progress, require_folder
 from semcal_ros.cli.drift_common import (
+    GIVE_FRAME_TIME,
     Follower,
     camera_of,
     echo_nominal_unit,
     echo_states,
+    frame_time_option,
     live_option,
     rate_text,
     start_time_s,
+    timing_seen,
+    with_frame_time,
 )
 from semcal_ros.core.drift_path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
@@ -39,6 +43,7 @@ _PLOT_SUFFIXES = (".png", ".svg", ".pdf")
 @click.option("--plot", type=click.Path(path_type=Path), help="Figure as png, svg or pdf, too.")
 @live_option
 @config_option
+@frame_time_option
 def command(
     recording: Path,
     output: Path,
@@ -46,6 +51,7 @@ def command(
     plot: Path | None,
     live: bool,
     config: str,
+    frame_time: float | None,
 ) -> None:
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
 
@@ -59,10 +65,15 @@ def command(
     require_folder(output)
     _check_plot(plot, output)
     model = None if calibration is None else Calibration.load(calibration)
-    microscope = configured(config, model)
+    microscope = with_frame_time(configured(config, model), frame_time)
     with open_recording(recording, microscope) as opened:
         stamps_ns, follower = _followed(opened, model, microscope)
-        notes = opened.notes
+        seen, note = timing_seen(microscope, follower, model)
+        if seen is not microscope and live:
+            note += f"; {GIVE_FRAME_TIME}"  # live, nobody could have known
+        elif seen is not microscope:
+            stamps_ns, follower = _followed(opened, model, seen)
+        notes = [*opened.notes, *([note] if note else [])]
     path = follower.path(live=live)
     write_csv(output, DRIFT_COLUMNS, _rows(stamps_ns, path))
     if plot is not None:

@@ -2,44 +2,52 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from dataclasses import replace
 
 import click
 import numpy as np
 
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.common import progress
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_path import DriftPath, path_of_updates
 from semcal_ros.core.drift_types import DriftUpdate
-from semcal_ros.core.errors import BagError
+from semcal_ros.core.frame_time import LEFT_IN, REMOVED, estimate_frame_time
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.files.recordings import Frame, Recording
+from semcal_ros.files.recordings import Frame
 
 __all__ = [
+    "GIVE_FRAME_TIME",
     "Follower",
-    "Job",
-    "Survey",
     "camera_of",
     "echo_nominal_unit",
     "echo_states",
+    "frame_time_option",
     "live_option",
     "rate_text",
     "start_time_s",
-    "surveyed",
+    "timing_seen",
+    "with_frame_time",
 ]
 
-_LISTED = 12
-# Grey levels of more than 8 bits are shown with these quantiles as black and white.
-_BLACK_WHITE = (0.001, 0.999)
 
+#: What a user can do about a timing that is not configured.
+GIVE_FRAME_TIME = "give the time of one pass as --frame-time or in a configuration"
+
+# Drift from frame to frame from which on its shear within them could matter, px.
+_FAST_PX = 0.5
+
+frame_time_option = click.option(
+    "--frame-time",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="S",
+    help="Seconds of one pass over a frame, instead of what the configuration says.",
+)
 live_option = click.option(
     "--live", is_flag=True, help="What was known live, without hindsight of later frames."
 )
@@ -58,19 +66,43 @@ def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) ->
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
 
 
-class Follower:
-    """Tracks the drift of a recording and looks at it once more with hindsight."""
+def with_frame_time(config: MicroscopeConfig, frame_time_s: float | None) -> MicroscopeConfig:
+    """The configuration with the time of one pass that ``--frame-time`` gives, if any.
 
-    def __init__(self) -> None:
-        self.history = DriftHistory()
+    Raises
+    ------
+    InvalidValueError
+        If it is no finite positive number.
+    """
+    if frame_time_s is None:
+        return config
+    if config.scan is None:
+        return replace(config, scan=ScanTiming(frame_time_s))
+    return replace(config, scan=replace(config.scan, frame_time_s=frame_time_s))
+
+
+class Follower:
+    """Tracks the drift of a recording and looks at it once more with hindsight.
+
+    Parameters
+    ----------
+    hindsight
+        Whether to keep what that takes.
+    """
+
+    def __init__(self, *, hindsight: bool = True) -> None:
+        self.history = DriftHistory() if hindsight else None
         self.tracker = DriftTracker(history=self.history)
         self.updates: list[DriftUpdate] = []
+        self._smoothed: DriftPath | None = None
 
     def update(
         self, frame: Frame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
-    ) -> None:
-        """The next frame."""
-        self.updates.append(self.tracker.update(frame.image, time_s, camera, scan))
+    ) -> DriftUpdate:
+        """Drift at the next frame."""
+        update = self.tracker.update(frame.image, time_s, camera, scan)
+        self.updates.append(update)
+        return update
 
     def path(self, *, live: bool) -> DriftPath:
         """Drift of all frames.
@@ -80,7 +112,69 @@ class Follower:
         live
             What was known at each frame when it came, without hindsight.
         """
-        return path_of_updates(self.updates) if live else self.history.smoothed()
+        if live or self.history is None:
+            return path_of_updates(self.updates)
+        if self._smoothed is None or len(self._smoothed) != len(self.updates):
+            self._smoothed = self.history.smoothed()
+        return self._smoothed
+
+
+# -- scan timing that no configuration tells ------------------------------------------------------
+
+
+def timing_seen(
+    config: MicroscopeConfig, follower: Follower, model: Calibration | None
+) -> tuple[MicroscopeConfig, str]:
+    """What drift tells of a raster whose timing is not configured.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    follower
+        Has tracked the recording with it.
+    model
+        Calibration, or None where distortion was left in.
+
+    Returns
+    -------
+    tuple
+        The configuration, with ``scan`` where that could be seen; a note for the user, empty where
+        there is nothing to tell.
+    """
+    if config.scan is not None or len(follower.updates) < 2:
+        return config, ""
+    path = follower.path(live=False)
+    shear_of_shift = LEFT_IN if model is None else REMOVED
+    found = estimate_frame_time(path, follower.updates, shear_of_shift=shear_of_shift)
+    if found.observable:
+        seen = _with_sigma(found.frame_time_s, found.sigma_s)
+        note = f"the configuration has no scan; the frames are sheared as if one pass took {seen} s"
+        return replace(config, scan=ScanTiming(found.frame_time_s)), note
+    step_px = _largest_step_px(follower.updates)
+    if not step_px > _FAST_PX:
+        return config, ""
+    return config, (
+        f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may "
+        f"shear the frames, too; {GIVE_FRAME_TIME}"
+    )
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """With as many decimals as one digit of the uncertainty has."""
+    digits = int(np.clip(-np.floor(np.log10(sigma)), 0, 9)) if sigma > 0.0 else 3
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}"
+
+
+def _largest_step_px(updates: Sequence[DriftUpdate]) -> float:
+    """Drift from one frame to the next in px of it, but for a tenth of the frames."""
+    pairs = [
+        (before, now)
+        for before, now in itertools.pairwise(updates)
+        if before.accepted and now.accepted
+    ]
+    steps = [np.hypot(*(b.px_from_unit @ (b.drift_m - a.drift_m))) for a, b in pairs]
+    return float(np.quantile(steps, 0.9)) if steps else 0.0
 
 
 def echo_states(states: Counter[str]) -> None:
@@ -107,172 +201,3 @@ def rate_text(path: DriftPath) -> str:
     digits = int(np.clip(1 - np.floor(np.log10(known)), 0, 9)) if known > 0.0 else 3
     parts = [f"{v:.{digits}f} +- {s:.{digits}f}" for v, s in zip(rate, sigma, strict=True)]
     return f"final drift rate: x {parts[0]}, y {parts[1]} nm/s"
-
-
-# -- frames of one magnification ------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Job:
-    """How the frames of a recording are to be read.
-
-    Attributes
-    ----------
-    model
-        Calibration, or None for nominal cameras.
-    microscope
-        Configuration.
-    at
-        The magnification to choose; None where there must be one only.
-    follower
-        Tracks the chosen frames; None for no drift.
-    """
-
-    model: Calibration | None
-    microscope: MicroscopeConfig
-    at: float | None = None
-    follower: Follower | None = None
-
-    def camera(self, frame: Frame) -> ScanCamera:
-        """Of a frame."""
-        return camera_of(frame, self.model, self.microscope)
-
-
-@dataclass
-class Survey:
-    """The frames of one magnification, size and encoding in a recording, and their drift.
-
-    Attributes
-    ----------
-    camera
-        Of the first frame.
-    dtype, size
-        Type of the grey levels; (width, height) in px.
-    first_stamp_ns
-        Stamp of the first frame.
-    follower
-        Their drift; None where it is not wanted.
-    chosen
-        Numbers of the frames as the recording gives them.
-    times_s
-        Starts of their acquisitions, s after the first stamp.
-    levels
-        Grey levels of each that are shown as black and white, where asked for.
-    other_kind
-        How many frames of the magnification have another size or encoding.
-    """
-
-    camera: ScanCamera
-    dtype: np.dtype[Any]
-    size: tuple[int, int]
-    first_stamp_ns: int
-    follower: Follower | None
-    chosen: list[int] = field(default_factory=list)
-    times_s: list[float] = field(default_factory=list)
-    levels: list[tuple[float, float]] = field(default_factory=list)
-    other_kind: int = 0
-
-    @cached_property
-    def path(self) -> DriftPath | None:
-        """Drift of the chosen frames; None where it is not wanted. For a finished survey."""
-        return None if self.follower is None else self.follower.path(live=False)
-
-
-def surveyed(
-    opened: Recording, job: Job, *, on_first: Callable[[Frame], None], levels: bool
-) -> Survey:
-    """Read a recording for the first time: choose its frames and track their drift.
-
-    Parameters
-    ----------
-    opened
-        The recording.
-    job
-        What to choose.
-    on_first
-        Called with the first chosen frame, to refuse it before any work is done.
-    levels
-        Whether black and white are wanted.
-
-    Raises
-    ------
-    BagError
-        There are several magnifications and none is chosen, the chosen one is not there, or time
-        runs backwards.
-    """
-    counts: Counter[str] = Counter()
-    wanted = None if job.at is None else _label(job.at)
-    survey: Survey | None = None
-    kind: tuple[object, ...] = ()
-    with progress(opened.frame_count, "drift" if job.follower else "reading") as bar:
-        for index, frame in enumerate(opened.frames()):
-            bar.update(1)
-            label = _label(frame.magnification)
-            counts[label] += 1
-            if label != (wanted or label) or (wanted is None and len(counts) > 1):
-                continue  # to be refused, or of no interest: only the magnification matters
-            if survey is None:
-                on_first(frame)
-                survey, kind = _begun(frame, job), _kind(frame)
-            if _kind(frame) != kind:
-                survey.other_kind += 1
-                continue
-            _add(survey, index, frame, job)
-            if levels:
-                survey.levels.append(_black_white(frame))
-    if survey is None or (wanted is None and len(counts) > 1):
-        _refuse_magnifications(opened, job, counts)
-    return survey
-
-
-def _label(magnification: float) -> str:
-    """A magnification as people read it: what a topic repeats may differ in the last digits."""
-    return f"{magnification:.6g}"
-
-
-def _kind(frame: Frame) -> tuple[object, ...]:
-    return (*frame.image.shape, frame.encoding)
-
-
-def _black_white(frame: Frame) -> tuple[float, float]:
-    values = frame.image[::4, ::4]
-    if values.dtype.kind == "f":
-        values = values[np.isfinite(values)]
-    low, high = np.quantile(values, _BLACK_WHITE) if values.size else (0.0, 1.0)
-    return float(low), float(high)
-
-
-def _begun(frame: Frame, job: Job) -> Survey:
-    height, width = frame.image.shape[:2]
-    size = width, height
-    return Survey(job.camera(frame), frame.image.dtype, size, frame.stamp_ns, job.follower)
-
-
-def _add(survey: Survey, index: int, frame: Frame, job: Job) -> None:
-    time_s = start_time_s(frame, survey.first_stamp_ns, job.microscope)
-    if survey.times_s and time_s < survey.times_s[-1]:
-        raise BagError(
-            f"image {index + 1} was taken {survey.times_s[-1] - time_s:g} s before the one before",
-            expected="images in the order of time",
-            do="record each pass of a replay to a recording of its own",
-        )
-    survey.chosen.append(index)
-    survey.times_s.append(time_s)
-    if job.follower is not None:
-        job.follower.update(frame, time_s, job.camera(frame), job.microscope.scan)
-
-
-def _refuse_magnifications(opened: Recording, job: Job, counts: Counter[str]) -> NoReturn:
-    labels = sorted(counts, key=float)
-    listed = ", ".join(labels[:_LISTED]) + (f", ... {labels[-1]}" if len(labels) > _LISTED else "")
-    if job.at is None:
-        raise BagError(
-            f"{opened.path} has frames at {len(labels)} magnifications: {listed}",
-            expected="frames of one magnification",
-            do="choose one with --at G",
-        )
-    raise BagError(
-        f"--at {job.at:g}: {opened.path} has no such frames",
-        expected=f"one of {listed}",
-        do="choose one of these magnifications",
-    )

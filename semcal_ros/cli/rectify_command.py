@@ -10,15 +10,25 @@ import click
 
 from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
-from semcal_ros.cli.drift_common import camera_of, echo_states, start_time_s
+from semcal_ros.cli.drift_common import (
+    GIVE_FRAME_TIME,
+    Follower,
+    camera_of,
+    echo_states,
+    frame_time_option,
+    start_time_s,
+    timing_seen,
+    with_frame_time,
+)
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker, DriftUpdate
+from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.rectify import Rectifier
 from semcal_ros.files.bags import BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording
@@ -88,6 +98,18 @@ class _Output:
         self._write("projection", frame.log_time_ns, projection)
 
 
+def _timing_notes(
+    microscope: MicroscopeConfig, follower: Follower | None, model: Calibration
+) -> list[str]:
+    """What the drift told of a scan timing that is not configured; it is too late to use it."""
+    if follower is None:
+        return []
+    seen, note = timing_seen(microscope, follower, model)
+    if seen is not microscope:
+        note += f"; {GIVE_FRAME_TIME}"
+    return [note] if note else []
+
+
 @click.command("rectify")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--calibration", required=True, type=click.Path(path_type=Path))
@@ -101,6 +123,7 @@ class _Output:
 )
 @click.option("--namespace", default="/sem", show_default=True, help="Of the topics in the output.")
 @config_option
+@frame_time_option
 @overwrite_option
 def command(
     recording: Path,
@@ -110,6 +133,7 @@ def command(
     interpolation: str,
     namespace: str,
     config: str,
+    frame_time: float | None,
     overwrite: bool,
 ) -> None:
     """Drift-free, undistorted copy of RECORDING with camera_info and projection per frame.
@@ -119,8 +143,8 @@ def command(
       semcal rectify recordings/zoom --calibration cal.yaml -o zoom_rect
     """
     model = Calibration.load(calibration)
-    microscope = configured(config, model)
-    tracker = None if no_drift else DriftTracker()
+    microscope = with_frame_time(configured(config, model), frame_time)
+    follower = None if no_drift else Follower(hindsight=microscope.scan is None)
     rectifier = Rectifier(interpolation)
     states: Counter[str] = Counter()
     extrapolated, first, count = 0, None, 0
@@ -135,9 +159,9 @@ def command(
             camera = camera_of(frame, model, microscope)
             extrapolated += not camera.in_range
             update = None
-            if tracker is not None:
+            if follower is not None:
                 time_s = start_time_s(frame, first, microscope)
-                update = tracker.update(frame.image, time_s, camera, microscope.scan)
+                update = follower.update(frame, time_s, camera, microscope.scan)
                 states[update.kind] += 1
             image = rectifier.rectify(
                 frame.image, camera, None if update is None else update.raster, microscope.scan
@@ -145,7 +169,7 @@ def command(
             out.frame(frame, image, camera, update)
             count += 1
             bar.update(1)
-        notes = opened.notes
+        notes = [*opened.notes, *_timing_notes(microscope, follower, model)]
     for note in notes:
         click.echo(f"note: {note}", err=True)
     if extrapolated:

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
-import tempfile
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 import cv2
@@ -28,22 +23,22 @@ from semcal_ros.cli.common import (
 )
 from semcal_ros.cli.drift_common import (
     Follower,
-    Job,
-    Survey,
     echo_nominal_unit,
     echo_states,
-    surveyed,
+    frame_time_option,
+    with_frame_time,
 )
+from semcal_ros.cli.survey import Job, Survey, surveyed
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.recordings import Frame, Recording, open_recording
+from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
 
 __all__ = ["command"]
 
 _TIFF = (".tif", ".tiff")
-_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 @click.command("stack")
@@ -74,6 +69,7 @@ _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
     show_default=True,
 )
 @config_option
+@frame_time_option
 @magnification_option
 def command(
     recording: Path,
@@ -86,6 +82,7 @@ def command(
     no_drift: bool,
     interpolation: str,
     config: str,
+    frame_time: float | None,
     magnification: float | None,
 ) -> None:
     """Average of the frames of RECORDING, each moved to where the specimen was in the first one.
@@ -98,7 +95,7 @@ def command(
     """
     _check_outputs(recording, output, sigma, video)
     model = None if calibration is None else Calibration.load(calibration)
-    microscope = configured(config, model)
+    microscope = with_frame_time(configured(config, model), frame_time)
     job = Job(model, microscope, at, None if no_drift else Follower())
     with open_recording(recording, microscope, magnification=magnification) as opened:
         survey = surveyed(
@@ -106,14 +103,15 @@ def command(
         )
         usable = _usable(survey)
         stack = Stack(survey.size, interpolation)
-        with _video(video, survey, fps) as film:
-            _add_frames(opened, job, survey, usable, stack, film)
+        grey = _video_levels(survey)
+        with film_of(video, survey.size, len(survey.chosen), fps, grey) as film:
+            _add_frames(opened, survey, usable, stack, film)
         notes = opened.notes
     image = stack.result()
     _write(image, survey, output, sigma)
     for note in notes:
         click.echo(f"note: {note}", err=True)
-    _report(survey, usable, image, job)
+    _report(survey, usable, image)
     for name, path in (("average", output), ("standard error", sigma), ("video", video)):
         if path is not None:
             click.echo(f"{name}: {path}")
@@ -127,7 +125,7 @@ def _check_outputs(recording: Path, output: Path, sigma: Path | None, video: Pat
     wanted = (
         (output, (*_TIFF, ".png"), "-o"),
         (sigma, _TIFF, "--sigma"),
-        (video, tuple(_CODECS), "--video"),
+        (video, tuple(VIDEO_CODECS), "--video"),
     )
     seen: set[Path] = set()
     source = recording.resolve()
@@ -203,11 +201,10 @@ def _usable(survey: Survey) -> NDArray[np.bool_]:
 
 def _add_frames(
     opened: Recording,
-    job: Job,
     survey: Survey,
     usable: NDArray[np.bool_],
     stack: Stack,
-    film: _Film | None,
+    film: Film | None,
 ) -> None:
     number_of = {index: number for number, index in enumerate(survey.chosen)}
     with progress(opened.frame_count, "averaging") as bar:
@@ -218,105 +215,37 @@ def _add_frames(
                 continue
             drift = None if survey.path is None else survey.path.raster(number)
             grey = to_gray(frame.image, frame.encoding)
-            picture, valid = stack.rectified(grey, job.camera(frame), drift, job.microscope.scan)
+            camera, scan = survey.job.camera(frame), survey.job.microscope.scan
+            picture, valid = stack.rectified(grey, camera, drift, scan)
             if usable[number]:
                 stack.add(picture, valid)
             if film is not None:
-                film.write(picture, number, bool(usable[number]))
+                film.write(picture, _caption(survey, number, bool(usable[number])))
 
 
-class _Film:
-    """Frames of a video with their number and time."""
-
-    def __init__(self, path: Path, survey: Survey, fps: float) -> None:
-        self._survey = survey
-        self._low, self._high = (0.0, 255.0)
-        if survey.dtype != np.uint8:
-            low, high = np.median(survey.levels, axis=0)
-            self._low, self._high = float(low), max(float(high), float(low) + 1e-6)
-        # Encoders want even numbers.
-        self._size = tuple(n + n % 2 for n in survey.size)
-        codec = _CODECS[path.suffix.lower()]
-        before = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(0)  # what it would print is said below in one line
-        try:
-            self._writer = cv2.VideoWriter(
-                str(path), cv2.VideoWriter.fourcc(*codec), fps, self._size, True
-            )
-        finally:
-            cv2.utils.logging.setLogLevel(before)
-        if not self._writer.isOpened():
-            raise InvalidValueError(
-                f"no encoder {codec} for {path.suffix} in OpenCV {cv2.__version__}",
-                expected="a build of OpenCV with FFmpeg",
-                do="try the other of " + " and ".join(_CODECS),
-            )
-
-    def write(self, picture: NDArray[np.float32], number: int, used: bool) -> None:
-        scale = 255.0 / (self._high - self._low)
-        grey = np.clip(np.rint((np.nan_to_num(picture) - self._low) * scale), 0, 255)
-        right, bottom = (self._size[k] - self._survey.size[k] for k in (0, 1))
-        padded = cv2.copyMakeBorder(
-            grey.astype(np.uint8), 0, bottom, 0, right, cv2.BORDER_CONSTANT, value=0
-        )
-        frame = cv2.cvtColor(padded, cv2.COLOR_GRAY2BGR)
-        times_s = self._survey.times_s
-        text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
-        _label_frame(frame, text if used else f"{text}  not tracked")
-        self._writer.write(frame)
-
-    def close(self) -> None:
-        self._writer.release()
+def _video_levels(survey: Survey) -> tuple[float, float]:
+    """Grey levels that are shown as black and white."""
+    if survey.dtype == np.uint8 or not survey.levels:
+        return 0.0, 255.0
+    low, high = np.median(survey.levels, axis=0)
+    return float(low), float(high)
 
 
-def _label_frame(frame: NDArray[Any], text: str) -> None:
-    scale = max(0.35, 0.5 * frame.shape[0] / 512)
-    place = (round(12 * scale), frame.shape[0] - round(14 * scale))
-    thin = max(1, round(1.5 * scale))
-    # White with a black edge can be read on any specimen.
-    for color, width in (((0, 0, 0), thin + 2), ((255, 255, 255), thin)):
-        cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
-
-
-@contextmanager
-def _video(path: Path | None, survey: Survey, fps: float) -> Iterator[_Film | None]:
-    """A video that gets its name only once it is complete."""
-    if path is None:
-        yield None
-        return
-    target = path.resolve()
-    with tempfile.TemporaryDirectory(
-        prefix=f".{target.name}.", suffix=".tmp", dir=target.parent
-    ) as scratch:
-        file = Path(scratch) / f"video{target.suffix.lower()}"
-        film = _Film(file, survey, fps)
-        try:
-            yield film
-        finally:
-            film.close()
-        _check_video(file, path, len(survey.chosen))
-        os.replace(file, target)
-
-
-def _check_video(file: Path, path: Path, frames: int) -> None:
-    """The encoder reports no errors, such as a full disk: look whether all is there."""
-    reader = cv2.VideoCapture(str(file))
-    found = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    reader.release()
-    if found != frames:
-        raise BagError(
-            f"{path} came out with {found} of {frames} frames",
-            expected="space for the whole video",
-            do="free space or choose another place",
-        )
+def _caption(survey: Survey, number: int, used: bool) -> str:
+    """Number and time of a frame."""
+    times_s = survey.times_s
+    text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
+    return text if used else f"{text}  not tracked"
 
 
 # -- what a person reads --------------------------------------------------------------------------
 
 
-def _report(survey: Survey, usable: NDArray[np.bool_], image: StackedImage, job: Job) -> None:
-    if job.model is None:
-        echo_nominal_unit(job.microscope, "the pixel size is the nominal one")
+def _report(survey: Survey, usable: NDArray[np.bool_], image: StackedImage) -> None:
+    if survey.timing_note:
+        click.echo(f"note: {survey.timing_note}", err=True)
+    if survey.job.model is None:
+        echo_nominal_unit(survey.job.microscope, "the pixel size is the nominal one")
     elif not survey.camera.in_range:
         click.echo("warning: the frames are outside of the calibrated range", err=True)
     if survey.other_kind:

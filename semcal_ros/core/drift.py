@@ -10,6 +10,8 @@ first frame is seen at X + drift.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +19,11 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_look import Found, look
-from semcal_ros.core.drift_map import Drop, Measure, Move
+from semcal_ros.core.drift_map import Drop, Measure, Move, still
 from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, bow_s2, loosened
 from semcal_ros.core.drift_surprise import Surprises
 from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
-from semcal_ros.core.drift_uncertainty import carry_covariance, scale_covariance
+from semcal_ros.core.drift_uncertainty import carry_covariance, centre_covariance, scale_covariance
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.keyframe import Shot, keyframe_of, make_keyframe, resampleable
 from semcal_ros.core.keyframe_store import KeyframeStore
@@ -139,7 +141,8 @@ class DriftTracker:
 
     def _first(self, shot: Shot, centre_s: float) -> DriftUpdate:
         kept = self._history is not None
-        self._filter = DriftFilter(centre_s, self.settings.acceleration_psd, history=kept)
+        start = still(centre_s, centre_covariance(shot.camera))
+        self._filter = DriftFilter(start, self.settings.acceleration_psd, history=kept)
         if self._history is not None:
             self._history.begin(self._filter)
         complaint = self._new_key(self._filter, shot, np.zeros(4))
@@ -223,7 +226,7 @@ class DriftTracker:
                 return f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
             drift.do(widened)
         if found.candidate.rescaled:
-            measure = self._carried(drift, shot, found, measure)
+            measure = self._carried(drift, shot, found, replace(measure, zoom=loose.zoom))
         drift.accept(measure)
         drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
         return ""

@@ -15,7 +15,6 @@ from semcal_ros.core.drift_map import (
     Restlessness,
     Settle,
     Widen,
-    still,
 )
 from semcal_ros.core.drift_smoothing import Event, Mark, likely_restlessness, replayed
 
@@ -50,17 +49,17 @@ class DriftFilter:
 
     Parameters
     ----------
-    time_s
-        Time at which the drift is zero.
+    start
+        State at the time at which the drift is zero.
     acceleration_psd
         Process noise, length^2 / s^3; None estimates it from the innovations.
     history
         Whether to keep what happened for good.
     """
 
-    def __init__(self, time_s: float, acceleration_psd: float | None, history: bool) -> None:
-        self.start = still(time_s)
-        self.state = self.start
+    def __init__(self, start: DriftMap, acceleration_psd: float | None, history: bool) -> None:
+        self.start = start
+        self.state = start
         self.events: list[Event] = []
         self.restlessness = Restlessness(acceleration_psd or 0.0)
         self.measured = 0

@@ -4,10 +4,13 @@ The state holds the drift p, its velocity v and acceleration a, and for each key
 picture lies: the drift m_j at which it seems to have been taken, and the velocity w_j by which it
 still is sheared. A frame with noise n that is registered against keyframe j has
 
-    shift = p + a b - m_j + n,        shear = T v - T_j w_j + n'
+    shift = p + a b - m_j - Z e + n,        shear = T v - T_j w_j + n'
 
 with the frame times T, and with b = A^2 / 24 for an acquisition that takes A: so far the mean of an
-accelerated drift is from its middle. All of this is linear, so one Kalman filter holds it, with every correlation:
+accelerated drift is from its middle. A zoom is about the principal point, of which the calibration
+may have an error e (px) that is the same at all magnifications: with Z = J^-1 - J_j^-1 (m per px)
+it looks like a drift when frame and keyframe have different magnifications, and in no other way.
+All of this is linear, so one Kalman filter holds it, with every correlation:
 the noise of a keyframe is shared by all frames that were registered against it and does not average
 out, and coming back to an old keyframe undoes what was lost on the way. A frame that becomes a
 keyframe itself seems to lie at ``m_new = m_j + shift`` exactly, noise and all, so that a chain of
@@ -22,7 +25,7 @@ an object that can be done again with another restlessness, and undone backwards
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -48,8 +51,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_OWN = 6
-_EACH = 4
+# Drift, velocity and acceleration; with the error of the principal point; each keyframe.
+_MOVING, _OWN, _EACH = 6, 8, 4
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,8 @@ class DriftMap:
     time_s
         Time of the state, s.
     mean
-        (6 + 4 k,) ``[x, y, vx, vy, ax, ay]``, then ``[mx, my, wx, wy]`` of each of the k keyframes.
+        (8 + 4 k,) ``[x, y, vx, vy, ax, ay, ex, ey]``, then ``[mx, my, wx, wy]`` of each of the k
+        keyframes.
     covariance
         Of ``mean``.
     keys
@@ -151,6 +155,12 @@ class DriftMap:
         return self.mean[2:6]
 
     @property
+    def centre_error_px(self) -> tuple[Array, Array]:
+        """(2,) error of the principal point that the zooms so far tell, px, and its covariance."""
+        part = slice(_MOVING, _OWN)
+        return self.mean[part], self.covariance[part, part]
+
+    @property
     def own(self) -> Array:
         """(4, 4) covariance of drift and velocity."""
         return self.covariance[:4, :4]
@@ -172,9 +182,15 @@ class DriftMap:
         return row @ self.mean, row @ self.covariance @ row.T
 
 
-def still(time_s: float) -> DriftMap:
-    """The beginning: no drift, by definition, and no velocity known yet."""
-    return DriftMap(time_s, np.zeros(_OWN), np.zeros((_OWN, _OWN)))
+def still(time_s: float, centre_covariance: Array | None = None) -> DriftMap:
+    """The beginning: no drift, by definition, and no velocity known yet.
+
+    ``centre_covariance`` (2, 2) is that of the principal point, px^2; None where it is known.
+    """
+    covariance = np.zeros((_OWN, _OWN))
+    if centre_covariance is not None:
+        covariance[_MOVING:, _MOVING:] = centre_covariance
+    return DriftMap(time_s, np.zeros(_OWN), covariance)
 
 
 @dataclass(frozen=True)
@@ -234,8 +250,8 @@ class Move(Operation):
         step = _same(state)
         if dt > 0.0:
             move, noise = restlessness.over(dt)
-            step.matrix[:_OWN, :_OWN] = np.kron(move, np.eye(2))
-            step.covariance[:_OWN, :_OWN] = np.kron(noise, np.eye(2))
+            step.matrix[:_MOVING, :_MOVING] = np.kron(move, np.eye(2))
+            step.covariance[:_MOVING, :_MOVING] = np.kron(noise, np.eye(2))
         return replace(step, time_s=self.time_s)
 
 
@@ -250,7 +266,7 @@ class Widen(Operation):
     def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
         step = _same(state)
-        step.covariance[:_OWN, :_OWN] = self.covariance
+        step.covariance[:_MOVING, :_MOVING] = self.covariance
         return step
 
 
@@ -287,7 +303,8 @@ class Carry(Operation):
     """The frame of now becomes keyframe ``key``, as it was measured against ``parent``.
 
     ``shift`` (4,) is what was measured: shift, and shear over the frame time; ``time_ratio`` is the
-    frame time of the parent over that of the frame; ``noise`` (4, 4) is added.
+    frame time of the parent over that of the frame; ``noise`` (4, 4) is added; ``zoom`` (2, 2) is Z
+    of the module.
     """
 
     key: int
@@ -295,6 +312,7 @@ class Carry(Operation):
     shift: Array
     time_ratio: float
     noise: Array
+    zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """As described."""
@@ -302,6 +320,7 @@ class Carry(Operation):
         matrix = np.vstack([np.eye(size), np.zeros((_EACH, size))])
         at = state.of(self.parent)
         matrix[size:, at] = np.diag([1.0, 1.0, self.time_ratio, self.time_ratio])
+        matrix[size : size + 2, _MOVING:_OWN] = self.zoom
         covariance = np.zeros((size + _EACH, size + _EACH))
         covariance[size:, size:] = self.noise
         offset = np.append(np.zeros(size), self.shift)
@@ -383,6 +402,8 @@ class Measure:
         b of the module.
     scan_s
         Time that the frame took.
+    zoom
+        (2, 2) Z of the module.
     """
 
     key: int
@@ -391,6 +412,7 @@ class Measure:
     time_ratio: float = 1.0
     bow: float = 0.0
     scan_s: float = 0.0
+    zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     def row(self, state: DriftMap) -> Array:
         """(2 or 4, n) derivative of the measurement by the state."""
@@ -398,6 +420,7 @@ class Measure:
         row = np.zeros((count, state.mean.size))
         row[:, :count] = np.eye(count)
         row[:2, 4:6] = self.bow * np.eye(2)
+        row[:2, _MOVING:_OWN] = -self.zoom
         factors = [1.0, 1.0, self.time_ratio, self.time_ratio]
         row[:, at : at + count] = -np.diag(factors[:count])
         return row

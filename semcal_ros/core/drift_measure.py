@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.drift_map import Carry, DriftMap, Measure
-from semcal_ros.core.drift_uncertainty import carry_covariance, relative_scale_sigma
+from semcal_ros.core.drift_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
 from semcal_ros.core.keyframe import Shot
 from semcal_ros.core.registration import Registration
 
@@ -106,10 +106,11 @@ def keyframe_noise(measure: Measure) -> Array:
 
 def loosened(measure: Measure, before: Shot, now: Shot) -> Measure:
     """The measurement with what a change of magnification leaves open."""
+    if before.camera is None or now.camera is None:
+        return measure
     covariance = measure.covariance.copy()
-    if before.camera is not None and now.camera is not None:
-        covariance[:2, :2] += carry_covariance(before.camera, now.camera)
-    return replace(measure, covariance=covariance)
+    covariance[:2, :2] += carry_covariance(before.camera, now.camera)
+    return replace(measure, covariance=covariance, zoom=zoom_of(before.camera, now.camera))
 
 
 def becoming_keyframe(
@@ -129,7 +130,7 @@ def becoming_keyframe(
     else:
         shift = np.append(measure.shift - bow, np.zeros(2))
         full[2:, 2:] = state.own[2:, 2:]
-    return Carry(key, measure.key, shift, measure.time_ratio, full)
+    return Carry(key, measure.key, shift, measure.time_ratio, full, measure.zoom)
 
 
 def at_itself(key: int, measure: Measure, removed: Array) -> Measure:
@@ -137,4 +138,4 @@ def at_itself(key: int, measure: Measure, removed: Array) -> Measure:
     noise.
     """
     shift = np.append(measure.bow * removed[2:], removed[:2])[: measure.shift.size]
-    return replace(measure, key=key, shift=shift, time_ratio=1.0)
+    return replace(measure, key=key, shift=shift, time_ratio=1.0, zoom=np.zeros((2, 2)))

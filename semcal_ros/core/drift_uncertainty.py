@@ -7,7 +7,13 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
 
-__all__ = ["carry_covariance", "relative_scale_sigma", "scale_covariance"]
+__all__ = [
+    "carry_covariance",
+    "centre_covariance",
+    "relative_scale_sigma",
+    "scale_covariance",
+    "zoom_of",
+]
 
 Array = NDArray[np.float64]
 
@@ -46,21 +52,34 @@ def relative_scale_sigma(camera: ScanCamera | None) -> float:
     return float(np.sqrt(max(camera.covariance[0, 0], 0.0))) / camera.m
 
 
-def carry_covariance(before: ScanCamera, after: ScanCamera) -> Array:
-    """(2, 2) covariance in m^2 of the step that a change of magnification seems to make.
+def centre_covariance(camera: ScanCamera | None) -> Array:
+    """(2, 2) covariance in px^2 of the camera's principal point; zero where it is known exactly."""
+    if camera is None or camera.covariance is None:
+        return np.zeros((2, 2))
+    return np.asarray(camera.covariance[_CENTRE, _CENTRE])
 
-    The zoom is about the principal point, which the calibration has for all magnifications at once:
-    an error of it by e px moves the specimen by ``(1/m_after - 1/m_before) e``. Errors of the two
-    scales move it in proportion to the distance of the image's middle from the principal point.
+
+def zoom_of(before: ScanCamera, after: ScanCamera) -> Array:
+    """(2, 2) metres that a change of magnification seems to move the specimen by, the other way, per
+    px of error of the principal point that both cameras share.
     """
-    metres = [np.linalg.inv(c.ideal_from_sem_jacobian) for c in (before, after)]
+    return np.asarray(
+        np.linalg.inv(after.ideal_from_sem_jacobian) - np.linalg.inv(before.ideal_from_sem_jacobian)
+    )
+
+
+def carry_covariance(before: ScanCamera, after: ScanCamera) -> Array:
+    """(2, 2) covariance in m^2 of the step that a change of magnification seems to make because of
+    errors of the two scales.
+
+    They move the specimen in proportion to the distance of the image's middle from the principal
+    point, about which the zoom is.
+    """
     covariance = np.zeros((2, 2))
-    moved = metres[1] - metres[0]
-    centres = [c.covariance[_CENTRE, _CENTRE] for c in (before, after) if c.covariance is not None]
-    if centres:
-        covariance += moved @ max(centres, key=lambda c: float(np.trace(c))) @ moved.T
-    for camera, inverse in zip((before, after), metres, strict=True):
+    for camera in (before, after):
         middle = 0.5 * np.array([camera.width - 1.0, camera.height - 1.0])
-        from_centre = inverse @ (middle - np.array([camera.px, camera.py]))
+        from_centre = np.linalg.solve(
+            camera.ideal_from_sem_jacobian, middle - np.array([camera.px, camera.py])
+        )
         covariance += scale_covariance(camera, from_centre, np.zeros(2))[:2, :2]
     return covariance
