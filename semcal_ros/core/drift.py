@@ -19,8 +19,9 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_look import Found, look
-from semcal_ros.core.drift_map import Drop, Measure, Move, still
+from semcal_ros.core.drift_map import still
 from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, bow_s2, loosened
+from semcal_ros.core.drift_operations import Drop, Measure, Move
 from semcal_ros.core.drift_surprise import Surprises
 from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
 from semcal_ros.core.drift_uncertainty import carry_covariance, centre_covariance, scale_covariance

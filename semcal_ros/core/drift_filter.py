@@ -7,16 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_map import (
-    DriftMap,
-    Measure,
-    Move,
-    Operation,
-    Restlessness,
-    Settle,
-    Widen,
-)
+from semcal_ros.core.drift_map import DriftMap
+from semcal_ros.core.drift_operations import Measure, Move, Operation, Settle, Widen
 from semcal_ros.core.drift_smoothing import Event, Mark, likely_restlessness, replayed
+from semcal_ros.core.restlessness import Restlessness
 
 __all__ = ["DriftFilter"]
 

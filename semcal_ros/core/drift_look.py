@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.drift_filter import DriftFilter
-from semcal_ros.core.drift_map import DriftMap, Measure, Reshear
+from semcal_ros.core.drift_map import DriftMap
 from semcal_ros.core.drift_measure import bends, bow_s2, keyframe_noise, measure_of
+from semcal_ros.core.drift_operations import Measure, Reshear
 from semcal_ros.core.keyframe import Shot, make_keyframe, picture_of
 from semcal_ros.core.keyframe_store import Candidate, KeyframeStore
 from semcal_ros.core.rectify import Rectifier

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_map import Carry, DriftMap, Measure
+from semcal_ros.core.drift_map import DriftMap
+from semcal_ros.core.drift_operations import Carry, Measure
 from semcal_ros.core.drift_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
 from semcal_ros.core.keyframe import Shot
 from semcal_ros.core.registration import Registration

@@ -2,7 +2,9 @@
 
 What happened to the :class:`~semcal_ros.core.drift_map.DriftMap` while a recording was tracked is
 done again with the acceleration noise that makes the measurements most likely, and then undone
-backwards by the Rauch-Tung-Striebel recursion (Rauch, Tung and Striebel 1965, doi:10.2514/3.3166).
+backwards. The recursion is that of Bryson and Frazier (1963; modified by Bierman 1973,
+doi:10.1016/0005-1098(73)90054-8), which needs no inverse of a prediction: positions of keyframes are
+copies of each other, and such an inverse does not exist.
 With white acceleration the result is the cubic smoothing spline through the measurements (Wahba
 1978, doi:10.1111/j.2517-6161.1978.tb01050.x), with one that lasts a stiffer one.
 """
@@ -15,8 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_map import DriftMap, Linear, Measure, Operation, Restlessness
+from semcal_ros.core.drift_map import DriftMap
+from semcal_ros.core.drift_operations import Measure, Operation
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.restlessness import Restlessness
 
 __all__ = ["Event", "Mark", "likely_restlessness", "replayed", "smoothed"]
 
@@ -25,7 +29,6 @@ Array = NDArray[np.float64]
 _OUTLIER_NIS = 25.0
 _MAX_FOR_LIKELIHOOD = 600
 _LOG_RANGE = (-14.0, 5.0)
-_SMALLEST_EIGENVALUE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -37,65 +40,52 @@ Event = Operation | Measure | Mark
 
 
 @dataclass(frozen=True)
-class _Node:
-    """A state to come back to: predicted from the one before by ``step``, then filtered."""
+class _Update:
+    """What a measurement did: its row, innovation with the inverse of its covariance, and what it
+    left of the prediction's errors.
+    """
 
-    step: Linear
-    predicted: DriftMap
-    filtered: DriftMap
-    marked: bool
+    row: Array
+    innovation: Array
+    inverse: Array
+    kept: Array
+
+
+#: What is needed to come back: the matrix of an operation, a measurement, or the state of a frame.
+_Step = Array | _Update | DriftMap
 
 
 def _forwards(
     start: DriftMap, events: Sequence[Event], restlessness: Restlessness
-) -> tuple[list[_Node], float, int]:
-    """Nodes at all measurements and marks; minus twice the log likelihood of the measurements, and
-    their number.
-    """
+) -> tuple[list[_Step], DriftMap, float]:
+    """The steps, the last state, and minus twice the log likelihood of the measurements."""
     state, cost, count = start, 0.0, 0
-    step = _nothing(start)
-    nodes = []
+    steps: list[_Step] = []
     for event in events:
         if isinstance(event, Operation):
             linear = event.linear(state, restlessness)
             state = linear.of(state)
-            step = _after(step, linear)
-            continue
-        predicted = state
-        if isinstance(event, Measure):
+            steps.append(linear.matrix)
+        elif isinstance(event, Measure):
             outcome = event(state, restlessness)
             state = outcome.state
+            unit = np.sqrt(np.diag(outcome.innovation_covariance))
+            scaled = np.linalg.inv(outcome.innovation_covariance / np.outer(unit, unit))
+            kept = np.eye(state.mean.size) - outcome.gain @ outcome.row
+            inverse = scaled / np.outer(unit, unit)
+            steps.append(_Update(outcome.row, outcome.innovation, inverse, kept))
             count += 1
             if count > 2:
                 size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
                 cost += min(outcome.nis + outcome.shear_nis, 2.0 * _OUTLIER_NIS) + size
-        nodes.append(_Node(step, predicted, state, isinstance(event, Mark)))
-        step = _nothing(state)
-    return nodes, cost, count
-
-
-def _nothing(state: DriftMap) -> Linear:
-    size = state.mean.size
-    return Linear(np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys)
-
-
-def _after(first: Linear, second: Linear) -> Linear:
-    """Both, one after the other."""
-    matrix = second.matrix @ first.matrix
-    covariance = second.matrix @ first.covariance @ second.matrix.T + second.covariance
-    offset = second.matrix @ first.offset + second.offset
-    return Linear(matrix, offset, covariance, second.time_s, second.keys)
+        else:
+            steps.append(state)
+    return steps, state, cost
 
 
 def replayed(start: DriftMap, events: Sequence[Event], restlessness: Restlessness) -> DriftMap:
     """The state after everything happened again."""
-    nodes, _, _ = _forwards(start, events, restlessness)
-    state = nodes[-1].filtered if nodes else start
-    last = max((k for k, e in enumerate(events) if not isinstance(e, Operation)), default=-1)
-    for event in events[last + 1 :]:
-        if isinstance(event, Operation):
-            state = event(state, restlessness)
-    return state
+    return _forwards(start, events, restlessness)[1]
 
 
 def smoothed(
@@ -117,33 +107,23 @@ def smoothed(
     InvalidValueError
         If a time goes back or the restlessness is negative.
     """
-    nodes, _, _ = _forwards(start, events, restlessness)
+    steps, last, _ = _forwards(start, events, restlessness)
     found: list[DriftMap] = []
-    after: DriftMap | None = None
-    for k in range(len(nodes) - 1, -1, -1):
-        state = nodes[k].filtered
-        if after is not None:
-            state = _stepped_back(state, nodes[k + 1], after)
-        if nodes[k].marked:
-            found.append(state)
-        after = state
+    # What later measurements say of the state, and how much they know of it.
+    told = np.zeros(last.mean.size)
+    known = np.zeros((last.mean.size, last.mean.size))
+    for step in reversed(steps):
+        if isinstance(step, _Update):
+            told = step.kept.T @ told - step.row.T @ step.inverse @ step.innovation
+            known = step.row.T @ step.inverse @ step.row + step.kept.T @ known @ step.kept
+        elif isinstance(step, DriftMap):
+            mean = step.mean - step.covariance @ told
+            covariance = step.covariance - step.covariance @ known @ step.covariance
+            covariance = 0.5 * (covariance + covariance.T)
+            found.append(replace(step, mean=mean, covariance=covariance))
+        else:
+            told, known = step.T @ told, step.T @ known @ step
     return found[::-1]
-
-
-def _stepped_back(filtered: DriftMap, node: _Node, after: DriftMap) -> DriftMap:
-    """The smoothed state before ``node``, whose own smoothed state is ``after``."""
-    predicted = node.predicted.covariance
-    # Metres and metres per second differ by orders of magnitude.
-    unit = np.sqrt(np.maximum(np.diag(predicted), 1e-300))
-    values, vectors = np.linalg.eigh(predicted / np.outer(unit, unit))
-    # What is known exactly, as the drift of the first frame is, nothing can change.
-    kept = values > _SMALLEST_EIGENVALUE * values[-1]
-    basis = vectors[:, kept]
-    inverse = (basis / values[kept]) @ basis.T / np.outer(unit, unit)
-    gain = filtered.covariance @ node.step.matrix.T @ inverse
-    mean = filtered.mean + gain @ (after.mean - node.predicted.mean)
-    covariance = filtered.covariance + gain @ (after.covariance - predicted) @ gain.T
-    return replace(filtered, mean=mean, covariance=0.5 * (covariance + covariance.T))
 
 
 def likely_restlessness(
@@ -187,7 +167,7 @@ def _likely_psd(
         return Restlessness(near * float(np.exp(log_psd)), memory_s)
 
     def cost(log_psd: float) -> float:
-        return _forwards(start, events, of(log_psd))[1]
+        return _forwards(start, events, of(log_psd))[2]
 
     grid = np.linspace(*_LOG_RANGE, 9)
     costs = [cost(float(v)) for v in grid]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_map import DriftMap, Widen
+from semcal_ros.core.drift_map import DriftMap
+from semcal_ros.core.drift_operations import Widen
 
 __all__ = ["Surprises"]
 

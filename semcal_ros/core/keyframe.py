@@ -24,7 +24,7 @@ from semcal_ros.core.registration import (
     RegistrationSettings,
     prepare_reference,
 )
-from semcal_ros.core.subpixel import sampled
+from semcal_ros.core.subpixel import MARGIN, sampled
 
 __all__ = [
     "Keyframe",
@@ -119,9 +119,13 @@ class Keyframe:
         whole = np.floor(shift).astype(int)
         spans = []
         for axis in (0, 1):
-            # The interpolation needs a neighbour.
-            first = max(self.region[axis], region[axis] - int(whole[axis]))
-            last = min(self.region[axis + 2], region[axis + 2] - int(whole[axis]) - 1)
+            # What the interpolation reaches beyond the region was not scanned; beyond the picture it
+            # is mirrored.
+            edges = 0, gray.shape[1 - axis]
+            low = MARGIN if region[axis] > edges[0] else 0
+            high = MARGIN if region[axis + 2] < edges[1] else 1
+            first = max(self.region[axis], region[axis] + low - int(whole[axis]))
+            last = min(self.region[axis + 2], region[axis + 2] - high - int(whole[axis]))
             spans.append((first, last))
         (left, right), (top, bottom) = spans
         if right - left < 8 or bottom - top < 8:

@@ -11,30 +11,23 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from semcal_ros.core.drift_map import (
-    Carry,
-    DriftMap,
-    Drop,
-    Measure,
-    Move,
-    Reshear,
-    Restlessness,
-    Settle,
-    Widen,
-    still,
-)
+from semcal_ros.core.drift_map import DriftMap, still
+from semcal_ros.core.drift_operations import Carry, Drop, Measure, Move, Reshear, Settle, Widen
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.restlessness import Restlessness
 
 Array = NDArray[np.float64]
 
 WHITE = Restlessness(0.3)
 FADING = Restlessness(0.3, 1.7)
+# Numbers of a state before those of its keyframes.
+OWN = still(0.0).mean.size
 
 
 def random_state(seed: int = 0, keys: tuple[int, ...] = (4, 7)) -> DriftMap:
     """A state in which everything correlates with everything."""
     rng = np.random.default_rng(seed)
-    size = 6 + 4 * len(keys)
+    size = OWN + 4 * len(keys)
     root = rng.standard_normal((size, size)) + np.eye(size)
     return DriftMap(1.0, rng.standard_normal(size), root @ root.T, keys)
 
@@ -133,13 +126,13 @@ def noise_by_quadrature(psd: float, memory_s: float, dt_s: float) -> Array:
     return psd * total
 
 
-@pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 3.0, 10.0, 15.0])
+@pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 3.0, 15.0, 60.0])
 def test_noise_is_the_integral_over_the_impulse_responses(ratio: float) -> None:
     dt, psd = 0.7, 0.3
     move, noise = Restlessness(psd, dt / ratio).over(dt)
     expected = noise_by_quadrature(psd, dt / ratio, dt)
     unit = np.sqrt(np.diag(expected))
-    # Correlations; at a ratio of 15 the exponentials in the computation cost 7 of 16 digits.
+    # Correlations.
     np.testing.assert_allclose(
         noise / np.outer(unit, unit), expected / np.outer(unit, unit), atol=1e-9
     )
@@ -218,8 +211,10 @@ def test_what_a_frame_adds_of_its_own_is_exact_when_white_and_never_too_small(
 
 
 def test_a_measurement_weighs_by_variance() -> None:
-    mean = np.array([1.0, 2.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    variances = np.array([3.0, 3.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+    mean, variances = np.zeros((2, OWN + 4))
+    mean[:4] = 1.0, 2.0, 0.5, -1.0
+    variances[:4] = 3.0, 3.0, 1.0, 1.0
+    variances[OWN : OWN + 2] = 1.0
     state = DriftMap(1.0, mean, np.diag(variances), (0,))
     # Drift 3 and keyframe 1 make a prior variance of 4; that of the measurement is 4: half way,
     # three quarters of it by the drift and one quarter, backwards, by the keyframe.
@@ -242,18 +237,20 @@ def test_shift_and_shear_together_are_bayes_rule() -> None:
     state = random_state(3)
     rng = np.random.default_rng(4)
     root = rng.standard_normal((4, 4))
-    measure = Measure(7, rng.standard_normal(4), root @ root.T, 1.3, 0.2, 0.6)
+    zoom = np.array([[0.5, 0.1], [0.0, 0.4]])
+    measure = Measure(7, rng.standard_normal(4), root @ root.T, 1.3, 0.2, 0.6, zoom)
     outcome = measure(state, FADING)
-    # In information form, written out: shift = p + b a - m, shear = v - 1.3 w.
-    row = np.zeros((4, 14))
-    row[0, [0, 4, 10]] = row[1, [1, 5, 11]] = 1.0, 0.2, -1.0
-    row[2, [2, 12]] = row[3, [3, 13]] = 1.0, -1.3
+    # In information form, written out: shift = p + b a - m - Z e, shear = v - 1.3 w.
+    row, at = np.zeros((4, OWN + 8)), OWN + 4
+    row[0, [0, 4, at]] = row[1, [1, 5, at + 1]] = 1.0, 0.2, -1.0
+    row[2, [2, at + 2]] = row[3, [3, at + 3]] = 1.0, -1.3
+    row[:2, 6:8] = [[-0.5, -0.1], [0.0, -0.4]]
     noise = measure.covariance + FADING.within(0.6)
     information = np.linalg.inv(state.covariance) + row.T @ np.linalg.solve(noise, row)
     covariance = np.linalg.inv(information)
     right = np.linalg.solve(state.covariance, state.mean)
     right += row.T @ np.linalg.solve(noise, measure.shift)
-    # Rounding: the inverse of a random matrix of 14 rows has a condition of some thousands.
+    # Rounding: the inverse of a random matrix of 16 rows has a condition of some thousands.
     np.testing.assert_allclose(outcome.state.covariance, covariance, atol=1e-9)
     np.testing.assert_allclose(outcome.state.mean, covariance @ right, atol=1e-9)
     # Shift, and shear given the shift, are all there is to be surprised about.
@@ -357,11 +354,13 @@ def assert_like_draws(state: DriftMap, draws: Array) -> None:
 def test_settle_puts_a_keyframe_where_the_frame_lies() -> None:
     state, removed, bow = random_state(7), np.array([0.3, -0.2, 0.5, 0.1]), 0.4
     noise = np.diag([0.5, 0.2, 0.1, 0.3])
-    settled = Settle(9, removed, bow, noise, 0.8)(state, FADING)
+    # Restless enough for what happens within the frame to matter, too.
+    restless = Restlessness(40.0)
+    settled = Settle(9, removed, bow, noise, 0.8)(state, restless)
     assert settled.keys == (4, 7, 9)
-    assert settled.of(9) == slice(14, 18)
+    assert settled.of(9) == slice(OWN + 8, OWN + 12)
     draws = sampled(state, 40000, 1)
-    own = noise + FADING.within(0.8)
+    own = noise + restless.within(0.8)
     error = np.random.default_rng(2).standard_normal((40000, 4)) * np.sqrt(np.diag(own))
     # The picture is that of p + b a; b times what was taken out for the acceleration is gone, and
     # so is the velocity that was taken out.
@@ -376,17 +375,20 @@ def test_settle_puts_a_keyframe_where_the_frame_lies() -> None:
 def test_carry_copies_the_parent_with_what_was_measured() -> None:
     state = random_state(8)
     shift, noise = np.array([5.0, -3.0, 0.2, 0.1]), np.diag([0.1, 0.2, 0.3, 0.4])
-    carried = Carry(8, 4, shift, 1.5, noise)(state, FADING)
+    zoom = np.array([[0.5, 0.1], [0.0, 0.4]])
+    carried = Carry(8, 4, shift, 1.5, noise, zoom)(state, FADING)
     assert carried.keys == (4, 7, 8)
     draws = sampled(state, 40000, 3)
     error = np.random.default_rng(4).standard_normal((40000, 4)) * np.sqrt(np.diag(noise))
-    where = draws[:, 6:10] * [1.0, 1.0, 1.5, 1.5] + shift + error
+    where = draws[:, OWN : OWN + 4] * [1.0, 1.0, 1.5, 1.5] + shift + error
+    # What was measured lacks Z e.
+    where[:, :2] += draws[:, 6:8] @ zoom.T
     assert_like_draws(carried, np.column_stack([draws, where]))
     # Without noise of its own their distance is known exactly.
     exact = Carry(8, 4, shift, 1.0, np.zeros((4, 4)))(state, FADING)
     both = np.hstack([-np.eye(4), np.zeros((4, 4)), np.eye(4)])
-    np.testing.assert_allclose(both @ exact.mean[6:], shift)
-    np.testing.assert_allclose(both @ exact.covariance[6:, 6:] @ both.T, 0.0, atol=1e-13)
+    np.testing.assert_allclose(both @ exact.mean[OWN:], shift)
+    np.testing.assert_allclose(both @ exact.covariance[OWN:, OWN:] @ both.T, 0.0, atol=1e-13)
 
 
 def test_reshear_moves_a_keyframe_and_leaves_every_covariance() -> None:
@@ -409,7 +411,7 @@ def test_reshear_moves_a_keyframe_and_leaves_every_covariance() -> None:
 def test_drop_forgets_one_keyframe_and_nothing_else() -> None:
     state = random_state(10, (4, 7, 5))
     left = Drop(7)(state, FADING)
-    kept = np.r_[0:10, 14:18]
+    kept = np.r_[0 : OWN + 4, OWN + 8 : OWN + 12]
     assert left.keys == (4, 5)
     np.testing.assert_allclose(left.mean, state.mean[kept])
     np.testing.assert_allclose(left.covariance, state.covariance[np.ix_(kept, kept)])
@@ -426,7 +428,7 @@ def test_widen_adds_to_the_drift_and_not_to_the_keyframes() -> None:
     state = random_state(11)
     wider = Widen(np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))(state, FADING)
     np.testing.assert_array_equal(wider.mean, state.mean)
-    added = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0] + [0.0] * 8)
+    added = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0] + [0.0] * (OWN + 2))
     np.testing.assert_allclose(wider.covariance - state.covariance, added, atol=1e-12)
 
 
@@ -525,7 +527,7 @@ RESTLESS = Restlessness(0.05, 3.0)
 
 @pytest.mark.parametrize("with_shear", [False, True])
 def test_errors_of_simulated_streams_are_as_stated(with_shear: bool) -> None:
-    runs, count = 120, 16
+    runs, count = 80, 16
     nees, landmarks, bias = [], [], []
     for seed in range(runs):
         stream = simulate(count, RESTLESS, seed)
@@ -592,10 +594,38 @@ def test_the_mean_drift_over_a_frame_is_bowed_by_the_acceleration() -> None:
     scan, acceleration = 1.3, np.array([0.7, -0.4])
     t = (np.arange(100000) + 0.5) / 100000 * scan - 0.5 * scan
     mean = np.mean(0.5 * t**2) * acceleration
-    state = DriftMap(0.0, np.append(np.zeros(4), acceleration), np.zeros((6, 6)))
+    state = still(0.0)
+    state = DriftMap(0.0, np.insert(np.zeros(OWN - 2), 4, acceleration), state.covariance)
     state = Settle(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0)(state, WHITE)
     measure = Measure(0, mean, np.eye(2), bow=scan**2 / 24.0)
     np.testing.assert_allclose(measure(state, WHITE).innovation[:2], acceleration * 0.0, atol=1e-9)
+
+
+def test_a_zoom_there_and_back_is_known_better_than_a_zoom() -> None:
+    centre = np.array([[4.0, 1.2], [1.2, 2.25]])
+    zoom = np.array([[-0.3, 0.02], [0.0, -0.28]])
+    rest = Restlessness(0.0)
+    exact, sharp = np.zeros((4, 4)), 1e-6 * np.eye(2)
+    state = Settle(0, np.zeros(4), 0.0, exact, 0.0)(still(0.0, centre), rest)
+    state = Widen(np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 0.0]))(state, rest)
+    np.testing.assert_array_equal(state.centre_error_px[1], centre)
+    # Over there nobody knows what was drift and what was the zoom (a prior of 100 tells 0.5 %).
+    there = Carry(1, 0, np.zeros(4), 1.0, exact, zoom)(state, rest)
+    there = Measure(1, np.zeros(2), sharp)(there, rest).state
+    np.testing.assert_allclose(there.own[:2, :2], zoom @ centre @ zoom.T, rtol=0.01)
+    # Back by the same way the error has undone itself.
+    back = Carry(2, 1, np.zeros(4), 1.0, exact, -zoom)(there, rest)
+    at = back.of(2)
+    np.testing.assert_allclose(back.covariance[at, at], 0.0, atol=1e-12)
+    # Seen from the first keyframe before and after, a specimen at rest tells the error: what a
+    # sharp look after the zoom adds to one from before it.
+    before = Measure(0, np.zeros(2), sharp)(state, rest).state
+    error = np.array([1.5, -0.7])
+    after = Measure(0, -zoom @ error, sharp, zoom=zoom)(before, rest).state
+    found, spread = after.centre_error_px
+    # 1 / 0.3 px per unit and noises of 0.001 for each look: a few thousandths.
+    np.testing.assert_allclose(found, error, atol=0.03)
+    assert np.all(np.sqrt(np.diag(spread)) < 0.01)
 
 
 # -- refusals -----------------------------------------------------------------------------------

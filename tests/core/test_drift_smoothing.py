@@ -10,18 +10,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from semcal_ros.core.drift_map import (
+from semcal_ros.core.drift_map import DriftMap, still
+from semcal_ros.core.drift_operations import (
     Carry,
-    DriftMap,
     Drop,
     Measure,
     Move,
     Operation,
     Reshear,
-    Restlessness,
     Settle,
     Widen,
-    still,
 )
 from semcal_ros.core.drift_smoothing import (
     Event,
@@ -31,6 +29,7 @@ from semcal_ros.core.drift_smoothing import (
     smoothed,
 )
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.restlessness import Restlessness
 
 Array = NDArray[np.float64]
 
@@ -49,7 +48,7 @@ class Dense:
     (:meth:`Restlessness.over`) and of a frame (:meth:`Restlessness.within`) is used.
     """
 
-    def __init__(self, restlessness: Restlessness) -> None:
+    def __init__(self, restlessness: Restlessness, centre: Array | None = None) -> None:
         self.restlessness = restlessness
         self.time_s = 0.0
         self.noises = 0
@@ -58,6 +57,7 @@ class Dense:
         self.places: dict[int, Array] = {}
         self.seen: list[tuple[Array, Array, Array]] = []
         self.marked: list[Array] = []
+        self.centre = self.noise(np.zeros((2, 2)) if centre is None else centre)
 
     def noise(self, covariance: Array) -> Array:
         """Rows of new noise."""
@@ -97,8 +97,9 @@ class Dense:
         elif isinstance(event, Carry):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
             copy = ratio[:, None] * self.places[event.parent]
+            zoomed = np.vstack([event.zoom, np.zeros((2, 2))]) @ self.centre
             own = self.noise(event.noise)
-            self.places[event.key] = self.sum(copy, self.constant(event.shift), own)
+            self.places[event.key] = self.sum(copy, zoomed, self.constant(event.shift), own)
         elif isinstance(event, Reshear):
             gone = -np.append(event.bow * event.removed[2:], event.removed[:2])
             self.places[event.key] = self.sum(self.places[event.key], self.constant(gone))
@@ -107,7 +108,8 @@ class Dense:
         elif isinstance(event, Measure):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
             where = np.vstack([drift + event.bow * turn, pace])
-            expected = self.sum(where, -ratio[:, None] * self.places[event.key])
+            zoomed = np.vstack([-event.zoom, np.zeros((2, 2))]) @ self.centre
+            expected = self.sum(where, zoomed, -ratio[:, None] * self.places[event.key])
             count = event.shift.size
             frame = self.restlessness.within(event.scan_s)[:count, :count]
             self.seen.append((expected[:count], event.shift, event.covariance + frame))
@@ -115,7 +117,7 @@ class Dense:
             self.marked.append(self.state())
 
     def state(self) -> Array:
-        return self.stacked(self.own, *self.places.values())
+        return self.stacked(self.own, self.centre, *self.places.values())
 
     def given(self) -> list[tuple[Array, Array]]:
         """Mean and covariance of each marked state, given all that was seen."""
@@ -175,11 +177,14 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
             size = 2 if what == "shift" else 4
             shift, noise = unit * rng.standard_normal(size), covariance_of(rng, size, unit)
             ratio, bow = rng.uniform(0.5, 2.0), 0.1 * rng.uniform()
-            events.append(Measure(key, shift, noise, ratio, bow, rng.uniform()))
+            zoom = unit * rng.standard_normal((2, 2)) * rng.choice([0.0, 0.3])
+            events.append(Measure(key, shift, noise, ratio, bow, rng.uniform(), zoom))
             if what in ("carry", "copy"):
                 # A copy without noise makes the covariance of the state singular.
                 own = covariance_of(rng, 4, unit) if what == "carry" else np.zeros((4, 4))
-                events.append(Carry(following, key, unit * rng.standard_normal(4), ratio, own))
+                events.append(
+                    Carry(following, key, unit * rng.standard_normal(4), ratio, own, zoom)
+                )
                 keys.append(following)
                 following += 1
         elif what == "settle":
@@ -199,7 +204,11 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
 
 def assert_same(state: DriftMap, mean: Array, covariance: Array, atol: float) -> None:
     """Equal within a part of the deviations that the truth has."""
-    unit = np.sqrt(np.maximum(np.diag(covariance), np.max(np.diag(covariance)) * 1e-16))
+    variances = np.diag(covariance).copy()
+    # What is known exactly is compared on the scale of the rest in its unit.
+    for part in (np.r_[0:6, 8 : len(mean)], np.r_[6:8]):
+        variances[part] = np.maximum(variances[part], 1e-16 * np.max(variances[part]))
+    unit = np.sqrt(variances)
     np.testing.assert_allclose((state.mean - mean) / unit, 0.0, atol=atol)
     np.testing.assert_allclose(
         (state.covariance - covariance) / np.outer(unit, unit), 0.0, atol=atol
@@ -219,11 +228,13 @@ def test_smoothed_states_are_the_exact_conditional_ones(
     rng = np.random.default_rng(seed)
     restlessness = Restlessness(0.3 * unit**2, memory)
     events = random_events(rng, 12, unit)
-    dense = Dense(restlessness)
+    # The error of the principal point is in px, whatever the unit of the drift.
+    centre = np.array([[4.0, 1.2], [1.2, 2.25]])
+    dense = Dense(restlessness, centre)
     for event in events:
         dense.do(event)
     expected = dense.given()
-    states = smoothed(still(0.0), events, restlessness)
+    states = smoothed(still(0.0, centre), events, restlessness)
     assert len(states) == len(expected) == sum(isinstance(e, Mark) for e in events)
     for state, (mean, covariance) in zip(states, expected, strict=True):
         # A part in 1e12 of a variance counts as nothing, and sums of 16 digits leave 1e-4 of it; of

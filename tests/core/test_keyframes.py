@@ -12,11 +12,13 @@ from drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift_map import DriftMap
+from semcal_ros.core.drift_map import DriftMap, still
 from semcal_ros.core.drift_uncertainty import (
     carry_covariance,
+    centre_covariance,
     relative_scale_sigma,
     scale_covariance,
+    zoom_of,
 )
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.keyframe import (
@@ -32,6 +34,7 @@ from semcal_ros.core.keyframe_store import KeyframeStore
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.rectify import Rectifier
 from semcal_ros.core.registration import Registration, RegistrationSettings, register
+from semcal_ros.core.subpixel import MARGIN
 
 Array = NDArray[np.float64]
 
@@ -137,9 +140,10 @@ def test_only_what_both_show_is_averaged_and_the_first_picture_stays_as_it_was()
     better = key.with_frame(frame(shift, 10.0, 2), region, known(shift))
     changed = better.mean != first
     rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
-    # Of the frame's region, seen from the keyframe; one neighbour on the far side is left out.
-    assert (cols[0], cols[-1] + 1) == (0, 150 - 30 - 1)
-    assert (rows[0], rows[-1] + 1) == (8 + 20, 140 + 20 - 1)
+    # Of the frame's region, seen from the keyframe, without what the interpolation would take from
+    # beyond it.
+    assert (cols[0], cols[-1] + 1) == (0, 150 - 30 - MARGIN)
+    assert (rows[0], rows[-1] + 1) == (8 + 20 + MARGIN, 140 + 20 - MARGIN)
     np.testing.assert_array_equal(key.mean, first)
     assert key.averaged == 1
     assert better.shot is key.shot
@@ -252,7 +256,7 @@ def plain_store(**limits: int) -> KeyframeStore:
 
 
 def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float]) -> DriftMap:
-    mean = np.array([*drift, 0.0, 0.0, 0.0, 0.0])
+    mean = np.append(drift, np.zeros(still(0.0).mean.size - 2))
     for place in places.values():
         mean = np.append(mean, [*place, 0.0, 0.0])
     return DriftMap(0.0, mean, np.eye(mean.size), tuple(places))
@@ -444,36 +448,33 @@ def test_a_camera_that_is_known_exactly_leaves_nothing_open() -> None:
 
 def test_a_zoom_about_a_wrong_principal_point_is_an_apparent_step() -> None:
     before, after = small_camera(2000.0), small_camera(3400.0)
-    covariance = np.zeros((10, 10))
-    covariance[3:5, 3:5] = [[4.0, 1.2], [1.2, 2.25]]
-    before, after = (replace(c, covariance=covariance) for c in (before, after))
-    rng = np.random.default_rng(0)
     specimen = np.array([1e-6, 2e-6])
-    steps = []
-    for error in rng.multivariate_normal(np.zeros(2), covariance[3:5, 3:5], 4000):
+    for error in ([1.0, 0.0], [0.0, 1.0], [-2.3, 0.7]):
         # Where the specimen seems to lie if the axis is taken for another pixel, before and after.
         seen = []
         for camera in (before, after):
             jacobian = camera.ideal_from_sem_jacobian
-            pixel = np.array([camera.px, camera.py]) + jacobian @ specimen
-            taken = np.array([camera.px, camera.py]) + error
-            seen.append(np.linalg.solve(jacobian, pixel - taken))
-        steps.append(seen[1] - seen[0])
-        if len(steps) == 1:
-            inverse = [np.linalg.inv(c.ideal_from_sem_jacobian) for c in (before, after)]
-            np.testing.assert_allclose(steps[0], (inverse[0] - inverse[1]) @ error, rtol=1e-9)
-    stated = carry_covariance(before, after)
-    unit = np.sqrt(np.diag(stated))
-    # Variances of 4000 draws scatter by 2.2 %.
-    np.testing.assert_allclose(
-        np.cov(np.array(steps).T) / np.outer(unit, unit), stated / np.outer(unit, unit), atol=0.1
-    )
-    # The way does not matter, and without a change of magnification there is no step.
-    np.testing.assert_allclose(carry_covariance(after, before), stated)
-    np.testing.assert_allclose(carry_covariance(before, before), 0.0, atol=1e-24)
-    # One of the two knows the error as well as both.
-    bare = replace(after, covariance=None)
-    np.testing.assert_allclose(carry_covariance(before, bare), stated)
+            axis = np.array([camera.px, camera.py])
+            pixel = axis + jacobian @ specimen
+            seen.append(np.linalg.solve(jacobian, pixel - (axis + error)))
+        step = seen[1] - seen[0]
+        np.testing.assert_allclose(step, -zoom_of(before, after) @ error, rtol=1e-9)
+    # There and back is no step, nor is one without a change of magnification.
+    np.testing.assert_allclose(zoom_of(after, before), -zoom_of(before, after))
+    np.testing.assert_array_equal(zoom_of(before, before), 0.0)
+
+
+def test_the_principal_point_is_as_uncertain_as_its_camera_says() -> None:
+    camera = uncertain(small_camera(2000.0))
+    assert camera.covariance is not None
+    np.testing.assert_array_equal(centre_covariance(camera), camera.covariance[3:5, 3:5])
+    for exact in (None, small_camera(2000.0)):
+        np.testing.assert_array_equal(centre_covariance(exact), 0.0)
+    # It is none of the errors of the two scales.
+    covariance = np.zeros((10, 10))
+    covariance[3:5, 3:5] = [[4.0, 1.2], [1.2, 2.25]]
+    pair = [replace(small_camera(g), covariance=covariance) for g in (2000.0, 3400.0)]
+    np.testing.assert_array_equal(carry_covariance(*pair), 0.0)
 
 
 def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() -> None:
