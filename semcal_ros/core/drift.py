@@ -26,11 +26,11 @@ from semcal_ros.core.drift_surprise import Surprises
 from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
 from semcal_ros.core.drift_uncertainty import carry_covariance, centre_covariance, scale_covariance
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.keyframe import Shot, keyframe_of, make_keyframe, resampleable
+from semcal_ros.core.keyframe import keyframe_of
 from semcal_ros.core.keyframe_store import KeyframeStore
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import Rectifier
 from semcal_ros.core.registration import Registration
+from semcal_ros.core.shot import Shot, Stills, resampleable
 
 __all__ = ["DriftForecast", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
@@ -69,7 +69,7 @@ class DriftTracker:
         self, settings: DriftSettings | None = None, *, history: DriftHistory | None = None
     ) -> None:
         self.settings = settings or DriftSettings()
-        self._rectifier = Rectifier(self.settings.interpolation)
+        self._stills = Stills(self.settings.interpolation)
         self._history = history
         self.reset()
 
@@ -156,7 +156,8 @@ class DriftTracker:
         """This frame becomes a keyframe that was not measured; why it cannot, or an empty
         string.
         """
-        keyframe = make_keyframe(shot, removed, self._rectifier, drift.state.time_s)
+        picture, region = self._stills.of(shot, removed)
+        keyframe = keyframe_of(shot, removed, picture, region, drift.state.time_s)
         complaint = keyframe.reference(self.settings.registration).complaint
         if not complaint:
             key, gone = self._store.add(keyframe)
@@ -188,7 +189,7 @@ class DriftTracker:
             return self._restarted(drift, shot, f"scale changed by a factor of {ratio:.2f}")
         refusal: tuple[str, Registration] | None = None
         for candidate in candidates[:2]:
-            found = look(drift, self._store, candidate, shot, self._rectifier)
+            found = look(drift, self._store, candidate, shot, self._stills)
             if isinstance(found, Registration):
                 refusal = refusal or (found.reason, found)
                 continue

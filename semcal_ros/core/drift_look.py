@@ -11,10 +11,10 @@ from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_map import DriftMap
 from semcal_ros.core.drift_measure import bends, bow_s2, keyframe_noise, measure_of
 from semcal_ros.core.drift_operations import Measure, Reshear
-from semcal_ros.core.keyframe import Shot, make_keyframe, picture_of
+from semcal_ros.core.keyframe import keyframe_of
 from semcal_ros.core.keyframe_store import Candidate, KeyframeStore
-from semcal_ros.core.rectify import Rectifier
 from semcal_ros.core.registration import Region, Registration, register
+from semcal_ros.core.shot import Shot, Stills
 
 __all__ = ["Found", "look"]
 
@@ -52,7 +52,7 @@ class Found:
 
 
 def look(
-    drift: DriftFilter, store: KeyframeStore, candidate: Candidate, shot: Shot, rectifier: Rectifier
+    drift: DriftFilter, store: KeyframeStore, candidate: Candidate, shot: Shot, stills: Stills
 ) -> Found | Registration:
     """Register a frame, and again without the shear that was left by a velocity that was wrong.
 
@@ -65,7 +65,7 @@ def look(
     """
     motion = drift.state.motion
     first = motion if _removable(motion, shot) else np.zeros(4)
-    found = _once(drift, store, candidate, shot, rectifier, first)
+    found = _once(drift, store, candidate, shot, stills, first)
     for _ in range(_LOOKS - 1):
         if isinstance(found, Registration):
             break
@@ -73,10 +73,10 @@ def look(
         if not _removable(state.motion, shot):
             # A jump, not a drift: it is for the filter to judge.
             break
-        bent = _straightened(drift, store, candidate, state, rectifier)
+        bent = _straightened(drift, store, candidate, state, stills)
         if not bent and not bends(state.motion - found.removed, shot):
             break
-        again = _once(drift, store, candidate, shot, rectifier, state.motion)
+        again = _once(drift, store, candidate, shot, stills, state.motion)
         if isinstance(again, Registration):
             break
         found = again
@@ -96,7 +96,7 @@ def _straightened(
     store: KeyframeStore,
     candidate: Candidate,
     state: DriftMap,
-    rectifier: Rectifier,
+    stills: Stills,
 ) -> bool:
     """Whether the keyframe was sheared, and now no longer is; only a single frame can be."""
     keyframe = store[candidate.key]
@@ -104,7 +104,10 @@ def _straightened(
     if candidate.rescaled or keyframe.averaged > 1 or not bends(left, keyframe.shot):
         return False
     removed = keyframe.removed + left
-    store.replace(candidate.key, make_keyframe(keyframe.shot, removed, rectifier, keyframe.time_s))
+    store.replace(
+        candidate.key,
+        keyframe_of(keyframe.shot, removed, *stills.of(keyframe.shot, removed), keyframe.time_s),
+    )
     drift.do(Reshear(candidate.key, left, bow_s2(keyframe.shot)))
     return True
 
@@ -114,11 +117,11 @@ def _once(
     store: KeyframeStore,
     candidate: Candidate,
     shot: Shot,
-    rectifier: Rectifier,
+    stills: Stills,
     motion: Array,
 ) -> Found | Registration:
     key = candidate.key
-    picture, region = picture_of(shot, motion, rectifier)
+    picture, region = stills.of(shot, motion)
     reference = store.carried(key, shot) if candidate.rescaled else store.reference(key)
     shift, covariance = drift.state.shift_from(key)
     px_from_unit = shot.px_from_unit

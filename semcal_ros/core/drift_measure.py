@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.drift_map import DriftMap
 from semcal_ros.core.drift_operations import Carry, Measure
 from semcal_ros.core.drift_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
-from semcal_ros.core.keyframe import Shot
 from semcal_ros.core.registration import Registration
+from semcal_ros.core.shot import Shot
 
 __all__ = [
     "at_itself",

@@ -13,10 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, Rectifier, raw_from_output
 from semcal_ros.core.registration import (
     Reference,
     Region,
@@ -24,52 +20,17 @@ from semcal_ros.core.registration import (
     RegistrationSettings,
     prepare_reference,
 )
+from semcal_ros.core.shot import Shot
 from semcal_ros.core.subpixel import MARGIN, sampled
 
 __all__ = [
     "Keyframe",
-    "Shot",
     "carried",
     "keyframe_of",
-    "make_keyframe",
-    "picture_of",
-    "resampleable",
     "scale_ratio",
 ]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A frame as it came in.
-
-    Attributes
-    ----------
-    image
-        Raw picture.
-    camera
-        Its camera at the image's size, or None.
-    timing
-        Its raster, or None for an instant.
-    rectified
-        Whether the picture already is in the camera's ideal pixels.
-    """
-
-    image: NDArray[np.generic]
-    camera: ScanCamera | None
-    timing: ScanTiming | None
-    rectified: bool = False
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) in px."""
-        return self.image.shape[1], self.image.shape[0]
-
-    @property
-    def px_from_unit(self) -> Array:
-        """(2, 2) px per unit of the drift: per m with a camera, per px without."""
-        return np.eye(2) if self.camera is None else self.camera.ideal_from_sem_jacobian
 
 
 @dataclass(frozen=True)
@@ -147,97 +108,11 @@ def _gray(picture: NDArray[np.generic]) -> NDArray[np.float32]:
     return np.asarray(picture, dtype=np.float32)
 
 
-def picture_of(
-    shot: Shot, motion: Array, rectifier: Rectifier
-) -> tuple[NDArray[np.generic], Region]:
-    """The frame in ideal pixels as if scanned in the instant of its centre, and the rectangle of
-    it that was scanned.
-
-    ``motion`` (4,) is drift velocity and acceleration, unit per s and s^2.
-    """
-    width, height = shot.size
-    camera = None if shot.rectified else shot.camera
-    # The rectifier takes px where it is given no camera.
-    unit = np.eye(2) if camera is not None else shot.px_from_unit
-    drift = None
-    if shot.timing is not None:
-        time_s = shot.timing.acquisition_time_s
-        bent = np.abs(shot.px_from_unit @ motion[:2]) * time_s
-        bent += np.abs(shot.px_from_unit @ motion[2:]) * time_s**2
-        if float(np.max(bent)) > 1e-3:
-            drift = RasterDrift(np.zeros(2), unit @ motion[:2], unit @ motion[2:])
-    if camera is None and drift is None:
-        return shot.image, (0, 0, width, height)
-    region = _scanned(shot.size, camera, drift, shot.timing)
-    return rectifier.rectify(shot.image, camera, drift, shot.timing), region
-
-
-def _scanned(
-    size: tuple[int, int],
-    camera: ScanCamera | None,
-    drift: RasterDrift | None,
-    timing: ScanTiming | None,
-) -> Region:
-    """Rectangle of output pixels of which all come from inside of the raw frame."""
-    width, height = size
-    left, top, right, bottom = 0, 0, width, height
-    for _ in range(4):
-        x, y = np.linspace(left, right - 1, 17), np.linspace(top, bottom - 1, 17)
-        edges = [
-            np.stack([np.full(17, float(left)), y], axis=1),
-            np.stack([x, np.full(17, float(top))], axis=1),
-            np.stack([np.full(17, right - 1.0), y], axis=1),
-            np.stack([x, np.full(17, bottom - 1.0)], axis=1),
-        ]
-        raw = [raw_from_output(edge, size, camera, drift, timing) for edge in edges]
-        # An interpolation reaches two pixels beyond its position; a hole in the distortion counts
-        # as far outside.
-        lacking = [
-            2.0 - np.nan_to_num(raw[0][:, 0], nan=-width / 8).min(),
-            2.0 - np.nan_to_num(raw[1][:, 1], nan=-height / 8).min(),
-            np.nan_to_num(raw[2][:, 0], nan=1.125 * width).max() - (width - 3.0),
-            np.nan_to_num(raw[3][:, 1], nan=1.125 * height).max() - (height - 3.0),
-        ]
-        steps = [int(np.ceil(max(v, 0.0))) for v in lacking]
-        left, top = min(left + steps[0], width // 3), min(top + steps[1], height // 3)
-        right, bottom = (
-            max(right - steps[2], 2 * width // 3),
-            max(bottom - steps[3], 2 * height // 3),
-        )
-        if not any(steps):
-            break
-    return left, top, right, bottom
-
-
-def make_keyframe(shot: Shot, motion: Array, rectifier: Rectifier, time_s: float) -> Keyframe:
-    """A keyframe of a frame from which velocity and acceleration (4,) are removed."""
-    return keyframe_of(shot, motion, *picture_of(shot, motion, rectifier), time_s)
-
-
 def keyframe_of(
     shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
 ) -> Keyframe:
     """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
     return Keyframe(shot, removed.copy(), _gray(picture).copy(), region, time_s)
-
-
-def resampleable(image: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The image in a type that can be resampled.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no picture.
-    """
-    shape = image.shape
-    if image.dtype.kind not in "uif" or not (
-        len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
-    ):
-        raise InvalidValueError(
-            f"an image of shape {shape} and type {image.dtype}",
-            expected="(h, w) or (h, w, 3) of integers or floats",
-        )
-    return image if image.dtype.name in ("uint8", "uint16", "float32") else image.astype(np.float32)
 
 
 def scale_ratio(before: Shot, now: Shot) -> float:

@@ -27,7 +27,7 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
 
-__all__ = ["RasterDrift", "Rectifier", "raw_from_output"]
+__all__ = ["RasterDrift", "Rectifier", "camera_key", "raw_from_output"]
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -253,7 +253,7 @@ class Rectifier:
         height).
         """
         fitted = None if camera is None else camera.resized(*size)
-        key = _camera_key(size, fitted)
+        key = camera_key(size, fitted)
         if drift is None and key in self._static:
             self._static.move_to_end(key)
             return self._static[key]
@@ -309,7 +309,7 @@ class Rectifier:
 
         What single precision has to carry later is this small departure, not the position itself.
         """
-        key = _camera_key(size, camera)
+        key = camera_key(size, camera)
         for degree in [d for d in _DEGREES if d >= self._degrees.get(key, 0)]:
             interpolant = self._interpolants.get((*size, degree))
             if interpolant is None:
@@ -338,7 +338,8 @@ def _keep(store: OrderedDict[_Key, _Value], key: _Key, value: _Value, at_most: i
         store.popitem(last=False)
 
 
-def _camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object, ...]:
+def camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object, ...]:
+    """What maps of (width, height) depend on, for looking them up."""
     if camera is None:
         return size
     field = b"" if camera.residual is None else camera.residual.coefficients.tobytes()

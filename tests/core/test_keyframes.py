@@ -23,17 +23,15 @@ from semcal_ros.core.drift_uncertainty import (
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.keyframe import (
     Keyframe,
-    Shot,
     carried,
     keyframe_of,
-    make_keyframe,
     resampleable,
     scale_ratio,
 )
 from semcal_ros.core.keyframe_store import KeyframeStore
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import Rectifier
 from semcal_ros.core.registration import Registration, RegistrationSettings, register
+from semcal_ros.core.shot import Shot, Stills
 from semcal_ros.core.subpixel import MARGIN
 
 Array = NDArray[np.float64]
@@ -193,11 +191,12 @@ def test_a_carried_keyframe_shows_the_drift_in_pixels_of_the_other_camera(ratio:
     # The same instrument, whose axis does not go through the same pixel at every magnification.
     now = replace(small_camera(2000.0 * ratio), px=101.5, py=88.25, ex=91.0, ey=97.0, skew=-0.01)
     drift = np.array([1.1e-6, -0.6e-6])
-    rectifier = Rectifier("cubic")
-    key = make_keyframe(shot_of(before, STILL, 0), NOWHERE, rectifier, 0.0)
+    stills = Stills("cubic")
+    first = shot_of(before, STILL, 0)
+    key = keyframe_of(first, NOWHERE, *stills.of(first, NOWHERE), 0.0)
     shot = shot_of(now, drift, 1)
     other = carried(key, shot)
-    picture = make_keyframe(shot, NOWHERE, rectifier, 1.0)
+    picture = keyframe_of(shot, NOWHERE, *stills.of(shot, NOWHERE), 1.0)
     found = register(
         other.reference(RegistrationSettings()), picture.mean, image_region=picture.region
     )
