@@ -25,13 +25,12 @@ from semcal_ros.core.keyframe import (
     Keyframe,
     carried,
     keyframe_of,
-    resampleable,
     scale_ratio,
 )
 from semcal_ros.core.keyframe_store import KeyframeStore
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.registration import Registration, RegistrationSettings, register
-from semcal_ros.core.shot import Shot, Stills
+from semcal_ros.core.shot import Shot, Stills, resampleable
 from semcal_ros.core.subpixel import MARGIN
 
 Array = NDArray[np.float64]
