@@ -87,7 +87,7 @@ class Follower:
     Parameters
     ----------
     hindsight
-        Whether to keep what that takes.
+        Whether to keep what that takes; without it there is only the drift of now.
     """
 
     def __init__(self, *, hindsight: bool = True) -> None:
@@ -101,7 +101,8 @@ class Follower:
     ) -> DriftUpdate:
         """Drift at the next frame."""
         update = self.tracker.update(frame.image, time_s, camera, scan)
-        self.updates.append(update)
+        if self.history is not None:
+            self.updates.append(update)
         return update
 
     def path(self, *, live: bool) -> DriftPath:

@@ -20,7 +20,9 @@ from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.cli import main
 from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.drift_path import DriftPath
-from semcal_ros.files.bags import BagWriter, open_bag
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.files.bags import BagWriter, blank_message, open_bag
+from semcal_ros.synthetic import Drift, drift_plan, preset
 
 FRAMES, SIZE, G = 9, 160, 20000.0
 Change = Callable[[int, np.ndarray, int], tuple[np.ndarray, int]]
@@ -333,6 +335,119 @@ def test_a_video_that_is_not_whole_is_not_kept(gold, tmp_path, capsys, monkeypat
     out, video = tmp_path / "m.tif", tmp_path / "v.mp4"
     assert "3 of 9 frames" in refused(capsys, "stack", gold, "-o", out, "--video", video)
     assert not list(tmp_path.iterdir())
+
+
+# -- scan timing that the configuration does not tell ---------------------------------------------
+
+PASS_S = 0.9
+
+
+def recorded(target: Path, drift: Drift, frames: int) -> Path:
+    """One frame per second, of a single pass each."""
+    microscope = preset("ideal").with_image_size(SIZE, SIZE).with_timing(ScanTiming(PASS_S, 1, 0.1))
+    plan = drift_plan(microscope, magnification=G, frames=frames, interval_s=1.0, drift=drift)
+    with BagWriter(target) as writer:
+        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
+        value = blank_message("std_msgs/msg/Float64")
+        value.data = G
+        writer.write("/sem/magnification", 0, value)
+        for k in range(frames):
+            image = blank_message("sensor_msgs/msg/Image")
+            fill_header(image.header, (k + 1) * 10**9, "sem_optical")
+            fill_image(image, plan.render(k), "mono8", image.header)
+            writer.write("/sem/image_raw", (k + 1) * 10**9, image)
+    return target
+
+
+SWAYING = Drift(wander_m=25e-9, wander_period_s=(30.0, 12.0), seed=4)
+
+
+@pytest.fixture(scope="module")
+def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drift whose velocity changes enough to tell how long a pass takes."""
+    return recorded(tmp_path_factory.mktemp("scan") / "swaying", SWAYING, 20)
+
+
+SEEN = re.compile(
+    r"^note: the configuration has no scan; the frames are sheared as if one pass took "
+    r"(\S+) \+- (\S+) s(.*)$",
+    re.MULTILINE,
+)
+
+
+def rms_nm(table: Path) -> float:
+    """Error of the drift at the centre of each frame against that of the first one."""
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    found = np.array([[float(r["dx_m"]), float(r["dy_m"])] for r in rows])
+    truth = SWAYING(np.arange(len(rows)) + 0.5 * PASS_S)
+    error = found - (truth - truth[0])
+    return 1e9 * float(np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)))
+
+
+def test_the_time_of_a_pass_is_seen_and_the_shear_removed(swaying, tmp_path, capsys):
+    tables = [tmp_path / f"{name}.csv" for name in ("seen", "given", "live")]
+    assert run("drift", swaying, "-o", tables[0]) == 0
+    captured = capsys.readouterr()
+    ((time_s, sigma_s, more),) = SEEN.findall(captured.err)
+    assert float(time_s) == pytest.approx(PASS_S, abs=3 * float(sigma_s))
+    assert float(sigma_s) < 0.15 and more == ""
+    assert run("drift", swaying, "-o", tables[1], "--frame-time", time_s) == 0
+    assert "no scan" not in capsys.readouterr().err
+    # The note is rounded.
+    drift = [np.loadtxt(t, delimiter=",", skiprows=1, usecols=(1, 2)) for t in tables[:2]]
+    np.testing.assert_allclose(*drift, atol=1e-9)
+    assert rms_nm(tables[0]) < 0.05 * 1e9 * 0.12 / G / SIZE
+    assert run("drift", swaying, "-o", tables[2], "--live") == 0
+    ((_, _, more),) = SEEN.findall(capsys.readouterr().err)
+    assert "--frame-time" in more
+
+
+def test_the_average_is_made_with_the_time_that_was_seen(swaying, tmp_path, capsys):
+    out, command = tmp_path / "seen.tif", ("stack", swaying, "-o")
+    assert run(*command, out) == 0
+    captured = capsys.readouterr()
+    ((_, _, more),) = SEEN.findall(captured.err)
+    assert more == "" and "20 of 20 frames averaged" in captured.out
+    images = [tifffile.imread(out)]
+    for time_s in (PASS_S, 1e-6):
+        assert run(*command, out, "--frame-time", time_s) == 0
+        assert "no scan" not in capsys.readouterr().err
+        images.append(tifffile.imread(out))
+    inner = (slice(24, -24), slice(24, -24))
+    seen, true, instants = (image[inner] for image in images)
+    # What is right to a few percent leaves a few percent of what the shear does.
+    assert np.std(seen - true) < 0.25 * np.std(instants - true)
+
+
+def test_rectify_tells_the_time_for_another_run(swaying, tmp_path, capsys):
+    make_calibration().save(tmp_path / "cal.yaml")
+    command = ("rectify", swaying, "--calibration", tmp_path / "cal.yaml")
+    assert run(*command, "-o", tmp_path / "a") == 0
+    err = capsys.readouterr().err
+    ((_, _, more),) = SEEN.findall(err)
+    assert "--frame-time" in more
+    assert run(*command, "-o", tmp_path / "b", "--frame-time", 0.9) == 0
+    assert run(*command, "-o", tmp_path / "c", "--no-drift") == 0
+    assert "no scan" not in capsys.readouterr().err
+
+
+def test_a_fast_drift_without_a_known_raster_is_told(tmp_path, capsys):
+    steady = recorded(tmp_path / "steady", Drift(velocity_m_s=(60e-9, 0.0)), 8)
+    capsys.readouterr()
+    assert run("drift", steady, "-o", tmp_path / "d.csv") == 0
+    err = capsys.readouterr().err
+    assert re.search(r"no scan; drift of up to 1\.[56] px .*--frame-time", err), err
+    for value in ("0", "-1", "nan", "inf"):
+        command = ("drift", steady, "-o", tmp_path / "d.csv")
+        assert run(*command, f"--frame-time={value}") == 2
+        capsys.readouterr()
+
+
+def test_a_configured_scan_is_believed(gold, tmp_path, capsys):
+    capsys.readouterr()
+    assert run("drift", gold, "--config", "virtual_sem", "-o", tmp_path / "d.csv") == 0
+    assert "scan" not in capsys.readouterr().err
 
 
 def test_help_has_an_example(capsys):
