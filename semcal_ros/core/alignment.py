@@ -31,7 +31,15 @@ from semcal_ros.core.tile_fit import (
     residuals,
     well_posed,
 )
-from semcal_ros.core.tiles import Level, Pyramid, TileSums, TileWindow, tile_sums, tile_window
+from semcal_ros.core.tiles import (
+    PIXELS_FOR_SLOPES,
+    Level,
+    Pyramid,
+    TileSums,
+    TileWindow,
+    tile_sums,
+    tile_window,
+)
 
 __all__ = ["Alignment", "align", "tile_energies"]
 
@@ -51,6 +59,12 @@ _BLOCK_SIGMAS = 14.0
 _LEAST_BLOCKS = 36
 # Rows of tiles from which a change of the shift over the rows can be told.
 _LEAST_ROWS = 6
+# Noise of lines is looked for in that many rows of tiles, and found where it makes the variance so
+# many times larger.
+_LEAST_ROWS_OF_NOISE = 10
+_ROWS_RATIO = 2.0
+# How many standard deviations of chance the common information must be above.
+_CHANCE = 5.0
 
 
 @dataclass(frozen=True)
@@ -186,7 +200,20 @@ def _look(
     geometry = geometry_of(level, window)
     sums = tile_sums(level, window, picture, shift, mean, slopes)
     fit = fitted(geometry, sums)
-    return None if fit is None else _Look(level, window, geometry, sums, fit, shift, size, mean)
+    if fit is None or not _informed(level, geometry, fit):
+        return None
+    return _Look(level, window, geometry, sums, fit, shift, size, mean)
+
+
+def _informed(level: Level, geometry: TileGeometry, fit: TileFit) -> bool:
+    """Whether the pictures have more gradient in common than chance gives, in every direction."""
+    energy = geometry.gram.sum(axis=0)[:2, :2] * np.outer(geometry.kept, geometry.kept)
+    pixels = min(float(geometry.gram[:, 3, 3].sum()), float(PIXELS_FOR_SLOPES))
+    # Smoothed noise has fewer independent pixels.
+    chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
+    values, vectors = np.linalg.eigh(fit.information)
+    weakest = vectors[:, 0]
+    return bool(values[0] > _CHANCE * chance * float(weakest @ energy @ weakest))
 
 
 def _blocks(look: _Look, scores: Array) -> Array:
@@ -210,7 +237,22 @@ def _covariance(look: _Look) -> Array:
     """(2, 2) from the scatter of the blocks' scores: noise of any colour and strength is in
     them.
     """
-    return _sandwich(_blocks(look, look.fit.scores), _inverse(look.fit.information))
+    return _robust(look, look.fit.scores, _inverse(look.fit.information))
+
+
+def _robust(look: _Look, scores: Array, inverse: Array) -> Array:
+    """Covariance from the scatter of blocks, and of whole rows of tiles where that is clearly
+    larger: lines of a scan may be shifted or shaded as a whole.
+    """
+    covariance = _sandwich(_blocks(look, scores), inverse)
+    cols = look.window.cols.stop - look.window.cols.start
+    rows = scores.reshape(-1, cols, scores.shape[1]).sum(axis=1)
+    if len(rows) < _LEAST_ROWS_OF_NOISE:
+        return covariance
+    ratio = np.diag(_sandwich(rows, inverse)) / np.maximum(np.diag(covariance), 1e-300)
+    # With few rows the ratio scatters; white noise seldom makes it so large.
+    scale = np.sqrt(np.where(ratio > _ROWS_RATIO, ratio, 1.0))
+    return np.asarray(covariance * np.outer(scale, scale))
 
 
 def _inverse(matrix: Array) -> Array:
@@ -316,7 +358,11 @@ def _with_shear(look: _Look, weights: Array) -> tuple[Array, Array]:
     scores = (powers[:, :, None] * look.fit.scores[:, None, :]).reshape(-1, 4)
     step = -inverse @ scores.sum(axis=0)
     joint = np.append(look.shift + step[:2], step[2:])
-    return joint, _sandwich(_blocks(look, scores), inverse)
+    # What the step explains is no noise.
+    moved = powers @ step.reshape(2, 2)
+    left = look.fit.scores + np.einsum("tij,tj->ti", weights, moved)
+    scores = (powers[:, :, None] * left[:, None, :]).reshape(-1, 4)
+    return joint, _robust(look, scores, inverse)
 
 
 def tile_energies(level: Level, image: Pyramid, shift_px: Array) -> Array | None:

@@ -16,13 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.drift_doubt import (
+    Surprises,
+    of_a_contradiction,
+    of_a_pause,
+    of_another_place,
+)
 from semcal_ros.core.drift_filter import DriftFilter
 from semcal_ros.core.drift_history import DriftHistory
-from semcal_ros.core.drift_look import Found, look
+from semcal_ros.core.drift_look import Found, joins, look
 from semcal_ros.core.drift_map import still
 from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, bow_s2, loosened
 from semcal_ros.core.drift_operations import Drop, Measure, Move
-from semcal_ros.core.drift_surprise import Surprises
 from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
 from semcal_ros.core.drift_uncertainty import carry_covariance, centre_covariance, scale_covariance
 from semcal_ros.core.errors import InvalidValueError
@@ -40,17 +45,18 @@ Array = NDArray[np.float64]
 _GATE = 27.6
 # Multiple of the first step's sigma within which a shift agrees with what was expected.
 _REACH = 2.0
-# A picture that has come to differ that much from its keyframe needs another one; one that differs
-# less may become part of it.
+# Changes of scale up to which the keyframe stays in use, resampled for each frame.
+_SMALL_ZOOM = 1.15
+# A picture that has come to differ that much from its keyframe needs another one.
 _LIKE_ENOUGH = 0.75
-_LIKE_ENOUGH_TO_ADD = 0.85
-_GAINS_TO_ADD = (0.5, 2.0)
-_SHEAR_TO_ADD_PX = 0.1
 # A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
 # noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
 # frame's noise, this much, and this much times the part that did not overlap, as seen in the closure
 # of triples of frames.
 _COPY_NOISE, _COPY_NOISE_BESIDE = 0.15, 5.0
+_FROZEN = "image: the same picture as the frame before"
+# After so many frame intervals without a frame nothing says that the drift went on as it was.
+_PAUSE = 10.0
 
 
 class DriftTracker:
@@ -84,6 +90,7 @@ class DriftTracker:
         self._surprises = Surprises()
         self._last: tuple[Shot, float] | None = None
         self._doubt = np.zeros((2, 2))
+        self._sample = b""
 
     def update(
         self,
@@ -146,6 +153,7 @@ class DriftTracker:
         self._filter = DriftFilter(start, self.settings.acceleration_psd, history=kept)
         if self._history is not None:
             self._history.begin(self._filter)
+        self._sample = shot.sample
         complaint = self._new_key(self._filter, shot, np.zeros(4))
         if complaint:
             # Nothing can be measured against such a picture: wait for a better one.
@@ -174,13 +182,18 @@ class DriftTracker:
             unit_from_px = np.linalg.inv(shot.px_from_unit)
             step = self.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
             drift.first_velocity(step / dt, (0.1 * step) ** 2 / dt**3, dt)
+        speed = float(np.hypot(*drift.state.velocity))
         drift.do(Move(centre_s))
+        if 0.0 < _PAUSE * drift.restlessness.memory_s < dt:
+            drift.do(of_a_pause(speed, dt))
 
     # -- measuring --------------------------------------------------------------------------------
 
     def _followed(self, drift: DriftFilter, shot: Shot) -> DriftUpdate:
         limits = self.settings
         self._doubt = np.zeros((2, 2))
+        sample = shot.sample
+        frozen, self._sample = sample == self._sample, sample
         candidates = self._store.candidates(
             drift.state, shot, limits.rekey_overlap, limits.max_ratio
         )
@@ -193,7 +206,8 @@ class DriftTracker:
             if isinstance(found, Registration):
                 refusal = refusal or (found.reason, found)
                 continue
-            reason = self._accepted(drift, shot, found)
+            # Noise never comes twice: the scan is paused, or the driver sent the frame again.
+            reason = _FROZEN if frozen else self._accepted(drift, shot, found)
             if not reason:
                 return self._kept(drift, shot, found)
             refusal = refusal or (reason, found.registration)
@@ -206,10 +220,11 @@ class DriftTracker:
         before = self._store[measure.key].shot
         expected, _ = state.shift_from(measure.key)
         away_px = np.abs(shot.px_from_unit @ (measure.shift[:2] - expected))
-        if np.any(away_px > self.settings.max_jump * np.array(shot.size)):
-            return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
         loose = loosened(measure, before, shot) if found.candidate.rescaled else measure
         outcome = loose(state, drift.restlessness)
+        unexpected = drift.measured == 0 or outcome.nis > _GATE
+        if unexpected and np.any(away_px > self.settings.max_jump * np.array(shot.size)):
+            return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
         if outcome.shear_nis > _GATE:
             measure = measure.of_shift()
         since_s = state.time_s - (self._last[1] if self._last else state.time_s)
@@ -227,8 +242,11 @@ class DriftTracker:
                 self._doubt = np.outer(doubt, doubt)
                 return f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
             drift.do(widened)
-        if found.candidate.rescaled:
+        if found.candidate.ratio > _SMALL_ZOOM:
             measure = self._carried(drift, shot, found, replace(measure, zoom=loose.zoom))
+        elif found.candidate.rescaled:
+            # A zoom in small steps would make a long chain of keyframes.
+            measure = loose
         drift.accept(measure)
         drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
         return ""
@@ -259,38 +277,31 @@ class DriftTracker:
     def _kept(self, drift: DriftFilter, shot: Shot, found: Found) -> DriftUpdate:
         """Bookkeeping of a frame that was registered: the keyframe in use, and its mean."""
         self._misses = 0
-        self._surprises.forget()
+        self._surprises.forget(drift.state)
         registration, candidate = found.registration, found.candidate
         overlap = registration.overlap
         time_s = self._store[candidate.key].time_s
-        if candidate.rescaled:
+        if candidate.ratio > _SMALL_ZOOM:
             return self._report(shot, "keyframe", registration, overlap)
         self._store.use(candidate.key)
         status, enough = "tracked", self.settings.rekey_overlap
         unlike = registration.likeness < _LIKE_ENOUGH
         if unlike or overlap < enough:
-            following = self._store.candidates(drift.state, shot, enough, 1.0)
+            following = self._store.candidates(drift.state, shot, enough, _SMALL_ZOOM)
             if unlike or following[0].overlap < enough:
                 share = _COPY_NOISE + _COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
                 noise = found.measure.covariance[:2, :2] * share
-                self._rekey(drift, shot, found, found.measure, noise)
+                measure = found.measure
+                if candidate.rescaled:
+                    before = self._store[candidate.key].shot
+                    measure = loosened(measure, before, shot)
+                self._rekey(drift, shot, found, measure, noise)
                 status = "keyframe"
-        elif self.settings.average and self._fits(found):
+        elif self.settings.average and joins(found, self._store):
             keyframe = self._store[candidate.key]
             better = keyframe.with_frame(found.picture, found.region, registration)
             self._store.replace(candidate.key, better)
         return self._report(shot, status, registration, overlap, keyframe_time_s=time_s)
-
-    def _fits(self, found: Found) -> bool:
-        """Whether a frame makes the mean of its keyframe better."""
-        registration = found.registration
-        shear = np.nan_to_num(registration.joint_px[2:], nan=0.0)
-        return (
-            self._store.wants(found.candidate.key, registration.overlap)
-            and registration.likeness > _LIKE_ENOUGH_TO_ADD
-            and _GAINS_TO_ADD[0] < registration.gain < _GAINS_TO_ADD[1]
-            and float(np.max(np.abs(shear))) < _SHEAR_TO_ADD_PX
-        )
 
     def _missed(
         self,
@@ -303,7 +314,17 @@ class DriftTracker:
         unusable = reason.startswith("image:")
         # A blanked beam says nothing about the keyframe.
         self._misses += 0 if unusable else 1
-        if self._misses >= self.settings.lost_after or (rescaled and not unusable):
+        since_s = max(drift.state.time_s - (self._last[1] if self._last else 0.0), 1e-9)
+        nearest = np.asarray(np.linalg.solve(shot.px_from_unit, registration.nearest_px))
+        doubt = of_a_contradiction(drift.state, self._store.current, nearest, since_s)
+        lost = self._misses >= self.settings.lost_after
+        if lost:
+            reach_px = self.settings.max_jump * max(shot.size)
+            pace_px = self.settings.first_step_px / since_s
+            doubt = of_another_place(shot.px_from_unit, reach_px, pace_px)
+        if doubt is not None:
+            drift.do(doubt)
+        if lost or (rescaled and not unusable):
             return self._restarted(drift, shot, reason)
         return self._report(shot, f"coasting: {reason}", registration, registration.overlap)
 

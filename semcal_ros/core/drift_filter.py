@@ -125,7 +125,7 @@ class DriftFilter:
         self.events.append(measure)
         self._pending = None
         self.measured += 1
-        if self._adapts and self.measured in _LEARNT:
+        if self._adapts and self.measured in _LEARNT and self.restlessness.psd > 0.0:
             # The guess that all began with is worth less than what was seen since.
             near = self.restlessness
             self.restlessness = likely_restlessness(self.start, self.events, near, (1.0,))

@@ -13,14 +13,17 @@ from semcal_ros.core.drift_measure import bends, bow_s2, keyframe_noise, measure
 from semcal_ros.core.drift_operations import Measure, Reshear
 from semcal_ros.core.keyframe import keyframe_of
 from semcal_ros.core.keyframe_store import Candidate, KeyframeStore
-from semcal_ros.core.registration import Region, Registration, register
+from semcal_ros.core.reference import Region
+from semcal_ros.core.registration import Registration, register
 from semcal_ros.core.shot import Shot, Stills
 
-__all__ = ["Found", "look"]
+__all__ = ["Found", "joins", "look"]
 
 Array = NDArray[np.float64]
 
 _LOOKS = 4
+# What frames must be like to become part of their keyframe's mean.
+_LIKE_ENOUGH, _GAINS, _LARGEST_SHEAR_PX = 0.85, (0.5, 2.0), 0.1
 # Part of the picture's height by which drift may shear it.
 _LARGEST_SHEAR = 0.1
 
@@ -131,7 +134,7 @@ def _once(
         guess_px=px_from_unit @ shift,
         guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
         image_region=region,
-        max_shear_px=0.0 if shot.timing is None else _LARGEST_SHEAR * shot.size[1],
+        max_shear_px=_LARGEST_SHEAR * shot.size[1],
     )
     if not registration.accepted:
         return registration
@@ -141,3 +144,16 @@ def _once(
     if drift.pending == key:
         drift.settle(keyframe_noise(measure), measure.scan_s)
     return Found(candidate, registration, picture, region, motion, measure)
+
+
+def joins(found: Found, store: KeyframeStore) -> bool:
+    """Whether a frame makes the mean of its keyframe better."""
+    registration, candidate = found.registration, found.candidate
+    shear = np.nan_to_num(registration.joint_px[2:], nan=0.0)
+    return (
+        not candidate.rescaled
+        and store.wants(candidate.key, registration.overlap)
+        and registration.likeness > _LIKE_ENOUGH
+        and _GAINS[0] < registration.gain < _GAINS[1]
+        and float(np.max(np.abs(shear))) < _LARGEST_SHEAR_PX
+    )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectify import RasterDrift
-from semcal_ros.core.registration import RegistrationSettings
+from semcal_ros.core.reference import RegistrationSettings
 
 __all__ = ["DriftForecast", "DriftSettings", "DriftUpdate"]
 

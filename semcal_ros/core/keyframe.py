@@ -13,13 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.registration import (
-    Reference,
-    Region,
-    Registration,
-    RegistrationSettings,
-    prepare_reference,
-)
+from semcal_ros.core.reference import Reference, Region, RegistrationSettings
+from semcal_ros.core.registration import Registration, prepare_reference
 from semcal_ros.core.shot import Shot
 from semcal_ros.core.subpixel import MARGIN, sampled
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.drift_map import DriftMap
 from semcal_ros.core.keyframe import Keyframe, carried, scale_ratio
-from semcal_ros.core.registration import Reference, RegistrationSettings
+from semcal_ros.core.reference import Reference, RegistrationSettings
 from semcal_ros.core.shot import Shot
 
 __all__ = ["SAME_SCALE", "Candidate", "KeyframeStore"]

@@ -8,16 +8,18 @@ pictures have most of their structure in common, and no rival shift explains the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.alignment import Alignment, align, tile_energies
+from semcal_ros.core.alignment import Alignment, align
 from semcal_ros.core.correlation import CoarsePeak, CoarseReference, coarse_peaks
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.prefilter import gaussian_taps, noise_variance, picture_statistics
-from semcal_ros.core.tiles import Level, Pyramid, make_level
+from semcal_ros.core.reference import Reference, Region, RegistrationSettings
+from semcal_ros.core.rivals import NOTHING, choose
+from semcal_ros.core.tiles import Pyramid, make_level
 
 __all__ = [
     "Reference",
@@ -30,45 +32,14 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.generic]
-#: Valid rectangle (left, top, right, bottom) in px, right and bottom exclusive.
-Region = tuple[int, int, int, int]
 
 _SMALLEST_PX = 48
 # Levels of the pyramid keep at least that many px along the shorter side.
 _SMALLEST_LEVEL_PX = 160
 _SATURATION_SAMPLES = 256
+# Of the noise's variance; chance makes about a hundredth of that.
+_LEAST_SIGNAL = 3e-3
 _NATIVE = ("uint8", "uint16", "float32")
-# Part of the residual by which two shifts must differ to be told apart.
-_DIFFERENT = 0.05
-_NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
-
-
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """Limits of :func:`register`.
-
-    Attributes
-    ----------
-    min_overlap
-        Least fraction of the smaller picture that must overlap.
-    max_sigma_px
-        Largest acceptable 1-sigma of the shift in its worst direction.
-    min_likeness
-        Least correlation of the two pictures after the noise has been accounted for.
-    max_saturated
-        Largest fraction of pixels at either end of the grey scale.
-    rival_height
-        Correlation peaks higher than this fraction of the best are examined as rivals.
-    rival_deviations
-        How many standard errors a rival must be worse by.
-    """
-
-    min_overlap: float = 0.3
-    max_sigma_px: float = 0.5
-    min_likeness: float = 0.6
-    max_saturated: float = 0.5
-    rival_height: float = 0.7
-    rival_deviations: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +72,9 @@ class Registration:
         Of the refinement.
     accepted, reason
         Whether the shift may be used; ``reason`` is empty when it may.
+    nearest_px
+        (2,) the shift nearest to the prediction among those between which a refused registration
+        could not decide; NaN otherwise.
     """
 
     shift_px: Array
@@ -116,34 +90,7 @@ class Registration:
     iterations: int
     accepted: bool
     reason: str
-
-
-@dataclass(frozen=True)
-class Reference:
-    """A reference picture with everything about it that does not depend on the image.
-
-    Made by :func:`prepare_reference`.
-
-    Attributes
-    ----------
-    region
-        The part of the picture that is compared.
-    coarse
-        Its side of the search over all shifts.
-    levels
-        Its tiles from the coarsest resolution to the finest.
-    noise_variance
-        Of its white part per pixel.
-    complaint
-        Why nothing can be registered against it, or an empty string.
-    """
-
-    region: Region
-    coarse: CoarseReference
-    levels: tuple[Level, ...]
-    noise_variance: float
-    complaint: str
-    settings: RegistrationSettings = field(default_factory=RegistrationSettings)
+    nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
 
 
 def _gray(image: ArrayLike) -> Picture:
@@ -223,6 +170,8 @@ def prepare_reference(
     if complaint:
         return Reference(inside, coarse, (), 0.0, complaint, limits)
     statistics = picture_statistics(gray, averaged)
+    if statistics.signal_variance < _LEAST_SIGNAL * statistics.noise_variance:
+        return Reference(inside, coarse, (), 0.0, "featureless picture (noise only)", limits)
     levels = []
     for factor in _factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
@@ -322,12 +271,14 @@ def register(
     if not peaks:
         return _refused("no shift stands out: featureless, or another place")
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    peak = _choose(prepared, pyramid, peaks, guess, spread)
+    peak = choose(prepared, pyramid, peaks, guess, spread)
     if isinstance(peak, str):
-        return _refused(peak)
+        away = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
+        nearest = np.array(peaks[int(np.argmin(away))].shift_px) + origin
+        return replace(_refused(peak), nearest_px=nearest)
     fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
     if fine is None:
-        return _refused(_NOTHING)
+        return _refused(NOTHING)
     return _judged(prepared, gray, peak, fine, origin, max_shear_px)
 
 
@@ -397,75 +348,3 @@ def _objection(
         apart = float(np.max(np.abs(fine.look_difference_px)))
         return f"halves of the picture disagree by {apart:.1f} px"
     return ""
-
-
-def _choose(
-    reference: Reference,
-    pyramid: Pyramid,
-    peaks: list[CoarsePeak],
-    guess: Array,
-    spread: Array | None,
-) -> CoarsePeak | str:
-    """The peak to believe, or the reason why none can be believed.
-
-    Rivals are compared at full resolution: reduced pictures differ by how their pixels happen to
-    fall.
-    """
-    limits, level = reference.settings, reference.levels[-1]
-    rivals = [p for p in peaks if p.correlation >= limits.rival_height * peaks[0].correlation]
-    if len(rivals) > 1 and spread is not None:
-        near = [p for p in rivals if _within(p, guess, spread)]
-        # Only rivals that the prediction allows count, as long as it allows any.
-        rivals = near or rivals
-    if len(rivals) == 1:
-        return rivals[0]
-    best: tuple[CoarsePeak, Array, Array | None] | None = None
-    for peak in rivals:
-        found = align(reference.levels, pyramid, np.array(peak.shift_px))
-        if found is None or not found.converged:
-            continue
-        theirs = found.shift_px, tile_energies(level, pyramid, found.shift_px)
-        if best is None:
-            best = (peak, *theirs)
-            continue
-        shift, other = best[1], theirs[0]
-        if float(np.max(np.abs(other - shift))) < 0.5:
-            continue
-        verdict = _paired(best[2], theirs[1])
-        if abs(verdict) < limits.rival_deviations:
-            return (
-                f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
-                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well"
-            )
-        if verdict < 0.0:
-            best = (peak, *theirs)
-    return _NOTHING if best is None else best[0]
-
-
-def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:
-    """Whether a peak lies within three deviations of the prediction."""
-    away = np.asarray(peak.shift_px) - guess
-    widened = spread + np.eye(2) * (0.5 * peak.step_px) ** 2
-    return float(away @ np.linalg.solve(widened, away)) <= 9.0
-
-
-def _paired(first: Array | None, second: Array | None) -> float:
-    """By how many standard errors the second shift explains the common tiles worse than the first;
-    0 where the difference does not matter.
-    """
-    if second is None:
-        return np.inf
-    if first is None:
-        return -np.inf
-    difference = (second - first).ravel()
-    common = np.isfinite(difference)
-    if np.count_nonzero(common) < 16:
-        return 0.0
-    difference = difference[common]
-    mean = float(difference.mean())
-    smaller = min(float(first.ravel()[common].mean()), float(second.ravel()[common].mean()))
-    if abs(mean) < _DIFFERENT * smaller:
-        # The interpolation is not perfect, and differs between shifts.
-        return 0.0
-    error = difference.std(ddof=1) / np.sqrt(difference.size)
-    return mean / max(float(error), 1e-30)

@@ -11,7 +11,7 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.rectify import RasterDrift, Rectifier, camera_key, raw_from_output
-from semcal_ros.core.registration import Region
+from semcal_ros.core.reference import Region
 
 __all__ = ["Shot", "Stills", "resampleable"]
 
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 # Motions that bend a frame by less are left in it.
 _NEGLIGIBLE_PX = 1e-3
 _CAMERAS = 16
+_SAMPLES = 96
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,12 @@ class Shot:
     def size(self) -> tuple[int, int]:
         """(width, height) in px."""
         return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def sample(self) -> bytes:
+        """Some of its pixels, by which to see that a picture came once more."""
+        rows, cols = (max(1, n // _SAMPLES) for n in self.image.shape[:2])
+        return np.ascontiguousarray(self.image[::rows, ::cols]).tobytes()
 
     @property
     def px_from_unit(self) -> Array:

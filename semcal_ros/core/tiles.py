@@ -18,14 +18,24 @@ from numpy.typing import NDArray
 from semcal_ros.core.prefilter import gaussian_taps, smoothed
 from semcal_ros.core.subpixel import MARGIN, gradients, sampled
 
-__all__ = ["Level", "Pyramid", "TileSums", "TileWindow", "make_level", "tile_sums", "tile_window"]
+__all__ = [
+    "PIXELS_FOR_SLOPES",
+    "Level",
+    "Pyramid",
+    "TileSums",
+    "TileWindow",
+    "make_level",
+    "tile_sums",
+    "tile_window",
+]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Picture = NDArray[np.generic]
 
 _LEAST_TILES = 3
-_PIXELS_FOR_SLOPES = 12_000
+#: From how many pixels the common information is taken at most.
+PIXELS_FOR_SLOPES = 12_000
 _BANDS = 3
 
 
@@ -242,7 +252,7 @@ def _common(level: Level, window: TileWindow, seen: Image) -> Array:
     """Products of both pictures' gradients, scaled from enough rows of tiles to all of them."""
     side = level.side[1]
     rows = len(window.y)
-    wanted = max(1, -(-_PIXELS_FOR_SLOPES // (seen.shape[1] * side * _BANDS)))
+    wanted = max(1, -(-PIXELS_FOR_SLOPES // (seen.shape[1] * side * _BANDS)))
     bands = [(0, rows)]
     if wanted * _BANDS < rows:
         starts = (rows * (2 * k + 1) // (2 * _BANDS) - wanted // 2 for k in range(_BANDS))
