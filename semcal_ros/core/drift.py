@@ -57,6 +57,7 @@ _COPY_NOISE, _COPY_NOISE_BESIDE = 0.15, 5.0
 _FROZEN = "image: the same picture as the frame before"
 # After so many frame intervals without a frame nothing says that the drift went on as it was.
 _PAUSE = 10.0
+_CANDIDATES = 2
 
 
 class DriftTracker:
@@ -201,7 +202,9 @@ class DriftTracker:
             ratio = self._store.least_ratio(shot)
             return self._restarted(drift, shot, f"scale changed by a factor of {ratio:.2f}")
         refusal: tuple[str, Registration] | None = None
-        for candidate in candidates[:2]:
+        # Where nothing matched before, the picture may be that of any of them.
+        tried = _CANDIDATES if self._misses == 0 and drift.pending is None else 2 * _CANDIDATES
+        for candidate in candidates[:tried]:
             found = look(drift, self._store, candidate, shot, self._stills)
             if isinstance(found, Registration):
                 refusal = refusal or (found.reason, found)
@@ -330,8 +333,13 @@ class DriftTracker:
 
     def _restarted(self, drift: DriftFilter, shot: Shot, reason: str) -> DriftUpdate:
         """Go on from the predicted drift with this frame as keyframe."""
+        useless = drift.pending
         complaint = self._new_key(drift, shot, drift.state.motion)
         if not complaint:
+            if useless is not None and len(self._store) > 2:
+                # Nothing was ever like it.
+                self._store.forget(useless)
+                drift.do(Drop(useless))
             self._misses = 0
             self._surprises.forget()
         status = f"coasting: {complaint or reason}"

@@ -101,6 +101,12 @@ class KeyframeStore:
             gone.append(oldest)
         return gone
 
+    def forget(self, key: int) -> None:
+        """Drop a keyframe."""
+        del self._frames[key]
+        if self._first == key:
+            self._first = next(iter(self._frames), None)
+
     def use(self, key: int) -> None:
         """Make it the one in use."""
         self.current = key

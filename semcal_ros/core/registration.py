@@ -37,8 +37,8 @@ _SMALLEST_PX = 48
 # Levels of the pyramid keep at least that many px along the shorter side.
 _SMALLEST_LEVEL_PX = 160
 _SATURATION_SAMPLES = 256
-# Of the noise's variance; chance makes about a hundredth of that.
-_LEAST_SIGNAL = 3e-3
+# Of the noise's variance; chance makes less of pictures of 96 px and more.
+_LEAST_SIGNAL = 0.06
 _NATIVE = ("uint8", "uint16", "float32")
 
 
