@@ -17,6 +17,7 @@ from semcal_ros.cli.drift_common import (
     camera_of,
     echo_nominal_unit,
     echo_states,
+    forecast_text,
     frame_time_option,
     live_option,
     rate_text,
@@ -41,6 +42,12 @@ _PLOT_SUFFIXES = (".png", ".svg", ".pdf")
     "--calibration", type=click.Path(path_type=Path), help="Work in rectified coordinates."
 )
 @click.option("--plot", type=click.Path(path_type=Path), help="Figure as png, svg or pdf, too.")
+@click.option(
+    "--forecast",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="S",
+    help="Also tell the drift that long after the last frame.",
+)
 @live_option
 @config_option
 @frame_time_option
@@ -49,6 +56,7 @@ def command(
     output: Path,
     calibration: Path | None,
     plot: Path | None,
+    forecast: float | None,
     live: bool,
     config: str,
     frame_time: float | None,
@@ -85,6 +93,9 @@ def command(
     echo_states(Counter(u.kind for u in follower.updates))
     if len(path) > 1:
         click.echo(rate_text(path))
+    if forecast is not None:
+        then_s = float(path.time_s[-1]) + forecast
+        click.echo(forecast_text(follower.tracker.forecast(then_s), forecast))
     click.echo(f"drift: {output}")
     if plot is not None:
         click.echo(f"plot: {plot}")

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
@@ -16,7 +17,7 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.drift_path import DriftPath, path_of_updates
-from semcal_ros.core.drift_types import DriftUpdate
+from semcal_ros.core.drift_types import DriftForecast, DriftUpdate
 from semcal_ros.core.frame_time import LEFT_IN, REMOVED, estimate_frame_time
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.files.recordings import Frame
@@ -27,6 +28,7 @@ __all__ = [
     "camera_of",
     "echo_nominal_unit",
     "echo_states",
+    "forecast_text",
     "frame_time_option",
     "live_option",
     "rate_text",
@@ -196,9 +198,19 @@ def rate_text(path: DriftPath) -> str:
     """The drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
     if len(path) < 2:
         return ""
-    rate, sigma = 1e9 * path.velocity_m_s[-1], 1e9 * path.velocity_sigma_m_s[-1]
-    known = float(np.min(sigma))
-    # Two digits of the smaller uncertainty.
-    digits = int(np.clip(1 - np.floor(np.log10(known)), 0, 9)) if known > 0.0 else 3
-    parts = [f"{v:.{digits}f} +- {s:.{digits}f}" for v, s in zip(rate, sigma, strict=True)]
+    parts = _lengths(path.velocity_m_s[-1], path.velocity_sigma_m_s[-1])
     return f"final drift rate: x {parts[0]}, y {parts[1]} nm/s"
+
+
+def forecast_text(forecast: DriftForecast, after_s: float) -> str:
+    """A forecast with its 1-sigma in nm."""
+    parts = _lengths(forecast.drift_m, np.sqrt(np.diag(forecast.covariance)[:2]))
+    return f"drift {after_s:g} s after the last frame: x {parts[0]}, y {parts[1]} nm"
+
+
+def _lengths(values: NDArray[np.float64], sigmas: NDArray[np.float64]) -> list[str]:
+    """Lengths in nm with their 1-sigma, to two digits of the smaller uncertainty."""
+    known = 1e9 * float(np.min(sigmas))
+    digits = int(np.clip(1 - np.floor(np.log10(known)), 0, 9)) if known > 0.0 else 3
+    pairs = zip(1e9 * values, 1e9 * sigmas, strict=True)
+    return [f"{v:.{digits}f} +- {s:.{digits}f}" for v, s in pairs]

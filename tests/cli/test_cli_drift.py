@@ -115,6 +115,21 @@ def test_the_final_rate_is_that_of_the_truth(gold, tmp_path, capsys):
     assert y == pytest.approx(rate[1], abs=4 * sigma_y + 0.01 * abs(rate[1]))
 
 
+def test_a_forecast_holds_the_drift_to_come(gold, tmp_path, capsys):
+    table = tmp_path / "d.csv"
+    assert run("drift", gold, "--config", "virtual_sem", "-o", table, "--forecast", 2) == 0
+    pattern = r"^drift 2 s after the last frame: x (\S+) \+- (\S+), y (\S+) \+- (\S+) nm$"
+    (found,) = re.findall(pattern, capsys.readouterr().out, re.MULTILINE)
+    x, sigma_x, y, sigma_y = map(float, found)
+    with open(table, newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    # It goes on from where it was, less certain than there.
+    assert sigma_x > 1e9 * float(last["sigma_x_m"])
+    assert sigma_y > 1e9 * float(last["sigma_y_m"])
+    assert abs(x - 1e9 * float(last["dx_m"])) < 200.0 + 4 * sigma_x
+    assert abs(y - 1e9 * float(last["dy_m"])) < 200.0 + 4 * sigma_y
+
+
 def test_the_rate_is_given_with_two_digits_of_its_uncertainty():
     covariance = np.zeros((2, 4, 4))
     covariance[:, [2, 3], [2, 3]] = [(0.123e-9) ** 2, (4.56e-9) ** 2]
