@@ -283,7 +283,6 @@ class DriftTracker:
         self._surprises.forget(drift.state)
         registration, candidate = found.registration, found.candidate
         overlap = registration.overlap
-        time_s = self._store[candidate.key].time_s
         if candidate.ratio > _SMALL_ZOOM:
             return self._report(shot, "keyframe", registration, overlap)
         self._store.use(candidate.key)
@@ -304,6 +303,7 @@ class DriftTracker:
             keyframe = self._store[candidate.key]
             better = keyframe.with_frame(found.picture, found.region, registration)
             self._store.replace(candidate.key, better)
+        time_s = found.keyframe_time_s
         return self._report(shot, status, registration, overlap, keyframe_time_s=time_s)
 
     def _missed(

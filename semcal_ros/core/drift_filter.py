@@ -127,7 +127,11 @@ class DriftFilter:
         self.measured += 1
         if self._adapts and self.measured in _LEARNT and self.restlessness.psd > 0.0:
             # The guess that all began with is worth less than what was seen since.
+            times = [event.time_s for event in self.events if isinstance(event, Move)]
+            interval_s = float(np.median(np.diff([self.start.time_s, *times])))
             near = self.restlessness
+            if interval_s > 0.0:
+                near = replace(near, memory_s=_MEMORY * interval_s)
             self.restlessness = likely_restlessness(self.start, self.events, near, (1.0,))
             self.state = replayed(self.start, self.events, self.restlessness)
 

@@ -44,6 +44,8 @@ class Found:
         (4,) drift velocity and acceleration that were removed from it.
     measure
         What it says of the drift.
+    keyframe_time_s
+        Time of the keyframe.
     """
 
     candidate: Candidate
@@ -52,6 +54,7 @@ class Found:
     region: Region
     removed: Array
     measure: Measure
+    keyframe_time_s: float
 
 
 def look(
@@ -139,11 +142,12 @@ def _once(
     if not registration.accepted:
         return registration
     averaged = np.inf if candidate.rescaled else float(store.averaged(key))
-    before = store[key].shot
-    measure = measure_of(key, before, shot, registration, motion, averaged)
+    keyframe = store[key]
+    measure = measure_of(key, keyframe.shot, shot, registration, motion, averaged)
     if drift.pending == key:
         drift.settle(keyframe_noise(measure), measure.scan_s)
-    return Found(candidate, registration, picture, region, motion, measure)
+    time_s = keyframe.time_s
+    return Found(candidate, registration, picture, region, motion, measure, time_s)
 
 
 def joins(found: Found, store: KeyframeStore) -> bool:
