@@ -226,6 +226,9 @@ class DriftTracker:
         loose = loosened(measure, before, shot) if found.candidate.rescaled else measure
         outcome = loose(state, drift.restlessness)
         unexpected = drift.measured == 0 or outcome.nis > _GATE
+        # If it is refused, either is wrong, and the one who reads the drift has to be warned.
+        doubt = (measure.shift[:2] - expected) / 3.0
+        self._doubt = np.outer(doubt, doubt)
         if unexpected and np.any(away_px > self.settings.max_jump * np.array(shot.size)):
             return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
         if outcome.shear_nis > _GATE:
@@ -240,9 +243,6 @@ class DriftTracker:
             reach = np.asarray(reach_px * np.linalg.inv(shot.px_from_unit))
             widened = self._surprises.believed(state, seen, reach, state.time_s - since_s)
             if widened is None:
-                # Either is wrong, and the one who reads this has to be warned.
-                doubt = (seen - state.position) / 3.0
-                self._doubt = np.outer(doubt, doubt)
                 return f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
             drift.do(widened)
         if found.candidate.ratio > _SMALL_ZOOM:
@@ -250,6 +250,7 @@ class DriftTracker:
         elif found.candidate.rescaled:
             # A zoom in small steps would make a long chain of keyframes.
             measure = loose
+        self._doubt = np.zeros((2, 2))
         drift.accept(measure)
         drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
         return ""
