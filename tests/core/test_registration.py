@@ -157,7 +157,7 @@ def test_refuses_blank_saturated_and_featureless() -> None:
     burnt = np.clip((image - 60.0) * 10.0, 0, 255).astype(np.uint8)
     _refused(register(reference, burnt), "image: saturated")
     _refused(register(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
-    _refused(register(_noise(0), _noise(1)), "stands out")
+    _refused(register(_noise(0), _noise(1)), "reference: featureless picture (noise only)")
     _refused(register(reference, _noise(2)), "stands out")
 
 
@@ -215,3 +215,37 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures() -> None:
         patch = sampled(picture, (10, 12), (100, 90), np.array(fraction), (plain, plain), 0.0)
         moved = TEXTURE.view((-fraction[0], -fraction[1]), 128)[12:102, 10:110]
         assert float(np.sqrt(np.mean((patch - moved) ** 2))) < 2e-3
+
+
+def test_jitter_of_the_scan_lines_is_in_the_covariance() -> None:
+    rng = np.random.default_rng(5)
+    inside = []
+    for trial in range(24):
+        reference = noisy(TEXTURE.view((0.0, 0.0), SIZE), 3.0, 2 * trial)
+        # Each line by itself, as vibration and stray fields move it.
+        exact = TEXTURE.view((2.3, -1.6), SIZE + 2)[1:-1]
+        columns = np.arange(SIZE) + 1.0
+        lines = [
+            np.interp(columns - dx, np.arange(SIZE + 2), line)
+            for dx, line in zip(rng.normal(0.0, 0.4, SIZE), exact, strict=True)
+        ]
+        result = register(reference, noisy(np.array(lines), 3.0, 2 * trial + 1))
+        assert result.accepted, result.reason
+        inside.append(np.abs(result.shift_px - (2.3, -1.6)) / np.sqrt(np.diag(result.covariance)))
+    # 48 values: 68 and 95 % within three binomial deviations. Noise taken for white would put a
+    # third of the shifts along the lines beyond two sigma.
+    assert np.mean(np.array(inside) < 1.0) > 0.48
+    assert np.mean(np.array(inside) < 1.96) > 0.85
+
+
+def test_featureless_in_one_direction_however_noisy_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    x = np.arange(SIZE) / 9.0
+    for angle in (0.0, 0.5, 1.2):
+        y, col = np.meshgrid(x, x, indexing="ij")
+        stripes = 60.0 * np.sin(np.cos(angle) * col + np.sin(angle) * y)
+        pair = [128.0 + stripes + rng.normal(0.0, 12.0, stripes.shape) for _ in range(2)]
+        for guess in ({}, {"guess_covariance": np.eye(2)}):
+            result = register(*pair, **guess)
+            assert not result.accepted
+            assert result.reason
