@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import cast
 
 import cv2
 import numpy as np
@@ -258,8 +257,10 @@ def _half(
     cols: tuple[NDArray[np.intp], ...],
 ) -> _Half:
     table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
-    sums = _box_sums(cast("Array", table), rows, cols)
-    variance = _box_sums(cast("Array", squares), rows, cols) - sums**2 / geometry.count
+    # Shading was removed, so that single precision is enough for differences of the sums.
+    sums = _box_sums(np.asarray(table, dtype=np.float32), rows, cols)
+    energies = _box_sums(np.asarray(squares, dtype=np.float32), rows, cols)
+    variance = energies - sums**2 / geometry.count
     floor = 1e-9 * max(float(variance.max()), 1e-30)
     return _Half(
         picture,
@@ -270,7 +271,7 @@ def _half(
 
 
 def _box_sums(
-    table: Array,
+    table: Image,
     rows: tuple[NDArray[np.intp], ...],
     cols: tuple[NDArray[np.intp], ...],
 ) -> Image:
@@ -278,7 +279,7 @@ def _box_sums(
     # Columns are gathered as rows, which lie together in memory.
     strips = np.ascontiguousarray(strips.T)
     sums = np.take(strips, cols[1], axis=0) - np.take(strips, cols[0], axis=0)
-    return np.asarray(sums.T, dtype=np.float32)
+    return np.asarray(sums.T)
 
 
 def _surface(reference: _Half, image: _Half, geometry: _Geometry) -> Image:
