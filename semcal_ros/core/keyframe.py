@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration import Registration, prepare_reference
 from semcal_ros.core.shot import Shot
-from semcal_ros.core.subpixel import MARGIN, sampled
+from semcal_ros.core.subpixel import FINE, sampled
 
 __all__ = [
     "Keyframe",
@@ -78,8 +78,8 @@ class Keyframe:
             # What the interpolation reaches beyond the region was not scanned; beyond the picture it
             # is mirrored.
             edges = 0, gray.shape[1 - axis]
-            low = MARGIN if region[axis] > edges[0] else 0
-            high = MARGIN if region[axis + 2] < edges[1] else 1
+            low = FINE.reach if region[axis] > edges[0] else 0
+            high = FINE.reach if region[axis + 2] < edges[1] else 1
             first = max(self.region[axis], region[axis] + low - int(whole[axis]))
             last = min(self.region[axis + 2], region[axis + 2] - high - int(whole[axis]))
             spans.append((first, last))
@@ -89,7 +89,7 @@ class Keyframe:
         plain = np.array([1.0])
         corner = left + int(whole[0]), top + int(whole[1])
         size = right - left, bottom - top
-        moved = sampled(gray, corner, size, shift - whole, (plain, plain), -registration.offset)
+        moved = sampled(gray, corner, size, shift - whole, plain, FINE, -registration.offset)
         mean = self.mean.copy()
         part = mean[top:bottom, left:right]
         share = np.float32(1.0 / (self.averaged + 1))

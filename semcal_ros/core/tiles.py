@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.prefilter import gaussian_taps, smoothed
-from semcal_ros.core.subpixel import MARGIN, gradients, sampled
+from semcal_ros.core.subpixel import FINE, SHARP, Band, gradients, sampled
 
 __all__ = [
     "PIXELS_FOR_SLOPES",
@@ -37,6 +37,8 @@ _LEAST_TILES = 3
 #: From how many pixels the common information is taken at most.
 PIXELS_FOR_SLOPES = 12_000
 _BANDS = 3
+# Pictures that are smoothed by less have structure beyond the band of the shorter filters.
+_SHARP_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,13 @@ class TileSums:
     slopes: Array
 
 
+def _band(sigma_px: float) -> Band:
+    return SHARP if sigma_px < _SHARP_PX else FINE
+
+
 def _margin(sigma_px: float) -> int:
     # What lies farther out than that has four per cent of a Gaussian's weight.
-    return MARGIN + int(np.ceil(1.5 * sigma_px))
+    return _band(sigma_px).reach + int(np.ceil(1.5 * sigma_px))
 
 
 def _tile_side(length: int) -> int:
@@ -143,7 +149,7 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> Level | None:
     cols, rows = inside[0] // side_x, inside[1] // side_y
     smooth = smoothed(picture, sigma_px)
     mean = float(smooth.mean(dtype=np.float64))
-    planes = np.stack([*gradients(smooth), smooth - np.float32(mean)])
+    planes = np.stack([*gradients(smooth, _band(sigma_px)), smooth - np.float32(mean)])
     left = margin + (inside[0] - cols * side_x) // 2
     top = margin + (inside[1] - rows * side_y) // 2
     cut = planes[:, top : top + rows * side_y, left : left + cols * side_x]
@@ -230,7 +236,8 @@ def tile_sums(
     corner = (left + int(whole[0]), top + int(whole[1]))
     smoothing = gaussian_taps(level.sigma_px)
     fraction = np.asarray(shift - whole, dtype=np.float64)
-    seen = sampled(image, corner, (width, height), fraction, (smoothing, smoothing), -mean)
+    band = _band(level.sigma_px)
+    seen = sampled(image, corner, (width, height), fraction, smoothing, band, -mean)
     rows, cols = height // side_y, width // side_x
     tiles = _tiled(seen, level.side)
     products = level.products[window.rows, window.cols]
@@ -250,7 +257,7 @@ def _tiled(picture: Image, side: tuple[int, int]) -> Image:
 
 def _common(level: Level, window: TileWindow, seen: Image) -> Array:
     """Products of both pictures' gradients, scaled from enough rows of tiles to all of them."""
-    side = level.side[1]
+    side, band = level.side[1], _band(level.sigma_px)
     rows = len(window.y)
     wanted = max(1, -(-PIXELS_FOR_SLOPES // (seen.shape[1] * side * _BANDS)))
     bands = [(0, rows)]
@@ -261,11 +268,11 @@ def _common(level: Level, window: TileWindow, seen: Image) -> Array:
     total, used = np.zeros((2, 2)), np.zeros((4, 4))
     for first, last in bands:
         # The derivatives reach beyond the band, and are mirrored at the edges of the window.
-        above = min(MARGIN, first * side)
-        part = seen[first * side - above : last * side + MARGIN]
+        above = min(band.reach, first * side)
+        part = seen[first * side - above : last * side + band.reach]
         products = level.products[window.rows, window.cols][first:last, :, :2]
         used += gram[first:last].sum(axis=(0, 1))
-        for axis, own in enumerate(gradients(part)):
+        for axis, own in enumerate(gradients(part, band)):
             tiles = _tiled(own[above : above + (last - first) * side], level.side)
             total[:, axis] += (products @ tiles[..., None])[..., 0].sum(axis=(0, 1))
     whole = np.diag(gram.sum(axis=(0, 1)))[:2]

@@ -31,7 +31,7 @@ from semcal_ros.core.keyframe_store import KeyframeStore
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.registration import Registration, RegistrationSettings, register
 from semcal_ros.core.shot import Shot, Stills, resampleable
-from semcal_ros.core.subpixel import MARGIN
+from semcal_ros.core.subpixel import FINE
 
 Array = NDArray[np.float64]
 
@@ -139,8 +139,8 @@ def test_only_what_both_show_is_averaged_and_the_first_picture_stays_as_it_was()
     rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
     # Of the frame's region, seen from the keyframe, without what the interpolation would take from
     # beyond it.
-    assert (cols[0], cols[-1] + 1) == (0, 150 - 30 - MARGIN)
-    assert (rows[0], rows[-1] + 1) == (8 + 20 + MARGIN, 140 + 20 - MARGIN)
+    assert (cols[0], cols[-1] + 1) == (0, 150 - 30 - FINE.reach)
+    assert (rows[0], rows[-1] + 1) == (8 + 20 + FINE.reach, 140 + 20 - FINE.reach)
     np.testing.assert_array_equal(key.mean, first)
     assert key.averaged == 1
     assert better.shot is key.shot

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration import Registration, prepare_reference, register
-from semcal_ros.core.subpixel import gradients, sampled
+from semcal_ros.core.subpixel import FINE, SHARP, Band, gradients, sampled
 
 SIZE = 192
 TEXTURE = Texture(1)
@@ -202,9 +202,10 @@ def test_bad_arguments_are_refused_with_a_reason(arguments: dict) -> None:
         register(np.zeros((64, 64)), **arguments)
 
 
-def test_subpixel_filters_are_exact_for_band_limited_pictures() -> None:
+@pytest.mark.parametrize("band", [FINE, SHARP])
+def test_subpixel_filters_are_exact_for_band_limited_pictures(band: Band) -> None:
     picture = TEXTURE.view((0.0, 0.0), 128).astype(np.float32)
-    dx, dy = gradients(picture)
+    dx, dy = gradients(picture, band)
     exact_x, exact_y = TEXTURE.gradient((0.0, 0.0), 128)
     inner = np.s_[8:-8, 8:-8]
     # Gradients of 0.21 RMS to 0.4 %, a picture of unit RMS to 0.2 %.
@@ -212,7 +213,7 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures() -> None:
     assert float(np.sqrt(np.mean((dy - exact_y)[inner] ** 2))) < 8e-4
     for fraction in ((0.3, -0.4), (0.5, 0.5), (-0.9, 0.0)):
         plain = np.array([1.0])
-        patch = sampled(picture, (10, 12), (100, 90), np.array(fraction), (plain, plain), 0.0)
+        patch = sampled(picture, (10, 12), (100, 90), np.array(fraction), plain, band, 0.0)
         moved = TEXTURE.view((-fraction[0], -fraction[1]), 128)[12:102, 10:110]
         assert float(np.sqrt(np.mean((patch - moved) ** 2))) < 2e-3
 
