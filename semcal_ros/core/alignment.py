@@ -164,7 +164,8 @@ def align(levels: Sequence[Level], image: Pyramid, start_px: Array) -> Alignment
         for _ in range(_COARSE_PASSES):
             look = _look(level, image, shift / level.factor, mean, slopes)
             if look is None:
-                return None
+                # A fine texture may be lost at this resolution; the next one knows more.
+                break
             passes += 1
             shift, slopes = look.improved * level.factor, look.sums.slopes
             if look.length < _COARSE_STEP_PX:
@@ -185,6 +186,8 @@ def align(levels: Sequence[Level], image: Pyramid, start_px: Array) -> Alignment
         if converged:
             break
     assert look is not None
+    if not _informed(look):
+        return None
     return _finished(look, covariance, converged, passes)
 
 
@@ -200,13 +203,12 @@ def _look(
     geometry = geometry_of(level, window)
     sums = tile_sums(level, window, picture, shift, mean, slopes)
     fit = fitted(geometry, sums)
-    if fit is None or not _informed(level, geometry, fit):
-        return None
-    return _Look(level, window, geometry, sums, fit, shift, size, mean)
+    return None if fit is None else _Look(level, window, geometry, sums, fit, shift, size, mean)
 
 
-def _informed(level: Level, geometry: TileGeometry, fit: TileFit) -> bool:
+def _informed(look: _Look) -> bool:
     """Whether the pictures have more gradient in common than chance gives, in every direction."""
+    level, geometry, fit = look.level, look.geometry, look.fit
     energy = geometry.gram.sum(axis=0)[:2, :2] * np.outer(geometry.kept, geometry.kept)
     pixels = min(float(geometry.gram[:, 3, 3].sum()), float(PIXELS_FOR_SLOPES))
     # Smoothed noise has fewer independent pixels.

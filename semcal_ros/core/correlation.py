@@ -119,7 +119,9 @@ class CoarseReference:
         return self._known[key]
 
 
-def coarse_peaks(reference: CoarseReference, image: Pyramid, guess_px: Array) -> list[CoarsePeak]:
+def coarse_peaks(
+    reference: CoarseReference, image: Pyramid, guess_px: Array, *, finest: bool = False
+) -> list[CoarsePeak]:
     """Local maxima of the correlation, best first, down to half of the height of the best.
 
     Parameters
@@ -128,6 +130,8 @@ def coarse_peaks(reference: CoarseReference, image: Pyramid, guess_px: Array) ->
         Pictures of the same scale; sizes may differ.
     guess_px
         (2,) predicted shift, near which peaks are listed even if many others are higher.
+    finest
+        Search at the finest resolution at once, for textures of which reduced pictures show little.
 
     Returns
     -------
@@ -136,7 +140,7 @@ def coarse_peaks(reference: CoarseReference, image: Pyramid, guess_px: Array) ->
     """
     longest = max(*reference.pyramid.full.shape, *image.full.shape)
     best: list[CoarsePeak] = []
-    for level in _LEVELS_PX:
+    for level in _LEVELS_PX[-1:] if finest else _LEVELS_PX:
         factor = 1 << max(0, int(np.ceil(np.log2(longest / level))))
         peaks = _peaks_at(reference, image, factor, guess_px)
         if peaks and (not best or peaks[0].significance > best[0].significance):

@@ -277,6 +277,13 @@ def register(
         nearest = np.array(peaks[int(np.argmin(away))].shift_px) + origin
         return replace(_refused(peak), nearest_px=nearest)
     fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
+    if fine is None or not fine.converged:
+        # A coarse search is only good to a fraction of its pixels, and fine textures forgive less.
+        found = coarse_peaks(prepared.coarse, pyramid, guess, finest=True)
+        if found and np.max(np.abs(np.subtract(found[0].shift_px, peak.shift_px))) < peak.step_px:
+            peak = found[0]
+            levels = [level for level in prepared.levels if level.factor <= peak.step_px]
+            fine = align(levels, pyramid, np.array(peak.shift_px))
     if fine is None:
         return _refused(NOTHING)
     return _judged(prepared, gray, peak, fine, origin, max_shear_px)
