@@ -12,6 +12,7 @@ calibration.py            calibration methods (joint with and without residual f
 drift.py                  registration beside phase correlation, ECC, scikit-image, imreg_dft and
                           pystackreg where they are installed, and the Cramer-Rao bound; the time of
                           the tracker, and what it leaves of a drift inside of the frames
+drift_soak.py             20 000 frames out and back (not among these: run it by itself)
 coverage.py               how often the stated uncertainty of a calibration holds the truth
 rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
 live.py                   the node stream_corrector over DDS beside a process that only relays
