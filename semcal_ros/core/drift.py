@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift_doubt import (
+    GATE,
     Surprises,
     of_a_contradiction,
     of_a_pause,
@@ -41,8 +42,6 @@ __all__ = ["DriftForecast", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 Array = NDArray[np.float64]
 
-# Innovations beyond this normalised square happen to a correct filter once in a million frames.
-_GATE = 27.6
 # Multiple of the first step's sigma within which a shift agrees with what was expected.
 _REACH = 2.0
 # Changes of scale up to which the keyframe stays in use, resampled for each frame.
@@ -225,17 +224,17 @@ class DriftTracker:
         away_px = np.abs(shot.px_from_unit @ (measure.shift[:2] - expected))
         loose = loosened(measure, before, shot) if found.candidate.rescaled else measure
         outcome = loose(state, drift.restlessness)
-        unexpected = drift.measured == 0 or outcome.nis > _GATE
+        unexpected = drift.measured == 0 or outcome.nis > GATE
         # If it is refused, either is wrong, and the one who reads the drift has to be warned.
         doubt = (measure.shift[:2] - expected) / 3.0
         self._doubt = np.outer(doubt, doubt)
         if unexpected and np.any(away_px > self.settings.max_jump * np.array(shot.size)):
             return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
-        if outcome.shear_nis > _GATE:
+        if outcome.shear_nis > GATE:
             measure = measure.of_shift()
         since_s = state.time_s - (self._last[1] if self._last else state.time_s)
         # The first step has only a guessed prior, which must not refuse what two looks agree on.
-        if drift.measured > 0 and outcome.nis > _GATE:
+        if drift.measured > 0 and outcome.nis > GATE:
             seen = measure.shift[:2] + state.where(measure.key)[:2]
             # What moves fast may also turn fast.
             step_px = float(np.hypot(*(shot.px_from_unit @ state.velocity))) * since_s

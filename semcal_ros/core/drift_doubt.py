@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from semcal_ros.core.drift_map import DriftMap
 from semcal_ros.core.drift_operations import Widen
 
-__all__ = ["Surprises", "of_a_contradiction", "of_a_pause", "of_another_place"]
+__all__ = ["GATE", "Surprises", "of_a_contradiction", "of_a_pause", "of_another_place"]
 
 Array = NDArray[np.float64]
 
-# Beyond this normalised square a prediction is contradicted.
-_GATE = 27.6
+#: Innovations beyond this normalised square happen to a correct filter once in a million frames.
+GATE = 27.6
 
 
 class Surprises:
@@ -116,7 +116,7 @@ def of_a_contradiction(
     away = nearest - expected
     unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     scaled = covariance / np.outer(unit, unit) + 1e-9 * np.eye(2)
-    if float(away / unit @ np.linalg.solve(scaled, away / unit)) <= _GATE:
+    if float(away / unit @ np.linalg.solve(scaled, away / unit)) <= GATE:
         return None
     spread = np.eye(2) * float(away @ away)
     return _spread(spread, spread / since_s**2)

@@ -81,7 +81,7 @@ class DriftFilter:
     def settle_later(self, key: int, removed: Array, bow: float) -> None:
         """The frame of now becomes a keyframe that was not measured; its noise is told later.
 
-        The arguments are those of :class:`~semcal_ros.core.drift_map.Settle`.
+        The arguments are those of :class:`~semcal_ros.core.drift_operations.Settle`.
         """
         settle = Settle(key, removed, bow, np.zeros((4, 4)), 0.0)
         self._pending = _Pending(settle, len(self.events), self.state)

@@ -6,6 +6,7 @@ another restlessness, and undone backwards (:mod:`semcal_ros.core.drift_smoothin
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,12 +54,12 @@ def _same(state: DriftMap) -> Linear:
     return Linear(np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys)
 
 
-class Operation:
+class Operation(ABC):
     """Something that happens to the state and is linear."""
 
+    @abstractmethod
     def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
         """Its matrices for a state."""
-        raise NotImplementedError
 
     def __call__(self, state: DriftMap, restlessness: Restlessness) -> DriftMap:
         """The state after it."""

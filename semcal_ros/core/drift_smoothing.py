@@ -3,7 +3,7 @@
 What happened to the :class:`~semcal_ros.core.drift_map.DriftMap` while a recording was tracked is
 done again with the acceleration noise that makes the measurements most likely, and then undone
 backwards. The recursion is that of Bryson and Frazier (1963; modified by Bierman 1973,
-doi:10.1016/0005-1098(73)90054-8), which needs no inverse of a prediction: positions of keyframes are
+Int. J. Control 18, 65-75), which needs no inverse of a prediction: positions of keyframes are
 copies of each other, and such an inverse does not exist.
 With white acceleration the result is the cubic smoothing spline through the measurements (Wahba
 1978, doi:10.1111/j.2517-6161.1978.tb01050.x), with one that lasts a stiffer one.

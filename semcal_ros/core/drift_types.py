@@ -12,11 +12,16 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectify import RasterDrift
 from semcal_ros.core.reference import RegistrationSettings
 
-__all__ = ["DriftForecast", "DriftSettings", "DriftUpdate"]
+__all__ = ["DriftForecast", "DriftSettings", "DriftUpdate", "kind_of"]
 
 Array = NDArray[np.float64]
 
 _NUMBER = re.compile(r"-?\d[\d.]*")
+
+
+def kind_of(status: str) -> str:
+    """A status without the numbers of the single frame, so that frames can be counted by kind."""
+    return _NUMBER.sub("\u2026", status)
 
 
 @dataclass(frozen=True)
@@ -132,10 +137,8 @@ class DriftUpdate:
 
     @property
     def kind(self) -> str:
-        """The status without the numbers of the single frame, so that frames can be counted by
-        kind.
-        """
-        return _NUMBER.sub("\u2026", self.status)
+        """The status without its numbers."""
+        return kind_of(self.status)
 
     @property
     def units(self) -> str:

@@ -75,11 +75,6 @@ class KeyframeStore:
     def __len__(self) -> int:
         return len(self._frames)
 
-    @property
-    def next_number(self) -> int:
-        """Number that the next keyframe will have."""
-        return self._next
-
     def add(self, keyframe: Keyframe) -> tuple[int, list[int]]:
         """Its number, by which it is the one in use, and those that were forgotten for it."""
         number = self._next

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,7 @@ class Rejected:
     reason: str
 
 
-class Recording:
+class Recording(ABC):
     """An open recording; use :func:`open_recording`, and close it or use it as a context manager.
 
     Attributes
@@ -97,7 +98,7 @@ class Recording:
     ) -> None:
         self.close()
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  # a folder has nothing to close
         """Close the files."""
 
     @property
@@ -106,9 +107,9 @@ class Recording:
         return ()
 
     @property
+    @abstractmethod
     def frame_count(self) -> int:
         """Number of images, bad ones included."""
-        raise NotImplementedError
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -146,8 +147,8 @@ class Recording:
                 expected="at least one image of a known encoding with a valid magnification",
             )
 
-    def _frames(self) -> Iterator[Frame]:
-        raise NotImplementedError
+    @abstractmethod
+    def _frames(self) -> Iterator[Frame]: ...
 
     def _cut(self, image: NDArray[Any], rows: int) -> NDArray[Any]:
         if not 0 <= rows < image.shape[0]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import textwrap
 from collections import Counter
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from semcal_ros.core.drift_path import DriftPath
+from semcal_ros.core.drift_types import kind_of
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.style import (
@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 _DPI = 160.0
 # Half the width of an interval that holds 95 % of a normal distribution.
 _BAND = 1.96
-_NUMBER = re.compile(r"-?\d[\d.]*")
 _LINE_LENGTH = 64
 # Colours and marks of the reasons; those beyond are put together.
 _MARKS = ((SECOND, "X"), (REFERENCE, "D"), (ACCENT, "^"), ("#8a6d00", "v"))
@@ -131,7 +130,7 @@ def drift_figure(path: DriftPath, title: str = "") -> Figure:
 def _kinds(path: DriftPath) -> list[_Kind]:
     """Frames that were not used, by the reason without its numbers, the most frequent first."""
     texts = [
-        "" if good else _NUMBER.sub("…", status.removeprefix("coasting: "))
+        "" if good else kind_of(status.removeprefix("coasting: "))
         for good, status in zip(path.accepted, path.status, strict=True)
     ]
     counts = Counter(t for t in texts if t).most_common()
