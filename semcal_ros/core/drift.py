@@ -88,7 +88,8 @@ class DriftTracker:
         )
         self._misses = 0
         self._surprises = Surprises()
-        self._last: tuple[Shot, float] | None = None
+        # Camera and time of the frame before.
+        self._last: tuple[ScanCamera | None, float] | None = None
         self._doubt = np.zeros((2, 2))
         self._sample = b""
 
@@ -130,7 +131,7 @@ class DriftTracker:
         shot = Shot(picture, fitted, timing, rectified)
         centre_s = time_s + (timing.centre_offset_s if timing is not None else 0.0)
         if self._last is not None and (
-            centre_s < self._last[1] or (self._last[0].camera is None) != (fitted is None)
+            centre_s < self._last[1] or (self._last[0] is None) != (fitted is None)
         ):
             self.reset()
         if self._filter is None or len(self._store) == 0:
@@ -140,7 +141,7 @@ class DriftTracker:
             update = self._followed(self._filter, shot)
         assert self._filter is not None
         self._filter.mark()
-        self._last = Shot(picture[:1, :1], fitted, timing, rectified), centre_s
+        self._last = fitted, centre_s
         if self._history is not None:
             self._history.add(update, fitted)
         return update
@@ -166,13 +167,13 @@ class DriftTracker:
         """
         picture, region = self._stills.of(shot, removed)
         keyframe = keyframe_of(shot, removed, picture, region, drift.state.time_s)
-        complaint = keyframe.reference(self.settings.registration).complaint
-        if not complaint:
-            key, gone = self._store.add(keyframe)
+        reference = keyframe.reference(self.settings.registration)
+        if not reference.complaint:
+            key, gone = self._store.add(keyframe, reference)
             drift.settle_later(key, removed, bow_s2(shot))
             for old in gone:
                 drift.do(Drop(old))
-        return complaint
+        return reference.complaint
 
     def _advance(self, drift: DriftFilter, shot: Shot, centre_s: float) -> None:
         dt = centre_s - drift.state.time_s
@@ -394,5 +395,5 @@ class DriftTracker:
         if self._filter is None or self._last is None:
             raise InvalidValueError("a forecast before the first frame", expected="a frame before")
         state = self._filter.forecast(time_s)
-        scale = scale_covariance(self._last[0].camera, state.position, state.velocity)
+        scale = scale_covariance(self._last[0], state.position, state.velocity)
         return DriftForecast(time_s, state.position, state.velocity, state.own + scale)

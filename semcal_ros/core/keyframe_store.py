@@ -65,6 +65,7 @@ class KeyframeStore:
         self._limits = at_most_bytes, at_most
         self._frames: dict[int, Keyframe] = {}
         self._prepared: tuple[int, Keyframe, Reference] | None = None
+        self._carried: tuple[Keyframe, Shot, Reference] | None = None
         self._first: int | None = None
         self._next = 0
         self.current: int | None = None
@@ -75,13 +76,18 @@ class KeyframeStore:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, keyframe: Keyframe) -> tuple[int, list[int]]:
-        """Its number, by which it is the one in use, and those that were forgotten for it."""
+    def add(self, keyframe: Keyframe, reference: Reference | None = None) -> tuple[int, list[int]]:
+        """Its number, by which it is the one in use, and those that were forgotten for it.
+
+        ``reference`` is its prepared reference, where that is known already.
+        """
         number = self._next
         self._next += 1
         self._first = number if self._first is None else self._first
         self._frames[number] = keyframe
         self.current = number
+        if reference is not None:
+            self._prepared = number, keyframe, reference
         return number, self._forgotten()
 
     def _forgotten(self) -> list[int]:
@@ -138,8 +144,14 @@ class KeyframeStore:
         return self._frames[key].averaged < _MEANS_PREPARED[-1] and overlap >= _OVERLAP_TO_ADD
 
     def carried(self, key: int, shot: Shot) -> Reference:
-        """The reference as the camera of a frame would show it."""
-        return carried(self._frames[key], shot).reference(self._settings)
+        """The reference as the camera of a frame would show it; the latest one is kept, because a
+        frame may be looked at several times.
+        """
+        keyframe, known = self._frames[key], self._carried
+        if known is None or known[0] is not keyframe or known[1] is not shot:
+            known = keyframe, shot, carried(keyframe, shot).reference(self._settings)
+            self._carried = known
+        return known[2]
 
     def least_ratio(self, shot: Shot) -> float:
         """By which factor the scale of a frame differs from that of the most similar keyframe."""

@@ -235,11 +235,11 @@ class Rectifier:
         if camera is None and drift is None:
             return image.copy()
         if drift is None:
-            return self._remap(image, *self.maps((width, height), camera))
+            return self.remapped(image, *self.maps((width, height), camera))
         output = np.empty_like(image)
         fitted = None if camera is None else camera.resized(width, height)
         for top, map_x, map_y in self._bands((width, height), fitted, drift, timing):
-            output[top : top + len(map_x)] = self._remap(image, map_x, map_y)
+            output[top : top + len(map_x)] = self.remapped(image, map_x, map_y)
         return output
 
     def maps(
@@ -252,6 +252,7 @@ class Rectifier:
         """Raw x and y, (h, w) float32 each, of every output pixel of an image of ``size`` (width,
         height).
         """
+        _check_drift(drift)
         fitted = None if camera is None else camera.resized(*size)
         key = camera_key(size, fitted)
         if drift is None and key in self._static:
@@ -264,7 +265,8 @@ class Rectifier:
             _keep(self._static, key, both, _KEPT_MAPS)
         return both
 
-    def _remap(self, image: NDArray[np.generic], map_x: Map, map_y: Map) -> NDArray[np.generic]:
+    def remapped(self, image: NDArray[np.generic], map_x: Map, map_y: Map) -> NDArray[np.generic]:
+        """The image at raw positions as :meth:`maps` gives them; 0 outside of it."""
         picture = cast("NDArray[np.float32]", image)
         warped = cv2.remap(
             picture, map_x, map_y, self._flag, borderMode=cv2.BORDER_CONSTANT, borderValue=0

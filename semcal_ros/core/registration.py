@@ -271,12 +271,14 @@ def register(
     if not peaks:
         return _refused("no shift stands out: featureless, or another place")
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    peak = choose(prepared, pyramid, peaks, guess, spread)
-    if isinstance(peak, str):
+    chosen = choose(prepared, pyramid, peaks, guess, spread)
+    if isinstance(chosen, str):
         away = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(away))].shift_px) + origin
-        return replace(_refused(peak), nearest_px=nearest)
-    fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
+        return replace(_refused(chosen), nearest_px=nearest)
+    peak, fine = chosen
+    if fine is None:
+        fine = align(prepared.levels, pyramid, np.array(peak.shift_px))
     if fine is None or not fine.converged:
         # A coarse search is only good to a fraction of its pixels, and fine textures forgive less.
         found = coarse_peaks(prepared.coarse, pyramid, guess, finest=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.alignment import align, tile_energies
+from semcal_ros.core.alignment import Alignment, align, tile_energies
 from semcal_ros.core.correlation import CoarsePeak
 from semcal_ros.core.reference import Reference
 from semcal_ros.core.tiles import Pyramid
@@ -28,8 +28,10 @@ def choose(
     peaks: list[CoarsePeak],
     guess: Array,
     spread: Array | None,
-) -> CoarsePeak | str:
-    """The peak to believe, or the reason why none can be believed.
+) -> tuple[CoarsePeak, Alignment | None] | str:
+    """The peak to believe with its alignment, or the reason why none can be believed.
+
+    The alignment is None where there was no need to compare.
 
     Parameters
     ----------
@@ -55,17 +57,17 @@ def choose(
             return _uncontradicted(reference, pyramid, near[0], rivals[0])
         rivals = near or rivals
     if len(rivals) == 1:
-        return rivals[0]
-    best: tuple[CoarsePeak, Array, Array | None] | None = None
+        return rivals[0], None
+    best: tuple[CoarsePeak, Alignment, Array | None] | None = None
     for peak in rivals:
         found = align(reference.levels, pyramid, np.array(peak.shift_px))
         if found is None or not found.converged:
             continue
-        theirs = found.shift_px, tile_energies(level, pyramid, found.shift_px)
+        theirs = found, tile_energies(level, pyramid, found.shift_px)
         if best is None:
             best = (peak, *theirs)
             continue
-        shift, other = best[1], theirs[0]
+        shift, other = best[1].shift_px, found.shift_px
         if float(np.max(np.abs(other - shift))) < 0.5:
             continue
         verdict = _paired(best[2], theirs[1])
@@ -76,25 +78,25 @@ def choose(
             )
         if verdict < 0.0:
             best = (peak, *theirs)
-    return NOTHING if best is None else best[0]
+    return NOTHING if best is None else best[:2]
 
 
 def _uncontradicted(
     reference: Reference, pyramid: Pyramid, near: CoarsePeak, far: CoarsePeak
-) -> CoarsePeak | str:
+) -> tuple[CoarsePeak, Alignment | None] | str:
     """The peak near the prediction, unless the best one explains the picture clearly better."""
-    energies: list[Array | None] = []
-    for peak in (near, far):
-        found = align(reference.levels, pyramid, np.array(peak.shift_px))
-        if found is None or not found.converged:
-            energies.append(None)
-            continue
-        energies.append(tile_energies(reference.levels[-1], pyramid, found.shift_px))
+    aligned = [align(reference.levels, pyramid, np.array(p.shift_px)) for p in (near, far)]
+    energies = [
+        None
+        if found is None or not found.converged
+        else tile_energies(reference.levels[-1], pyramid, found.shift_px)
+        for found in aligned
+    ]
     verdict = _paired(energies[0], energies[1], _CONTRADICTING)
     if verdict < -reference.settings.rival_deviations:
         x, y = far.shift_px
         return f"ambiguous: the picture says ({x:.1f}, {y:.1f}) px, far from the prediction"
-    return near
+    return near, aligned[0]
 
 
 def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:

@@ -111,8 +111,8 @@ class Stack:
         """
         picture = _grey(image, self._size)
         map_x, map_y = self._rectifier.maps(self._size, camera, drift, timing)
-        moved = self._rectifier.rectify(picture, camera, drift, timing).astype(np.float32)
-        return moved, scanned(map_x, map_y, self._size, self._reach)
+        moved = self._rectifier.remapped(picture, map_x, map_y)
+        return np.asarray(moved, dtype=np.float32), scanned(map_x, map_y, self._size, self._reach)
 
     def add(self, picture: NDArray[np.float32], valid: Mask) -> None:
         """Add a rectified picture.
