@@ -24,6 +24,7 @@ __all__ = [
     "overwrite_option",
     "progress",
     "require_folder",
+    "require_suffix",
 ]
 
 config_option = click.option(
@@ -75,6 +76,18 @@ def echo_json(value: Any) -> None:
         return item
 
     click.echo(json.dumps(plain(value), indent=2))
+
+
+def require_suffix(path: Path, suffixes: Sequence[str], what: str) -> None:
+    """Refuse an output whose name does not end as its kind of file does, before any work is done
+    for it.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise InvalidValueError(
+            f"{what} {path}",
+            expected="a name that ends in " + ", ".join(suffixes),
+            do="choose one of these suffixes",
+        )
 
 
 def require_folder(path: Path) -> None:

@@ -10,7 +10,13 @@ import click
 
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.common import config_option, configured, progress, require_folder
+from semcal_ros.cli.common import (
+    config_option,
+    configured,
+    progress,
+    require_folder,
+    require_suffix,
+)
 from semcal_ros.cli.drift_common import (
     GIVE_FRAME_TIME,
     Follower,
@@ -104,12 +110,7 @@ def command(
 def _check_plot(plot: Path | None, output: Path) -> None:
     if plot is None:
         return
-    if plot.suffix.lower() not in _PLOT_SUFFIXES:
-        raise InvalidValueError(
-            f"a plot named {plot}",
-            expected="a name that ends in " + ", ".join(_PLOT_SUFFIXES),
-            do="choose one of these suffixes",
-        )
+    require_suffix(plot, _PLOT_SUFFIXES, "--plot")
     if plot.absolute() == output.absolute():
         raise InvalidValueError(f"{plot} for both table and plot", expected="two files")
     require_folder(plot)

@@ -20,6 +20,7 @@ from semcal_ros.cli.common import (
     magnification_option,
     progress,
     require_folder,
+    require_suffix,
 )
 from semcal_ros.cli.drift_common import (
     Follower,
@@ -132,12 +133,7 @@ def _check_outputs(recording: Path, output: Path, sigma: Path | None, video: Pat
     for path, suffixes, option in wanted:
         if path is None:
             continue
-        if path.suffix.lower() not in suffixes:
-            raise InvalidValueError(
-                f"{option} {path}",
-                expected="a name that ends in " + " or ".join(suffixes),
-                do="choose one of these suffixes",
-            )
+        require_suffix(path, suffixes, option)
         require_folder(path)
         target = path.resolve()
         if target in seen or target == source or source in target.parents:
