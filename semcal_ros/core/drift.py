@@ -287,7 +287,7 @@ class DriftTracker:
         if candidate.ratio > _SMALL_ZOOM:
             return self._report(shot, "keyframe", registration, overlap)
         self._store.use(candidate.key)
-        status, enough = "tracked", self.settings.rekey_overlap
+        status, enough, joined = "tracked", self.settings.rekey_overlap, False
         unlike = registration.likeness < _LIKE_ENOUGH
         if unlike or overlap < enough:
             following = self._store.candidates(drift.state, shot, enough, _SMALL_ZOOM)
@@ -300,12 +300,12 @@ class DriftTracker:
                     measure = loosened(measure, before, shot)
                 self._rekey(drift, shot, found, measure, noise)
                 status = "keyframe"
-        elif self.settings.average and joins(found, self._store):
+        elif joined := self.settings.average and joins(found, self._store):
             keyframe = self._store[candidate.key]
             better = keyframe.with_frame(found.picture, found.region, registration)
             self._store.replace(candidate.key, better)
-        time_s = found.keyframe_time_s
-        return self._report(shot, status, registration, overlap, keyframe_time_s=time_s)
+        update = self._report(shot, status, registration, overlap)
+        return replace(update, keyframe_time_s=found.keyframe_time_s, joined=joined)
 
     def _missed(
         self,
@@ -354,7 +354,6 @@ class DriftTracker:
         overlap: float,
         *,
         restarted: bool = False,
-        keyframe_time_s: float = np.nan,
     ) -> DriftUpdate:
         assert self._filter is not None
         state = self._filter.state
@@ -379,7 +378,8 @@ class DriftTracker:
             restarted=restarted,
             shear_px=joint[2:],
             shear_covariance=spread[2:, 2:],
-            keyframe_time_s=keyframe_time_s,
+            keyframe_time_s=float("nan"),
+            joined=False,
         )
 
     # -- other times ------------------------------------------------------------------------------

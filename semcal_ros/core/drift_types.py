@@ -116,6 +116,8 @@ class DriftUpdate:
         not measured.
     keyframe_time_s
         Time of the keyframe that the frame was compared with; NaN where there was none.
+    joined
+        Whether the frame became part of that keyframe's mean.
     """
 
     time_s: float
@@ -134,6 +136,7 @@ class DriftUpdate:
     shear_px: Array
     shear_covariance: Array
     keyframe_time_s: float
+    joined: bool
 
     @property
     def kind(self) -> str:

@@ -36,6 +36,7 @@ from scipy.optimize import nnls
 from semcal_ros.core.drift_path import DriftPath
 from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.keyframe_store import MEANS_PREPARED
 
 __all__ = ["LEFT_IN", "REMOVED", "FrameTimeEstimate", "estimate_frame_time"]
 
@@ -56,11 +57,6 @@ _FLOOR_PX = 0.005
 _KEYFRAME_FLOOR_PX = 0.01
 _SCALE_FLOOR = 0.03
 _COMMON_SCALE_FLOOR = 0.04
-# Frames become part of a keyframe as the tracker does it: at so little shear, with so much overlap,
-# and the mean is used anew at these numbers.
-_SHEAR_TO_ADD_PX = 0.1
-_OVERLAP_TO_ADD = 0.75
-_MEANS_PREPARED = (1, 2, 4, 8, 16, 32)
 # Normalised residuals of two components beyond this weigh less (1 in 20 good ones).
 _HUBER = 2.45
 _MEDIAN_CHI2 = 2.0 * float(np.log(2.0))
@@ -170,18 +166,8 @@ class _Mean:
 
     def used(self) -> tuple[int, Array]:
         """How many frames are in the reference, and their mean velocity."""
-        count = max(n for n in _MEANS_PREPARED if n <= len(self.velocities))
+        count = max(n for n in (1, *MEANS_PREPARED) if n <= len(self.velocities))
         return count, np.asarray(np.mean(self.velocities[:count], axis=0))
-
-    def add(self, update: DriftUpdate, velocity: Array) -> None:
-        """As the tracker does where the frame fits."""
-        if (
-            update.status == "tracked"
-            and update.overlap >= _OVERLAP_TO_ADD
-            and float(np.max(np.abs(update.shear_px))) < _SHEAR_TO_ADD_PX
-            and len(self.velocities) < _MEANS_PREPARED[-1]
-        ):
-            self.velocities.append(velocity)
 
 
 def _seen(path: DriftPath, updates: Sequence[DriftUpdate]) -> _Seen:
@@ -195,7 +181,8 @@ def _seen(path: DriftPath, updates: Sequence[DriftUpdate]) -> _Seen:
             continue
         mean = means.setdefault(index, _Mean(index, len(means), [path.velocity_m_s[index]]))
         rows.append(_row(path, k, update, mean))
-        mean.add(update, path.velocity_m_s[k])
+        if update.joined:
+            mean.velocities.append(path.velocity_m_s[k])
     columns = list(zip(*rows, strict=True)) if rows else [()] * 8
     seen = _Seen(*(np.array(column) for column in columns))
     return _evened(seen) if rows else seen

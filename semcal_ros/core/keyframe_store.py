@@ -12,7 +12,7 @@ from semcal_ros.core.keyframe import Keyframe, carried, scale_ratio
 from semcal_ros.core.reference import Reference, RegistrationSettings
 from semcal_ros.core.shot import Shot
 
-__all__ = ["SAME_SCALE", "Candidate", "KeyframeStore"]
+__all__ = ["MEANS_PREPARED", "SAME_SCALE", "Candidate", "KeyframeStore"]
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,8 @@ SAME_SCALE = 1.0001
 _WORTH_A_CHANGE = 0.05
 # Frames are added to a mean where most of it is seen and the mean's noise still matters.
 _OVERLAP_TO_ADD = 0.75
-_MEANS_PREPARED = (2, 4, 8, 16, 32)
+#: Numbers of frames in a mean at which it is used anew.
+MEANS_PREPARED = (2, 4, 8, 16, 32)
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class KeyframeStore:
     def _improved(self, before: Keyframe, now: Keyframe) -> bool:
         if before.shot is not now.shot or not np.array_equal(before.removed, now.removed):
             return True
-        return now.averaged in _MEANS_PREPARED and now.averaged > before.averaged
+        return now.averaged in MEANS_PREPARED and now.averaged > before.averaged
 
     def averaged(self, key: int) -> int:
         """Number of frames in the prepared reference."""
@@ -141,7 +142,7 @@ class KeyframeStore:
 
     def wants(self, key: int, overlap: float) -> bool:
         """Whether a frame would make the keyframe's mean better."""
-        return self._frames[key].averaged < _MEANS_PREPARED[-1] and overlap >= _OVERLAP_TO_ADD
+        return self._frames[key].averaged < MEANS_PREPARED[-1] and overlap >= _OVERLAP_TO_ADD
 
     def carried(self, key: int, shot: Shot) -> Reference:
         """The reference as the camera of a frame would show it; the latest one is kept, because a

@@ -79,6 +79,7 @@ class Stream:
                 shear_px=shear[k] if k else np.full(2, np.nan),
                 shear_covariance=np.eye(2) * 2.0 * sigma_px**2,
                 keyframe_time_s=float(t[key[k]]) if k else float("nan"),
+                joined=False,
             )
             for k in range(frames)
         ]
