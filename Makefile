@@ -14,7 +14,7 @@ endif
 SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo bench clean
+.PHONY: help setup test lint demo bench fuzz soak clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
@@ -38,7 +38,7 @@ lint: setup ## style (ruff) and types (mypy)
 	@$(VENV_PYTHON) -m mypy
 
 test: lint ## everything that is checked: style, types, tests
-	@$(VENV_PYTHON) -m pytest -q -W error $(PYTEST_ARGS) tests
+	@$(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal $(PYTEST_ARGS) tests
 
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
 	@$(VENV_PYTHON) examples/demo.py
@@ -50,8 +50,18 @@ bench: setup ## the benchmarks, as a table (installs what they compare with into
 	  echo "bench: requirements/bench.txt could not be installed; going on without" >&2
 	@$(VENV_PYTHON) benchmarks/run.py
 
+FUZZ_CASES ?= 2400
+
+fuzz: setup ## over 100 000 damaged messages, recordings, calibrations, TIFFs and configurations
+	@SEMCAL_FUZZ_CASES=$(FUZZ_CASES) $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal \
+	  --timeout 3600 tests/fuzz
+
+soak: setup ## the suite broken every second (SEMCAL_SOAK_S=600, SEMCAL_SOAK_SEED=0)
+	@$(VENV_PYTHON) -m pytest -q -s -W error tests/soak/soak_nodes.py
+
 clean: ## remove what make and the tools made, .venv too
-	rm -rf .venv .venv-jazzy .venv-kilted .venv.lock build install log demo_output
+	rm -rf .venv .venv-jazzy .venv-kilted .venv.lock build install log demo_output bench_output
+	rm -rf cantilever_output nano_ball_output visual_servo_output
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis semcal_ros.egg-info
 	find semcal_ros tests examples benchmarks launch scripts -name __pycache__ -type d \
 	  -prune -exec rm -rf {} + 2>/dev/null || true

@@ -25,6 +25,7 @@ NODES = (
     "rectifier",
     "stream_corrector",
     "virtual_sem",
+    "visual_servo",
 )
 RUNTIME = (
     "click>=8.1",
@@ -39,6 +40,7 @@ RUNTIME = (
     "scipy>=1.11",
     "tifffile>=2023.2.3",
     "tqdm>=4.64",
+    "trimesh>=5.2",
 )
 FOR_PIP = not {"install", "develop"} & set(sys.argv[1:])
 
@@ -121,6 +123,7 @@ setup(
         shared("launch"),
         shared("msg_configs"),
         shared("dds"),
+        shared("security"),
     ],
     install_requires=list(RUNTIME) if FOR_PIP else ["setuptools"],
     zip_safe=False,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, raw_from_output
+from semcal_ros.core.raw_map import RasterDrift, raw_from_output
 from semcal_ros.synthetic import (
     Detector,
     Drift,

@@ -1,330 +1,137 @@
-"""The node stream_corrector over DDS beside a process that only relays the images.
+"""One frame from message to message, and the stream over DDS, beside the least that must be done.
 
-Three processes: this one publishes images at a fixed rate, by turns to the relay and to the
-corrector, and takes the time until each comes back; so both see the same machine at the same time.
-The relay is the least that a Python node can do: it subscribes to images and publishes them again.
-Each size runs in processes of its own, with and without the Fast DDS profile for large images.
+live_callback.py measures what happens inside of a process, live_stream.py what three processes see
+of each other; this makes one table and a plot of both.
 """
 
 from __future__ import annotations
 
 import argparse
-import array
 import json
 import os
-import signal
 import subprocess
 import sys
-import tempfile
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
+from live_callback import COLUMNS
+from live_stream import DDS_VARIABLES, MALLOC
 from table import show
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-PROFILE = REPOSITORY / "dds" / "fastdds_large_images.xml"
-# As the comment in the profile recommends: large buffers are reused instead of faulted in anew.
-MALLOC = {"MALLOC_MMAP_THRESHOLD_": "268435456", "MALLOC_TRIM_THRESHOLD_": "536870912"}
-DDS_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-
-# Frames per second of each of the two streams.
-RATES = {512: 10.0, 1024: 10.0, 2048: 4.0, 4096: 1.5}
-PATHS = ("relay", "corrector")
-MAGNIFICATION = 5000.0
-TIMEOUT_S = 20.0
-WARM_UP = 2
+HERE = Path(__file__).resolve().parent
+PLOT = HERE.parent / "bench_output" / "live.png"
+SIZES = (512, 1024, 2048, 4096)
+# Frames per second over DDS, and seconds; so many that the busiest process has time to spare.
+RATES = {512: 60.0, 1024: 25.0, 2048: 8.0, 4096: 3.0}
+SECONDS = 15.0
 
 
-# -- the relay -------------------------------------------------------------------------------------
-
-
-def relay() -> None:
-    """Publish again what arrives, with the same quality of service as the suite's nodes."""
-    import rclpy
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import QoSProfile
-    from sensor_msgs.msg import Image
-
-    rclpy.init()
-    node = rclpy.create_node("relay", namespace="/relay")
-    publisher = node.create_publisher(Image, "image_rect", QoSProfile(depth=2))
-    node.create_subscription(Image, "image_raw", publisher.publish, QoSProfile(depth=1))
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-
-
-# -- one measurement -------------------------------------------------------------------------------
-
-
-def calibration_text() -> str:
-    """A calibration with a little of every distortion, for 512 x 512."""
-    from semcal_ros import Calibration
-    from semcal_ros.core.functions import ContinuousFunction
-
-    limits = (500.0, 20000.0)
-    values = {"scale": 1.01, "aspect": 1.004, "skew": 0.001, "px": 250.0, "py": 262.0, "rho": 50.0}
-    values |= {"xi_r": 0.01, "xi_t": 0.001, "ex": 235.0, "ey": 268.0}
-    functions = {
-        name: ContinuousFunction("chebyshev_log", np.array([value]), limits)
-        for name, value in values.items()
-    }
-    return Calibration(
-        functions=functions,
-        covariance=np.eye(len(values)) * 1e-8,
-        image_width=512,
-        image_height=512,
-        display_width_m=0.12,
-        magnifications=limits,
-        method="joint",
-    ).dumps()
-
-
-def pictures(size: int, count: int = 16) -> list[np.ndarray]:
-    """A random texture that drifts slowly on a circle, with noise.
-
-    A fifth of a pixel of 512 per frame, so that every frame can be tracked.
-    """
-    rng = np.random.default_rng(0)
-    wide = rng.standard_normal((size + 16, size + 16), dtype=np.float32)
-    wide = cv2.GaussianBlur(wide, (0, 0), 2.5)
-    wide *= 40.0 / wide.std()
-    # One noise, rolled: drawing it anew is slow at 4096.
-    noise = rng.standard_normal((size, size), dtype=np.float32) * 5.0
-    radius = 0.5 * size / 512
-    out = []
-    for k in range(count):
-        angle = 2.0 * np.pi * k / count
-        x, y = radius * np.cos(angle) - 8.0, radius * np.sin(angle) - 8.0
-        moved = cv2.warpAffine(
-            wide, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (size, size), flags=cv2.INTER_CUBIC
-        )
-        out.append(np.clip(128.0 + moved + np.roll(noise, 37 * k), 0, 255).astype(np.uint8))
-    return out
-
-
-def config_text(size: int) -> str:
-    """A microscope that scans each frame in most of the time between two."""
-    return (
-        "name: benchmark\ndisplay_width_m: 0.12\n"
-        "magnification: {quantity: magnification}\n"
-        f"scan: {{frame_time_s: {0.8 / RATES[size]}}}\n"
-    )
-
-
-@contextmanager
-def running(command: list[str], log: Path) -> Iterator[subprocess.Popen]:
-    with open(log, "wb") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-class Measurement:
-    """Publishes and times; the answers arrive in a thread of their own."""
-
-    def __init__(self, size: int, frames: int) -> None:
-        import rclpy
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from sensor_msgs.msg import Image
-        from std_msgs.msg import Float64
-
-        self._rclpy = rclpy
-        self._frames = frames
-        self._period_s = 1.0 / RATES[size]
-        rclpy.init()
-        self._node = rclpy.create_node("benchmark")
-        self._sent: dict[str, dict[int, float]] = {path: {} for path in PATHS}
-        self._back: dict[str, dict[int, float]] = {path: {} for path in PATHS}
-        self._publishers = {}
-        for path in PATHS:
-            self._publishers[path] = self._node.create_publisher(
-                Image, f"/{path}/image_raw", QoSProfile(depth=2)
-            )
-            self._node.create_subscription(
-                Image, f"/{path}/image_rect", self._receiver(path), QoSProfile(depth=2)
-            )
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._magnification = self._node.create_publisher(
-            Float64, "/corrector/magnification", latched
-        )
-        self._magnification.publish(Float64(data=MAGNIFICATION))
-        self._messages = []
-        for picture in pictures(size):
-            message = Image(height=size, width=size, step=size, encoding="mono8")
-            data = array.array("B")
-            data.frombytes(picture.tobytes())
-            message.data = data
-            self._messages.append(message)
-        self._thread = threading.Thread(target=rclpy.spin, args=(self._node,), daemon=True)
-        self._thread.start()
-
-    def _receiver(self, path: str) -> Callable[[object], None]:
-        def receive(message) -> None:
-            now = time.perf_counter()
-            stamp = message.header.stamp
-            self._back[path][stamp.sec * 10**9 + stamp.nanosec] = now
-
-        return receive
-
-    def _publish(self, path: str, index: int) -> None:
-        message = self._messages[index % len(self._messages)]
-        now_ns = time.time_ns()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
-        self._sent[path][now_ns] = time.perf_counter()
-        self._publishers[path].publish(message)
-
-    def _wait(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + TIMEOUT_S
-        while not condition():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"waited {TIMEOUT_S:g} s in vain for {what}")
-            time.sleep(0.02)
-
-    def _stream(self, count: int) -> None:
-        """Frames by turns at the fixed rate."""
-        start = time.monotonic()
-        for turn in range(count * len(PATHS)):
-            due = start + turn * self._period_s / len(PATHS)
-            time.sleep(max(0.0, due - time.monotonic()))
-            self._publish(PATHS[turn % len(PATHS)], turn // len(PATHS))
-
-    def run(self) -> dict[str, dict[str, object]]:
-        for path, publisher in self._publishers.items():
-            self._wait(lambda p=publisher: p.get_subscription_count() == 1, f"the {path}")
-            topic = f"/{path}/image_rect"
-            self._wait(lambda t=topic: self._node.count_publishers(t) == 1, topic)
-        self._wait(lambda: self._magnification.get_subscription_count() == 1, "its magnification")
-        # Until both answer, whatever discovery takes.
-        deadline = time.monotonic() + TIMEOUT_S
-        while min(len(back) for back in self._back.values()) < WARM_UP:
-            if time.monotonic() > deadline:
-                break
-            self._stream(2 * WARM_UP)
-        time.sleep(0.5)
-        for path in PATHS:
-            self._sent[path].clear()
-            self._back[path].clear()
-        self._stream(self._frames)
-        deadline = time.monotonic() + max(3.0, 12.0 * self._period_s)
-        while time.monotonic() < deadline and any(
-            len(self._back[p]) < len(self._sent[p]) for p in PATHS
-        ):
-            time.sleep(0.05)
-        result: dict[str, dict[str, object]] = {}
-        for path in PATHS:
-            sent, back = self._sent[path], dict(self._back[path])
-            taken = [back[stamp] - sent[stamp] for stamp in back if stamp in sent]
-            median, late = np.percentile(taken, [50, 95]).tolist() if taken else (None, None)
-            result[path] = {"in": len(sent), "out": len(taken), "median": median, "late": late}
-        return result
-
-    def close(self) -> None:
-        self._rclpy.try_shutdown()
-        self._thread.join(TIMEOUT_S)
-
-
-def measure(size: int, frames: int) -> None:
-    """Start the processes, measure, print the result as one line of JSON."""
-    with tempfile.TemporaryDirectory() as folder:
-        calibration = Path(folder) / "calibration.yaml"
-        calibration.write_text(calibration_text(), encoding="utf-8")
-        corrector = [sys.executable, "-m", "semcal_ros.nodes.stream_corrector", "--ros-args"]
-        corrector += ["-r", "__ns:=/corrector", "-p", f"calibration:={calibration}"]
-        config = Path(folder) / "benchmark.yaml"
-        config.write_text(config_text(size), encoding="utf-8")
-        corrector += ["-p", f"config:={config}"]
-        relaying = [sys.executable, __file__, "--relay"]
-        log = Path(folder) / "corrector.log"
-        with running(relaying, Path(folder) / "relay.log"), running(corrector, log):
-            measurement = Measurement(size, frames)
-            try:
-                result = measurement.run()
-            finally:
-                measurement.close()
-    print(json.dumps(result), flush=True)
-
-
-# -- all of them -----------------------------------------------------------------------------------
-
-
-def measured(size: int, frames: int, extra: dict[str, str]) -> dict[str, dict[str, object]] | None:
-    """Result of one measurement in an environment of its own."""
+def asked(command: list[str], extra: dict[str, str] | None = None) -> dict[str, object] | None:
+    """JSON that a script of this folder prints, or None if it fails."""
     environment = {k: v for k, v in os.environ.items() if k not in (*DDS_VARIABLES, *MALLOC)}
-    # A domain of its own on this host alone: nobody else's nodes are heard or disturbed.
-    environment["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    command = [sys.executable, __file__, "--measure", str(size), str(frames)]
+    # As the nodes set it for themselves: small matrices do not want threads that wait in loops.
+    environment |= {"OPENBLAS_NUM_THREADS": "1", **(extra or {})}
+    script, *rest = command
     done = subprocess.run(
-        command, env=environment | extra, stdout=subprocess.PIPE, text=True, check=False
+        [sys.executable, str(HERE / script), *rest],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
     )
-    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
-    return json.loads(lines[-1]) if lines else None
+    return json.loads(done.stdout) if done.returncode == 0 and done.stdout.strip() else None
 
 
-def ratio(value: float | None, unit: float | None) -> float | None:
-    return value / unit if value and unit else None
+def callbacks(sizes: tuple[int, ...], quick: bool) -> list[list[object]]:
+    rows: list[list[object]] = []
+    for size in sizes:
+        for depth in (8, 16):
+            command = ["live_callback.py", str(size), str(depth)] + ["--quick"] * quick
+            found = asked(command, MALLOC) or {}
+            floor = found.get("floor")
+            in_ms = 1e3 * floor if isinstance(floor, float) else None
+            rows.append([f"{size} mono{depth}", in_ms, *(found.get(name) for name in COLUMNS)])
+    return rows
+
+
+def streams(sizes: tuple[int, ...], floors: dict[int, float], quick: bool) -> list[list[object]]:
+    rows: list[list[object]] = []
+    seconds = str(SECONDS / (3.0 if quick else 1.0))
+    variants = {
+        "least node, default transport": ["--relay", "--default-transport"],
+        "least node": ["--relay"],
+        "stream_corrector, default transport": ["--default-transport"],
+        "stream_corrector": [],
+    }
+    for size in sizes:
+        for name, options in variants.items():
+            command = ["live_stream.py", str(size), str(RATES[size]), "--seconds", seconds]
+            found = asked(command + options) or {}
+
+            def times(key: str, found: dict = found, size: int = size) -> float | None:
+                value = found.get(key)
+                return None if value is None else float(value) / floors[size]
+
+            row: list[object] = [f"{size}  {name}", RATES[size], found.get("in"), found.get("lost")]
+            row += [times("median_ms"), times("p99_ms"), found.get("cores")]
+            rows.append(row)
+    return rows
+
+
+def plot(rows: list[list[object]], path: Path) -> None:
+    """Ratios to the floor over the image size, one line for each column; mono8."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
+    kept = [row for row in rows if "mono8" in str(row[0]) and row[1] is not None]
+    sizes = [int(str(row[0]).split()[0]) for row in kept]
+    for index, name in enumerate(COLUMNS[:-1], 2):
+        style = "--" if name.startswith("core") else "-"
+        axes.plot(sizes, [row[index] for row in kept], style, marker="o", label=name)
+    axes.axhline(1.0, color="0.5", linewidth=1.0)
+    axes.set(xscale="log", xlabel="image size, px", ylabel="time over remap + copy", ylim=(0, None))
+    axes.set_xticks(sizes, [str(size) for size in sizes], minor=False)
+    axes.minorticks_off()
+    axes.legend(frameon=False, fontsize=8)
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=120)
+    print(f"plot: {path}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="less of everything")
-    parser.add_argument("--relay", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--measure", nargs=2, type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--plot", type=Path, default=PLOT)
     options = parser.parse_args()
     try:
         import rclpy  # noqa: F401
     except ImportError:
         print("\nLive nodes over DDS: rclpy is not installed")
         return
-    if options.relay:
-        return relay()
-    if options.measure:
-        return measure(*options.measure)
-    profile = dict.fromkeys(DDS_VARIABLES, str(PROFILE))
-    variants = {"default": {}, "profile, malloc": profile | MALLOC}
-    rows: list[list[object]] = []
-    for size in (512, 1024, 2048) if options.quick else RATES:
-        frames = round(RATES[size] * (3 if options.quick else 8))
-        unit: float | None = None
-        for name, extra in variants.items():
-            result = measured(size, frames, extra)
-            if result is None:
-                rows.append([f"{size}  {name}  failed", *[None] * 8])
-                continue
-            for path in PATHS:
-                one, base = result[path], result["relay"]
-                unit = unit or base["median"]
-                row: list[object] = [f"{size}  {name}  {path}", RATES[size]]
-                row += [one["in"], one["out"], one["in"] - one["out"]]
-                row += [ratio(one["median"], base["median"]), ratio(one["late"], base["median"])]
-                row += [ratio(one["late"], base["late"]), ratio(one["median"], unit)]
-                rows.append(row)
+    sizes = SIZES[:3] if options.quick else SIZES
+    inside = callbacks(sizes, options.quick)
     show(
-        "Live: image_raw to image_rect over DDS (mono8), by turns through a relay and stream_corrector",
-        ["size  transport  path", "Hz", "in", "out", "lost", "median", "95 %", "95 %/95 %"]
-        + ["median/default"],
-        rows,
-        "median, 95 %: latency as ratio to the relay's median in the same run; 95 %/95 %: to its 95 %.",
-        "median/default: to the relay's median at this size over the default transport, in another run.",
-        "Published reliable, depth 2; subscribed keep-last 1: of several waiting frames the newest wins.",
+        "Live, inside of a process: time as ratio to cv2.remap with maps at hand and one copy",
+        ["frames", "floor ms", *COLUMNS],
+        inside,
+        "core: Rectifier.rectify; node: from the message that has arrived to the messages published.",
+        "still: nothing changes. drift, magnification, both: they change with every frame.",
+        "node, still: rectifier; node, both: stream_corrector without registration, which stands",
+        "beside it. Floor ms: for orientation, on this machine at this moment.",
     )
+    floors = {int(str(r[0]).split()[0]): float(str(r[1])) for r in inside if "mono8" in str(r[0])}
+    show(
+        "Live, over DDS: mono8 from publisher to node to subscriber, three processes",
+        ["frames  node", "Hz", "in", "lost", "median", "99 %", "cores"],
+        streams(sizes, floors, options.quick),
+        "median, 99 %: latency from before publishing to a Python subscriber, over the floor of this",
+        "size above. least node: cv2.remap with maps at hand into the outgoing message, in Python.",
+        "cores: processor time of the node per second. Transport: the profile in dds/ and malloc set,",
+        "or the default. Reliable, keep-last 10 at the node.",
+    )
+    plot(inside, options.plot)
 
 
 if __name__ == "__main__":

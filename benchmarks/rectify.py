@@ -11,7 +11,8 @@ from table import interleaved, quick_from_command_line, show
 
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, Rectifier
+from semcal_ros.core.raw_map import RasterDrift
+from semcal_ros.core.rectify import Rectifier
 from semcal_ros.synthetic import preset
 
 TIMING = ScanTiming(1.0 / 15.0, 8, 0.1)

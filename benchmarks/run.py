@@ -15,11 +15,12 @@ drift.py                  registration beside phase correlation, ECC, scikit-ima
 drift_soak.py             20 000 frames out and back (not among these: run it by itself)
 coverage.py               how often the stated uncertainty of a calibration holds the truth
 rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
-live.py                   the node stream_corrector over DDS beside a process that only relays
+live.py                   one frame through core and node, and the stream over DDS, beside a bare
+                          remap and copy (its parts: live_callback.py, live_stream.py)
 ========================  ==========================================================================
 
 Everything but one column is measured on simulated data whose truth is known, with fixed seeds. Accuracy is in px
-and stands beside a bound wherever there is one. A time is never given in seconds: it is the ratio
+and stands beside a bound wherever there is one. A time is the ratio
 of two medians, taken turn by turn in one run, so that it means something on another machine or on a
 busy one. Ratios of a few percent are still chance. Nothing here passes or fails.
 

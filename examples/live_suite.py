@@ -24,6 +24,11 @@ from semcal_ros.bridge.images import image_from_message
 NODES = ("parameter_server", "drift_compensator", "stream_corrector")
 IMAGES = ("image_raw", "image_stabilized", "image_rect")
 TIMEOUT_S = 60.0
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+MALLOC_VARIABLES = (
+    ("MALLOC_MMAP_THRESHOLD_", "268435456"),
+    ("MALLOC_TRIM_THRESHOLD_", "536870912"),
+)
 # Nothing new for so long after the end of the replay: what is missing was overtaken by newer frames.
 SILENCE_S = 3.0
 
@@ -54,7 +59,15 @@ class LiveSuite:
         # A domain of its own, so that the demo neither hears nor disturbs anybody else's robots.
         os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        self._executables = Path(get_package_prefix("semcal_ros")) / "lib" / "semcal_ros"
+        prefix = Path(get_package_prefix("semcal_ros"))
+        profile = str(prefix / "share" / "semcal_ros" / "dds" / "fastdds_large_images.xml")
+        # As the launch files do: shared memory for whole images, and memory that is used again. A
+        # profile of the user's own stays.
+        if not any(name in os.environ for name in PROFILE_VARIABLES):
+            os.environ.update(dict.fromkeys(PROFILE_VARIABLES, profile))
+        for name, value in MALLOC_VARIABLES:
+            os.environ.setdefault(name, value)
+        self._executables = prefix / "lib" / "semcal_ros"
         self._logs = logs
         self._parameters = {
             "config": config,
@@ -70,6 +83,8 @@ class LiveSuite:
             parameters = dict(self._parameters)
             if name == "drift_compensator":
                 del parameters["calibration"]
+            if name != "parameter_server":
+                parameters["drift_tracking"] = "every_frame"
             self._start(name, parameters)
         rclpy.init()
         self._node = rclpy.create_node("demo", namespace="/sem")

@@ -15,6 +15,7 @@ from launch.actions import (
     Shutdown,
     TimerAction,
 )
+from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
@@ -25,6 +26,8 @@ PACKAGE = "semcal_ros"
 SUITE = Path(__file__).absolute().with_name("semcal_launch.py")
 # Seconds for the frames that have been received but are still being worked on.
 GRACE_S = 1.0
+# Status of a node that cannot start with what it was given.
+CANNOT_START = 2
 
 # Default (None: there is none), type and description.
 ARGUMENTS = {
@@ -83,27 +86,33 @@ def start_player(context):
     if values["config"] != "generic":
         parameters["config"] = ParameterValue(values["config"], value_type=str)
     files = [str(Path(values["params_file"]).expanduser())] if values["params_file"] else []
+    # As the suite does for its nodes.
+    secure = context.environment.get("ROS_SECURITY_ENABLE") == "true"
+    enclave = ["--enclave", f"/{values['namespace'].strip('/')}/bag_player"] if secure else []
     player = Node(
         package=PACKAGE,
         executable="bag_player",
         name="bag_player",
         namespace=values["namespace"],
         parameters=[*files, parameters],
-        ros_arguments=["--log-level", values["log_level"]],
+        ros_arguments=["--log-level", values["log_level"], *enclave],
         output="screen",
     )
-    # A player would wait forever for a node that could not start.
     watch = OnProcessExit(
         target_action=lambda action: getattr(action, "node_package", None) == PACKAGE,
-        on_exit=lambda event, _context: on_exit(event, event.action is player),
+        on_exit=lambda event, context: on_exit(event, context, event.action is player),
     )
     return [RegisterEventHandler(watch), player]
 
 
-def on_exit(event, is_player):
+def on_exit(event, context, is_player):
     """What follows the end of a node."""
-    if event.returncode != 0:
-        return [Shutdown(reason=f"{event.process_name} ended with {event.returncode}")]
-    if is_player:
-        return [TimerAction(period=GRACE_S, actions=[Shutdown(reason="the recording has ended")])]
-    return None
+    if event.returncode == 0:
+        after = TimerAction(period=GRACE_S, actions=[Shutdown(reason="the recording has ended")])
+        return [after] if is_player else None
+    # The suite starts a node again that has died. A player that began anew would play everything twice, and would
+    # wait forever for a node that cannot start.
+    final = is_player or event.returncode == CANNOT_START
+    if not final and IfCondition(LaunchConfiguration("respawn")).evaluate(context):
+        return None
+    return [Shutdown(reason=f"{event.process_name} ended with {event.returncode}")]

@@ -7,8 +7,17 @@ ros2 launch semcal_ros semcal_launch.py --show-args
 from pathlib import Path
 
 from launch import LaunchDescription  # isort: skip - this folder has the same name
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
+)
 from launch.conditions import IfCondition
+from launch.event_handlers import OnProcessExit
+from launch.events import matches_action
+from launch.events.process import ShutdownProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -19,6 +28,10 @@ PROFILE = Path(__file__).absolute().parents[1] / "dds" / "fastdds_large_images.x
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 # Bytes. The memory of one frame is used again for the next instead of being faulted in anew.
 MALLOC_VARIABLES = {"MALLOC_MMAP_THRESHOLD_": "268435456", "MALLOC_TRIM_THRESHOLD_": "536870912"}
+# Seconds. Long enough for on_exit to be heard first, short for who waits for frames.
+RESPAWN_DELAY_S = 1.0
+# Asked to end; cannot start with what it was given.
+FINAL = (0, 2)
 
 ARGUMENTS = {
     "namespace": ("sem", "Namespace of all nodes and of their topics."),
@@ -37,6 +50,11 @@ ARGUMENTS = {
     ),
     "use_sim_time": ("false", "Take the time from /clock. Frames keep their stamps either way."),
     "log_level": ("info", "Least severity that is logged."),
+    "respawn": (
+        "true",
+        "Start a node again that has died, after a second. Not one that was asked to end, nor one"
+        " that ended with status 2 because it cannot start with what it was given.",
+    ),
     "large_images": (
         "true",
         "Set the environment for large images: shared memory for Fast DDS, and malloc."
@@ -92,7 +110,18 @@ def start_nodes(context):
         nodes.append(node(context, "rectifier", "config", "calibration", fixed=stabilized))
     wanted = IfCondition(LaunchConfiguration("calibration_server"))
     nodes.append(node(context, "calibration_server", "config", condition=wanted))
-    return nodes
+    watch = OnProcessExit(
+        target_action=lambda action: getattr(action, "node_package", None) == PACKAGE,
+        on_exit=on_exit,
+    )
+    return [RegisterEventHandler(watch), *nodes]
+
+
+def on_exit(event, _context):
+    """launch itself would start a node again whatever its status."""
+    if event.returncode not in FINAL:
+        return None
+    return [EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))]
 
 
 def node(context, executable, *passed, fixed=None, condition=None):
@@ -122,7 +151,17 @@ def node(context, executable, *passed, fixed=None, condition=None):
         name=executable,
         namespace=values["namespace"],
         parameters=[*files, parameters],
-        ros_arguments=["--log-level", values["log_level"]],
+        ros_arguments=["--log-level", values["log_level"], *enclave(context, executable)],
         output="screen",
+        respawn=LaunchConfiguration("respawn"),
+        respawn_delay=RESPAWN_DELAY_S,
         condition=condition,
     )
+
+
+def enclave(context, executable):
+    """Where DDS security is on, a node has the enclave of its name (doc/security.md)."""
+    if context.environment.get("ROS_SECURITY_ENABLE") != "true":
+        return []
+    namespace = LaunchConfiguration("namespace").perform(context).strip("/")
+    return ["--enclave", f"/{namespace}/{executable}"]

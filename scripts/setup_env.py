@@ -32,6 +32,7 @@ PACKAGE_SOURCES = (
     "launch/*",
     "msg_configs/*",
     "dds/*",
+    "security/*",
 )
 
 

@@ -6,7 +6,7 @@ import base64
 import binascii
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -22,6 +22,8 @@ from semcal_ros.core.field import ResidualField
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.files.atomic import atomic_write_text
+from semcal_ros.files.confined import read_plain_text
+from semcal_ros.files.plain_yaml import check_plain_yaml
 
 __all__ = ["FILE_VERSION", "Calibration"]
 
@@ -30,13 +32,25 @@ Array = NDArray[np.float64]
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
 _MAX_TEXT = 64 * 1024 * 1024
+_MAX_REASON = 400
 _HEADER = (
     "# Calibration of a scanning electron microscope as functions of the magnification. SI units.\n"
 )
 
+# What the rounding of a file's numbers may leave below zero, per coefficient.
+_NEGATIVE_CORRELATION = 1e-7
 # libyaml where it was built in: 20 times faster on the covariance.
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+# A value that its tag does not fit, such as ``!!bool maybe``, surfaces as any of these.
+_YAML_ERRORS = (
+    yaml.YAMLError,
+    ValueError,
+    LookupError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 
 
 class Calibration(CalibrationModel):
@@ -66,24 +80,7 @@ class Calibration(CalibrationModel):
             If the file is missing, unreadable, corrupt, foreign or of a newer version.
         """
         name = os.fspath(path)
-        try:
-            size = Path(name).stat().st_size
-            if size > _MAX_TEXT:
-                raise CalibrationFileError(
-                    f"{name}: a file of {size} bytes", expected=f"a calibration below {_MAX_TEXT}"
-                )
-            text = Path(name).read_text(encoding="utf-8")
-        except OSError as error:
-            raise CalibrationFileError(
-                f"{name}: {error.strerror or error}",
-                expected="a readable calibration file",
-                do="check the path, or make one with `semcal calibrate`",
-            ) from error
-        except UnicodeDecodeError as error:
-            raise CalibrationFileError(
-                f"{name}: not a text file", expected="a calibration written by semcal"
-            ) from error
-        return cls.loads(text, source=name)
+        return cls.loads(read_plain_text(Path(name), _MAX_TEXT), source=name)
 
     @classmethod
     def loads(cls, text: str, *, source: str = "calibration") -> Calibration:
@@ -95,32 +92,19 @@ class Calibration(CalibrationModel):
             As :meth:`load`.
         """
         data = _parsed(text, source)
-        _check_kind(data, source)
-        _check_schema(data, source)
         try:
-            covariance, field = _covariance_from(data["covariance"]), None
-            if "residual_field" in data:
-                field = _field_from(data["residual_field"])
-                covariance = _with_field_covariance(
-                    covariance, data["residual_field"]["covariance"], field.size
-                )
-            return cls(
-                functions={
-                    name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES
-                },
-                covariance=covariance,
-                image_width=data["image_width_px"],
-                image_height=data["image_height_px"],
-                display_width_m=float(data["display_width_m"]),
-                magnifications=tuple(float(g) for g in data["magnifications"]),
-                method=data["method"],
-                statistics=data.get("statistics", {}),
-                residual=field,
-            )
-        except InvalidValueError as error:
+            _check_kind(data, source)
+            _check_schema(data, source)
+            calibration = cls(**_fields_from(data))
+            _check_cameras(calibration)
+        except (ValueError, ArithmeticError) as error:
+            # YAML has integers of any length, and floats whose products are none.
+            known = isinstance(error, InvalidValueError)
+            reason = str(error)[:_MAX_REASON] if known else "numbers that cannot be used"
             raise CalibrationFileError(
-                f"{source}: {error}", do="restore the file or calibrate again"
+                f"{source}: {reason}", do="restore the file or calibrate again"
             ) from error
+        return calibration
 
     def dumps(self) -> str:
         """The text of the calibration file, with every number in full precision."""
@@ -172,9 +156,10 @@ def _parsed(text: str, source: str) -> Any:
         raise CalibrationFileError(
             f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
         )
+    check_plain_yaml(text, source)
     try:
         return yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except _YAML_ERRORS as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark is not None else ""
         raise CalibrationFileError(
@@ -197,7 +182,7 @@ def _check_kind(data: Any, source: str) -> None:
             isinstance(version, int) and not isinstance(version, bool) and version > FILE_VERSION
         )
         raise CalibrationFileError(
-            f"{source}: file version {version!r}",
+            f"{source}: file version {repr(version)[:40]}",
             expected=f"version {FILE_VERSION}",
             do="update semcal_ros" if newer else "calibrate again",
         )
@@ -210,7 +195,10 @@ def _validator() -> Any:
 
 
 def _check_schema(data: Mapping[str, Any], source: str) -> None:
-    error = next(_validator().iter_errors(data), None)
+    try:
+        error = next(_validator().iter_errors(data), None)
+    except TypeError as wrong:  # the validator compares names with patterns
+        raise CalibrationFileError(f"{source}: a key that is no text", expected="names") from wrong
     if error is not None:
         where = ".".join(str(p) for p in error.absolute_path) or "top level"
         raise CalibrationFileError(
@@ -220,13 +208,54 @@ def _check_schema(data: Mapping[str, Any], source: str) -> None:
         )
 
 
+def _fields_from(data: Mapping[str, Any]) -> dict[str, Any]:
+    covariance, field = _covariance_from(data["covariance"]), None
+    if "residual_field" in data:
+        field = _field_from(data["residual_field"])
+        covariance = _with_field_covariance(
+            covariance, data["residual_field"]["covariance"], field.size
+        )
+    width, *magnifications = _finite([data["display_width_m"], *data["magnifications"]])
+    return {
+        "functions": {name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES},
+        "covariance": covariance,
+        # The schema counts 512.0 as an integer.
+        "image_width": int(data["image_width_px"]),
+        "image_height": int(data["image_height_px"]),
+        "display_width_m": width,
+        "magnifications": tuple(magnifications),
+        "method": data["method"],
+        "statistics": data.get("statistics", {}),
+        "residual": field,
+    }
+
+
+def _finite(values: Sequence[Any]) -> list[float]:
+    numbers = [float(value) for value in values]
+    if not np.all(np.isfinite(numbers)):
+        raise InvalidValueError("numbers that are not finite", expected="finite numbers")
+    return numbers
+
+
+def _check_cameras(model: CalibrationModel) -> None:
+    """Refuse numbers that are valid one by one and overflow in what the camera is asked for."""
+    right, bottom = model.image_width - 1.0, model.image_height - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    with np.errstate(over="raise", divide="raise", invalid="raise"):
+        for g in model.magnifications:
+            camera = model.at(g)
+            camera.project_sigma(camera.sem_from_ideal(corners))
+            if camera.rho > 0.0:
+                camera.resized(1, 1).P  # noqa: B018
+
+
 def _function_from(data: Mapping[str, Any]) -> ContinuousFunction:
     low, high = data["magnification_range"]
     return ContinuousFunction(
         data["kind"],
         np.array(data["coefficients"], dtype=np.float64),
         (float(low), float(high)),
-        np.array(data.get("shape", []), dtype=np.float64),
+        np.array(_finite(data.get("shape", []))),
         np.array(data.get("breaks", []), dtype=np.float64),
     )
 
@@ -294,7 +323,7 @@ def _with_field_covariance(functions: Array, packed: str, own: int) -> Array:
 
 
 def _covariance_from(data: Mapping[str, Any]) -> Array:
-    size, rows = data["size"], data["upper_rows"]
+    size, rows = int(data["size"]), data["upper_rows"]
     if [len(row) for row in rows] != list(range(size, 0, -1)):
         raise InvalidValueError(
             "a covariance of the wrong size", expected=f"{size} rows of the upper triangle"
@@ -311,6 +340,20 @@ def _check_covariance(matrix: Array) -> None:
     if not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
         raise InvalidValueError(
             "a covariance that is none", expected="finite numbers, variances >= 0"
+        )
+    # The coefficients have units that differ by orders of magnitude.
+    unit = np.sqrt(np.diag(matrix))
+    unit[unit == 0.0] = 1.0
+    with np.errstate(over="ignore"):
+        correlation = matrix / unit[:, None] / unit
+    least = -np.inf
+    if np.all(np.abs(correlation) < 2.0):
+        least = float(np.linalg.eigvalsh(correlation)[0])
+    if least < -_NEGATIVE_CORRELATION * len(matrix):
+        raise InvalidValueError(
+            f"a covariance whose correlations have the eigenvalue {least:.2g}",
+            expected="none below zero",
+            do="calibrate again: the file was changed by hand, or damaged",
         )
 
 

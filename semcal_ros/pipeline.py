@@ -260,8 +260,9 @@ def calibrate_found(
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
     residual: str = "auto",
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> RecordingCalibration:
-    """Calibrate from images whose corners have been found."""
+    """Calibrate from found corners; ``on_stage`` is told what begins and what fraction of the work is done."""
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
     factor = collected.assignment.scale_factor
     _check_factor(factor, display_width_m)
@@ -273,7 +274,9 @@ def calibrate_found(
         options=options,
         breakpoints=breakpoints,
         residual=residual,
+        on_stage=lambda name, part: on_stage(name, 0.95 * part),
     )
+    on_stage("summary", 0.95)
     collected = _without_outliers(collected, result)
     warnings = list(result.warnings)
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:

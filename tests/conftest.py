@@ -58,7 +58,12 @@ def _isolate() -> int:
         "RMW_IMPLEMENTATION",
         "FASTRTPS_DEFAULT_PROFILES_FILE",
         "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_BUILTIN_TRANSPORTS",
         "ROS_LOCALHOST_ONLY",
+        "ROS_SECURITY_ENABLE",
+        "ROS_SECURITY_STRATEGY",
+        "ROS_SECURITY_KEYSTORE",
+        "ROS_SECURITY_ENCLAVE_OVERRIDE",
     ):
         os.environ.pop(name, None)
     return lock

@@ -63,6 +63,8 @@ def _broken(calibration, edit):
         (lambda d: d.update(magnifications=[5.0, 1.0]), "ascending"),
         (lambda d: d["covariance"]["upper_rows"].pop(), "covariance"),
         (lambda d: d["covariance"]["upper_rows"][0].__setitem__(0, -1.0), "covariance"),
+        (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e6), "correlations"),
+        (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e308), "correlations"),
         (lambda d: d.update(surprise=1), "surprise"),
     ],
 )

@@ -39,6 +39,7 @@ from semcal_ros.bridge.images import (
     ENCODINGS,
     fill_image,
     image_from_message,
+    pixel_memory,
     to_gray,
     without_databar,
 )
@@ -48,6 +49,7 @@ from semcal_ros.bridge.magnification import (
     magnification_from_message,
     read_magnification,
 )
+from semcal_ros.bridge.pace import TrackingPace
 from semcal_ros.bridge.parameters import (
     PARAMETER_KINDS,
     ParameterRequest,
@@ -57,6 +59,7 @@ from semcal_ros.bridge.parameters import (
     value_of,
 )
 from semcal_ros.bridge.projection import fill_projection, projection_from_message
+from semcal_ros.bridge.scan_interval import scan_interval_ns
 
 __all__ = [
     "ENCODINGS",
@@ -69,6 +72,7 @@ __all__ = [
     "MicroscopeConfig",
     "ParameterRequest",
     "StreamStatistics",
+    "TrackingPace",
     "ZeroOrderHold",
     "calibration_text_from_message",
     "check_magnification",
@@ -90,9 +94,11 @@ __all__ = [
     "optional_stamp_ns",
     "parse_config",
     "parse_parameter_name",
+    "pixel_memory",
     "projection_from_message",
     "read_magnification",
     "read_parameter",
+    "scan_interval_ns",
     "stamp_ns_from_msg",
     "to_gray",
     "value_of",

@@ -18,10 +18,16 @@ def calibration_text_from_message(message: StringMessage) -> str:
     Raises
     ------
     MessageError
-        The text is empty or longer than :data:`MAX_TEXT_BYTES`.
+        There is no text, or it is empty or longer than :data:`MAX_TEXT_BYTES`.
     """
     require_fields(message, ("data",), "std_msgs/msg/String")
     text = message.data
+    if not isinstance(text, str):
+        raise MessageError(
+            f"a calibration of type {type(text).__name__}",
+            expected="std_msgs/msg/String",
+            do="check the type of the topic",
+        )
     size = len(text.encode("utf-8", errors="replace"))
     if not text.strip() or size > MAX_TEXT_BYTES:
         raise MessageError(
@@ -34,7 +40,10 @@ def calibration_text_from_message(message: StringMessage) -> str:
 
 def fill_calibration_text(message: StringMessage, text: str) -> None:
     """Set the text; raises :class:`InvalidValueError` where a receiver would refuse it."""
-    size = len(text.encode("utf-8"))
+    try:
+        size = len(text.encode("utf-8"))
+    except UnicodeEncodeError as error:
+        raise InvalidValueError("a calibration text with half a character") from error
     if not text.strip() or size > MAX_TEXT_BYTES:
         raise InvalidValueError(
             f"a calibration text of {size} bytes", expected=f"1 to {MAX_TEXT_BYTES} bytes"

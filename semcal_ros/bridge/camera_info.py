@@ -31,7 +31,8 @@ def fill_camera_info(
         The message to fill.
     camera
         The camera of this image, in any size: it is resized to the image's. None means
-        uncalibrated; a parallel projection (``rho <= 0``) has no finite K either. Both leave K, R
+        uncalibrated; a parallel projection (``rho <= 0``, or
+        hardly above) has no finite K either. Both leave K, R
         and P zero, which sensor_msgs defines as "uncalibrated"; the affine-safe matrix of
         :mod:`semcal_ros.bridge.projection` still describes a parallel projection.
     header
@@ -44,7 +45,10 @@ def fill_camera_info(
     message.distortion_model = "plumb_bob"
     k, r = np.zeros((3, 3)), np.zeros((3, 3))
     if camera is not None and camera.rho > 0.0:
-        k, r = camera.resized(width, height).K, np.eye(3)
+        with np.errstate(over="ignore"):
+            pinhole = camera.resized(width, height).K
+        if np.all(np.isfinite(pinhole)):
+            k, r = pinhole, np.eye(3)
     assign_floats(message, "d", np.zeros(5))
     assign_floats(message, "k", k)
     assign_floats(message, "r", r)

@@ -11,10 +11,14 @@ from typing import Any, Literal
 
 from semcal_ros.bridge.config_files import config_names, find_config_file, read_config_text
 from semcal_ros.bridge.config_parse import parse_mapping
+from semcal_ros.bridge.config_schema import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, IMAGE_TYPES
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.core.raster import ScanTiming
 
 __all__ = [
+    "COMPRESSED_IMAGE_TYPE",
+    "IMAGE_TYPE",
+    "IMAGE_TYPES",
     "ImageConfig",
     "MagnificationConfig",
     "MicroscopeConfig",
@@ -36,7 +40,8 @@ class ImageConfig:
     Parameters
     ----------
     topic, type
-        Where the frames arrive; a relative topic is resolved in the node's namespace.
+        Where the frames arrive, and one of :data:`IMAGE_TYPES`; a relative topic is resolved in the node's namespace.
+        The topic of compressed images is given in full, such as ``image_raw/compressed``.
     stamp
         The moment of the acquisition that the header stamp means.
     databar_rows
@@ -44,7 +49,7 @@ class ImageConfig:
     """
 
     topic: str = "image_raw"
-    type: str = "sensor_msgs/msg/Image"
+    type: str = IMAGE_TYPE
     stamp: StampMoment = "start"
     databar_rows: int = 0
 

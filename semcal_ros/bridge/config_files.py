@@ -60,7 +60,7 @@ def find_config_file(name_or_path: str | Path) -> Path:
     if path is not None:
         return path
     raise ConfigError(
-        f"no configuration {text!r}",
+        f"no configuration {text[:200]!r}",
         expected="the path of a YAML file or one of the names " + ", ".join(config_names()),
         do="check the spelling or copy msg_configs/generic.yaml",
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Hashable, Iterator
 from typing import Any, cast
@@ -16,15 +15,40 @@ from semcal_ros.core.errors import ConfigError
 __all__ = ["parse_mapping"]
 
 _MAX_SEEN = 80
+_MAX_KEY = 100
+# A value that its tag does not fit, such as ``!!bool maybe``, surfaces as any of these.
+_YAML_ERRORS = (
+    yaml.YAMLError,
+    ValueError,
+    LookupError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
+# Above every limit of the schema; integers of YAML may have any length, which NumPy and printing do not take.
+_MAX_NUMBER = 1e15
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader that reads ``25e-6`` as a number, as YAML 1.2 does, and refuses repeated keys."""
+    """Safe loader that reads ``25e-6`` as a number, as YAML 1.2 does, and refuses repeated keys.
+
+    Aliases are refused too: with them, a short text stands for exponentially much.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            mark = cast("Any", self).peek_event().start_mark
+            raise yaml.composer.ComposerError(None, None, "an alias is used", mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()
         for key_node, _ in node.value:
             key = str(key_node.value)
+            if len(key) > _MAX_KEY:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"a key has {len(key)} characters", key_node.start_mark
+                )
             if key in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key!r} is given twice", key_node.start_mark
@@ -50,13 +74,16 @@ def parse_mapping(text: str, source: str) -> dict[str, Any]:
         what was seen there and what was expected.
     """
     values = _load_yaml(text, source)
+    for path, number in _numbers(values):
+        if not -_MAX_NUMBER <= number <= _MAX_NUMBER:
+            raise ConfigError(
+                f"{source}: a number at key {path} that is infinite, none or enormous",
+                expected=f"a number below {_MAX_NUMBER:g}",
+            )
     validator = jsonschema.Draft202012Validator(CONFIG_SCHEMA)
     problems = sorted(validator.iter_errors(values), key=_problem_order)
     if problems:
         raise _config_error(problems[0], source)
-    for path, number in _numbers(values):
-        if not math.isfinite(number):
-            raise ConfigError(f"{source}: key {path} is {number}", expected="a finite number")
     checked: dict[str, Any] = values
     return checked
 
@@ -67,8 +94,8 @@ def _load_yaml(text: str, source: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f" in line {mark.line + 1}" if mark is not None else ""
-        seen = f"{source}: {error.problem or 'no YAML'}{line}"
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        seen = f"{source}: {(error.problem or 'no YAML')[:_MAX_SEEN]}{line}"
+    except _YAML_ERRORS as error:
         seen = f"{source}: {type(error).__name__} while reading YAML"
     raise ConfigError(seen, expected="a YAML file", do="compare with msg_configs/generic.yaml")
 
@@ -120,5 +147,5 @@ def _numbers(values: Any, path: str = "") -> Iterator[tuple[str, float]]:
     elif isinstance(values, list):
         for index, value in enumerate(values):
             yield from _numbers(value, f"{path}[{index}]")
-    elif isinstance(values, float):
+    elif isinstance(values, (int, float)):
         yield path, values

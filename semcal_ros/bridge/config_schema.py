@@ -7,7 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["CONFIG_SCHEMA"]
+__all__ = ["COMPRESSED_IMAGE_TYPE", "CONFIG_SCHEMA", "IMAGE_TYPE", "IMAGE_TYPES"]
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE_TYPE = "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
+"""Message types in which frames are accepted."""
 
 _TYPE_PATTERN = r"^[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*\Z"
 _TOPIC_PATTERN = r"^(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*\Z"
@@ -20,8 +25,10 @@ def _positive(what: str, maximum: float) -> dict[str, Any]:
     return {"type": "number", "exclusiveMinimum": 0, "maximum": maximum, "description": what}
 
 
+_MAX_NAME = 255
 _TOPIC = {
     "type": "string",
+    "maxLength": _MAX_NAME,
     "pattern": _TOPIC_PATTERN,
     "description": "a ROS topic name such as image_raw",
 }
@@ -32,8 +39,8 @@ _IMAGE: dict[str, Any] = {
     "properties": {
         "topic": _TOPIC,
         "type": {
-            "enum": ["sensor_msgs/msg/Image"],
-            "description": "sensor_msgs/msg/Image (compressed images are not supported)",
+            "enum": list(IMAGE_TYPES),
+            "description": " or ".join(IMAGE_TYPES),
         },
         "stamp": {
             "enum": ["start", "centre", "end"],
@@ -56,11 +63,13 @@ _MAGNIFICATION: dict[str, Any] = {
         "topic": _TOPIC,
         "type": {
             "type": "string",
+            "maxLength": _MAX_NAME,
             "pattern": _TYPE_PATTERN,
             "description": "a message type such as std_msgs/msg/Float64",
         },
         "field": {
             "type": "string",
+            "maxLength": _MAX_NAME,
             "pattern": _FIELD_PATTERN,
             "description": "a path of field names such as data, vector.x or position[0]",
         },
@@ -91,7 +100,8 @@ _SCAN: dict[str, Any] = {
         "averages": {
             "type": "integer",
             "minimum": 1,
-            "description": "the number of averaged passes, 1 or more",
+            "maximum": 1000000,
+            "description": "the number of averaged passes, 1 to 1000000",
         },
         "flyback_fraction": {
             "type": "number",
@@ -114,6 +124,7 @@ CONFIG_SCHEMA: dict[str, Any] = {
         "display_width_m": _positive("a positive display width in m, such as 0.12", 100.0),
         "frame_id": {
             "type": "string",
+            "maxLength": _MAX_NAME,
             "pattern": _FRAME_PATTERN,
             "description": "a frame name such as sem_optical",
         },

@@ -83,20 +83,27 @@ def _set_vector(vector: Any, x: float, y: float) -> None:
     vector.x, vector.y, vector.z = x, y, 0.0
 
 
+def _floats(values: ArrayLike, what: str) -> NDArray[np.float64]:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidValueError(f"a {what} that is no array of numbers") from error
+
+
 def _pair(values: ArrayLike, what: str) -> tuple[float, float]:
-    pair = np.asarray(values, dtype=np.float64)
+    pair = _floats(values, what)
     if pair.shape != (2,) or not np.all(np.isfinite(pair)):
         raise InvalidValueError(f"a {what} of {pair.tolist()}", expected="two finite numbers")
     return float(pair[0]), float(pair[1])
 
 
 def _block(covariance: ArrayLike, first: int) -> NDArray[np.float64]:
-    matrix = np.asarray(covariance, dtype=np.float64)
+    matrix = whole = _floats(covariance, "covariance")
     if matrix.shape == (4, 4):
         matrix = matrix[first : first + 2, first : first + 2]
     if matrix.shape != (2, 2) or not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
         raise InvalidValueError(
-            f"a covariance of shape {np.shape(covariance)} with block {matrix.tolist()}",
+            f"a covariance of shape {whole.shape}",
             expected="a finite (4, 4) or (2, 2) matrix with a diagonal that is not negative",
         )
     scale = float(np.max(np.abs(matrix)))

@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["assign_bytes", "assign_floats", "new_nested", "require_fields"]
+__all__ = [
+    "assign_bytes",
+    "assign_floats",
+    "byte_memory",
+    "new_nested",
+    "require_fields",
+    "whole_number",
+]
 
 
 def require_fields(message: Any, names: tuple[str, ...], type_name: str) -> None:
@@ -25,25 +32,44 @@ def require_fields(message: Any, names: tuple[str, ...], type_name: str) -> None
         )
 
 
-def assign_bytes(message: Any, name: str, values: NDArray[Any]) -> None:
-    """Copy the memory of a C-contiguous array into a ``uint8[]`` field.
+def whole_number(value: Any, what: str) -> int:
+    """``value`` as an int, or :class:`MessageError` where it is something else.
+
+    A recording may bring a definition of its own for a known type, so that a field has any type.
+    """
+    if not isinstance(value, (int, np.integer)):
+        raise MessageError(
+            f"{what} of type {type(value).__name__}",
+            expected="a whole number",
+            do="check the definition of the message type",
+        )
+    return int(value)
+
+
+def byte_memory(message: Any, name: str, size: int) -> NDArray[np.uint8]:
+    """(size,) writeable memory of a ``uint8[]`` field, with anything in it.
 
     rclpy takes an ``array.array('B')`` without looking at its elements; every other type is checked
     element by element, which costs milliseconds per image. An array that the message already has is
-    overwritten if its length fits: a node that keeps one output message then pays for no new
-    memory, whose first touch costs more than the copy.
+    used again if its length fits: a node that keeps one output message then pays for no new memory,
+    whose first touch costs more than a copy.
     """
-    flat = values.reshape(-1).view(np.uint8)
     old = getattr(message, name)
     if isinstance(old, np.ndarray):
-        setattr(message, name, flat.copy())
-        return
-    if isinstance(old, array.array) and old.typecode == "B" and len(old) == flat.size > 0:
-        np.frombuffer(old, dtype=np.uint8)[:] = flat
-        return
-    data = array.array("B")
-    data.frombytes(flat.data)
-    setattr(message, name, data)
+        new = np.empty(size, dtype=np.uint8)
+        setattr(message, name, new)
+        return new
+    if not (isinstance(old, array.array) and old.typecode == "B" and len(old) == size):
+        setattr(message, name, array.array("B", bytes(size)))
+        # rclpy may have taken a copy.
+        old = getattr(message, name)
+    return np.frombuffer(old, dtype=np.uint8) if size else np.empty(0, np.uint8)
+
+
+def assign_bytes(message: Any, name: str, values: NDArray[Any]) -> None:
+    """Copy the memory of a C-contiguous array into a ``uint8[]`` field."""
+    flat = values.reshape(-1).view(np.uint8)
+    byte_memory(message, name, flat.size)[:] = flat
 
 
 def assign_floats(message: Any, name: str, values: ArrayLike) -> None:

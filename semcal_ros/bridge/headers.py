@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from semcal_ros.bridge.fields import whole_number
 from semcal_ros.bridge.protocols import HeaderMessage, StampMessage
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
@@ -19,7 +20,8 @@ def stamp_ns_from_msg(message: Any) -> int:
     Raises
     ------
     MessageError
-        There is no stamp, or its nanoseconds are not below one second.
+        There is no stamp, or its numbers are not those of a time: 32-bit seconds, and nanoseconds
+        below one second.
     """
     stamp = _find_stamp(message)
     if stamp is None:
@@ -27,10 +29,14 @@ def stamp_ns_from_msg(message: Any) -> int:
             f"a message of type {type(message).__name__} without a stamp",
             expected="a message with a header",
         )
-    nanosec = int(stamp.nanosec)
+    sec, nanosec = whole_number(stamp.sec, "seconds"), whole_number(stamp.nanosec, "nanoseconds")
     if not 0 <= nanosec < _NS_PER_S:
         raise MessageError(f"a stamp with {nanosec} ns", expected="nanoseconds below 1000000000")
-    return int(stamp.sec) * _NS_PER_S + nanosec
+    if not _SEC_MIN <= sec <= _SEC_MAX:
+        raise MessageError(
+            f"a stamp of {sec} s", expected="seconds that fit a 32-bit signed integer"
+        )
+    return sec * _NS_PER_S + nanosec
 
 
 def optional_stamp_ns(message: Any) -> int | None:

@@ -96,3 +96,8 @@ class ZeroOrderHold(Generic[T]):
         """Stamp of the value that :meth:`at` returns, or None."""
         place = bisect_right(self._stamps, stamp_ns)
         return self._stamps[place - 1] if place else None
+
+    def between(self, start_ns: int, end_ns: int) -> list[T]:
+        """Values that began in ``start_ns`` < stamp <= ``end_ns``, oldest first."""
+        first, last = bisect_right(self._stamps, start_ns), bisect_right(self._stamps, end_ns)
+        return self._values[first:last]

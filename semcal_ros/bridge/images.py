@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.fields import assign_bytes, require_fields
+from semcal_ros.bridge.fields import byte_memory, require_fields, whole_number
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.protocols import HeaderMessage, ImageMessage
 from semcal_ros.core.errors import InvalidValueError, MessageError
@@ -21,6 +21,7 @@ __all__ = [
     "PixelFormat",
     "fill_image",
     "image_from_message",
+    "pixel_memory",
     "to_gray",
     "without_databar",
 ]
@@ -74,7 +75,10 @@ def image_from_message(message: ImageMessage) -> NDArray[Any]:
     """
     require_fields(message, _FIELDS, "sensor_msgs/msg/Image")
     pixel = _pixel_format(message.encoding)
-    height, width, step = int(message.height), int(message.width), int(message.step)
+    height, width, step, big_endian = (
+        whole_number(getattr(message, name), name)
+        for name in ("height", "width", "step", "is_bigendian")
+    )
     row_bytes = width * pixel.bytes_per_pixel
     data = _byte_view(message.data)
     _check_layout(height, width, step, data.size, message.encoding, row_bytes)
@@ -83,16 +87,16 @@ def image_from_message(message: ImageMessage) -> NDArray[Any]:
     if pixel.dtype.itemsize == 1:
         image = _split_channels(rows, pixel.channels)
     else:
-        image = _wide_pixels(rows, pixel.dtype, bool(message.is_bigendian)).reshape(shape)
+        image = _wide_pixels(rows, pixel.dtype, big_endian != 0).reshape(shape)
     image.flags.writeable = False
     return image
 
 
 def _pixel_format(encoding: str) -> PixelFormat:
-    pixel = ENCODINGS.get(encoding)
+    pixel = ENCODINGS.get(encoding) if isinstance(encoding, str) else None
     if pixel is None:
         raise MessageError(
-            f"an image with encoding {encoding[:40]!r}",
+            f"an image with encoding {str(encoding)[:40]!r}",
             expected="one of " + ", ".join(ENCODINGS),
             do="convert the stream, for example with image_proc, or change the driver's setting",
         )
@@ -210,23 +214,50 @@ def fill_image(
     InvalidValueError
         Shape or type of the image do not fit the encoding.
     """
+    np.copyto(pixel_memory(message, image, encoding, header), image)
+
+
+def pixel_memory(
+    message: ImageMessage, like: NDArray[Any], encoding: str, header: HeaderMessage
+) -> NDArray[Any]:
+    """Set every field of an image message but the pixels, and give their memory to write to.
+
+    Parameters
+    ----------
+    message
+        The message. One that is used again for an image of the same size keeps its memory, so what
+        was given for it before changes with it.
+    like
+        Array of the shape and type that the image will have; those of ``encoding``.
+    encoding, header
+        As for :func:`fill_image`.
+
+    Returns
+    -------
+    Writeable array of the shape of ``like``, in the byte order of this machine, with anything in
+    it.
+
+    Raises
+    ------
+    InvalidValueError
+        As :func:`fill_image`.
+    """
     pixel = ENCODINGS.get(encoding)
     if pixel is None:
         raise InvalidValueError(
             f"image encoding {encoding!r}", expected="one of " + ", ".join(ENCODINGS)
         )
-    dimensions_fit = (
-        image.ndim == 2 if pixel.channels == 1 else image.shape[2:] == (pixel.channels,)
-    )
-    if not dimensions_fit or image.size == 0 or image.dtype.newbyteorder("=") != pixel.dtype:
+    dimensions_fit = like.ndim == 2 if pixel.channels == 1 else like.shape[2:] == (pixel.channels,)
+    if not dimensions_fit or like.size == 0 or like.dtype.newbyteorder("=") != pixel.dtype:
         raise InvalidValueError(
-            f"an image of shape {image.shape} and type {image.dtype} for encoding {encoding}",
+            f"an image of shape {like.shape} and type {like.dtype} for encoding {encoding}",
             expected=f"a non-empty {pixel.dtype} image with {pixel.channels} channel(s)",
         )
-    native = np.ascontiguousarray(image, dtype=pixel.dtype)
     copy_header(message.header, header)
-    message.height, message.width = int(image.shape[0]), int(image.shape[1])
+    message.height, message.width = int(like.shape[0]), int(like.shape[1])
     message.encoding = encoding
     message.is_bigendian = int(sys.byteorder == "big")
     message.step = message.width * pixel.bytes_per_pixel
-    assign_bytes(message, "data", native)
+    memory = byte_memory(message, "data", like.size * pixel.dtype.itemsize)
+    pixels: NDArray[Any] = memory.view(pixel.dtype).reshape(like.shape)
+    return pixels

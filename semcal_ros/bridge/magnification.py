@@ -162,7 +162,7 @@ def _field(message: Any, path: str, type_name: str) -> Any:
 def _element(values: Any, index: int, path: str) -> Any:
     try:
         return values[index]
-    except (IndexError, TypeError) as error:
+    except (LookupError, TypeError, OverflowError) as error:
         size = len(values) if hasattr(values, "__len__") else "no"
         raise MessageError(
             f"field {path} with {size} elements", expected=f"at least {index + 1} elements"

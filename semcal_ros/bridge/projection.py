@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.fields import assign_floats, new_nested
+from semcal_ros.bridge.fields import assign_floats, new_nested, whole_number
 from semcal_ros.bridge.protocols import MultiArrayMessage
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import MessageError
@@ -47,11 +47,17 @@ def projection_from_message(message: MultiArrayMessage) -> NDArray[np.float64]:
     MessageError
         The array has another size or holds values that are not finite.
     """
-    values = np.array(message.data, dtype=np.float64)
-    offset = int(message.layout.data_offset)
-    if values.size - offset != 12 or not np.all(np.isfinite(values[offset:])):
+    offset = whole_number(message.layout.data_offset, "data_offset")
+    try:
+        values = np.array(message.data, dtype=np.float64)
+    except (TypeError, ValueError) as error:
         raise MessageError(
-            f"a projection of {values.size - offset} numbers",
+            f"a projection of type {type(message.data).__name__}", expected="12 finite numbers"
+        ) from error
+    fits = values.ndim == 1 and 0 <= offset == values.size - 12
+    if not (fits and np.all(np.isfinite(values[offset:]))):
+        raise MessageError(
+            f"a projection of {values.size} numbers from number {offset} on",
             expected="12 finite numbers, 3 rows of 4",
         )
     return values[offset:].reshape(3, 4)

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from semcal_ros.bridge.parameters import value_of
 from semcal_ros.calibration import Calibration
@@ -36,9 +37,14 @@ def command(calibration: Path, magnification: float, as_json: bool) -> None:
         _tell(camera, model)
 
 
+def _sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Of an exactly known parameter, rounding may leave a variance of less than nothing.
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
 def _as_dict(camera: ScanCamera, model: Calibration) -> dict[str, Any]:
     assert camera.covariance is not None
-    sigma = np.sqrt(np.diag(camera.covariance))
+    sigma = _sigma(camera.covariance)
     perspective = camera.rho > 0.0
     return {
         "magnification": camera.magnification,
@@ -68,7 +74,7 @@ def _matrix(name: str, values: Any) -> str:
 def _tell(camera: ScanCamera, model: Calibration) -> None:
     assert camera.covariance is not None
     (x, y), (sx, sy) = camera.pixel_size_m, camera.pixel_size_sigma_m
-    sigma = dict(zip(PARAMETER_NAMES, np.sqrt(np.diag(camera.covariance)), strict=True))
+    sigma = dict(zip(PARAMETER_NAMES, _sigma(camera.covariance), strict=True))
     low, high = model.magnification_range
     click.echo(f"magnification {camera.magnification:g}, image {camera.width} x {camera.height} px")
     click.echo(f"nm per px      {1e9 / camera.m:.4f} (mean of both axes)")

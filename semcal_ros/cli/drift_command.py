@@ -101,7 +101,7 @@ def command(
         click.echo(rate_text(path))
     if forecast is not None:
         then_s = float(path.time_s[-1]) + forecast
-        click.echo(forecast_text(follower.tracker.forecast(then_s), forecast))
+        click.echo(forecast_text(follower.tracker.outlook().at(then_s), forecast))
     click.echo(f"drift: {output}")
     if plot is not None:
         click.echo(f"plot: {plot}")

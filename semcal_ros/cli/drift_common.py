@@ -16,8 +16,9 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.drift_history import DriftHistory
+from semcal_ros.core.drift_outlook import DriftForecast
 from semcal_ros.core.drift_path import DriftPath, path_of_updates
-from semcal_ros.core.drift_types import DriftForecast, DriftUpdate
+from semcal_ros.core.drift_types import DriftUpdate
 from semcal_ros.core.frame_time import LEFT_IN, REMOVED, estimate_frame_time
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.files.recordings import Frame

@@ -16,11 +16,14 @@ __all__ = ["main"]
 _COMMANDS = {
     "at": "camera at a magnification: K, P, distortion, nm per pixel",
     "calibrate": "calibrate from a recording of the chess grid",
+    "doctor": "what keeps a live stream from working",
     "drift": "specimen drift of a recording, as a table",
     "evaluate": "reprojection error of a calibration on a recording",
     "import": "make a bag from a folder of SEM TIFF files",
     "info": "what a recording contains",
+    "measure": "measurements in nanometres: bending of a cantilever",
     "play": "replay a recording as ROS topics",
+    "reconstruct": "shape of a ball that is turned under the beam",
     "rectify": "drift-free, undistorted copy of a recording",
     "simulate": "record the virtual SEM to a bag, with its truth",
     "stack": "drift-corrected average of a recording, and a stabilised video",
@@ -34,7 +37,14 @@ class _Group(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return None
-        module = import_module(f"semcal_ros.cli.{cmd_name}_command")
+        try:
+            module = import_module(f"semcal_ros.cli.{cmd_name}_command")
+        except ImportError as error:
+            raise SemcalError(
+                f"semcal {cmd_name} cannot be loaded ({error})",
+                expected="the packages of requirements/base.txt, in versions that fit each other",
+                do="run `make setup`, or install them anew",
+            ) from error
         command: click.Command = module.command
         return command
 

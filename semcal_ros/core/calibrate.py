@@ -145,6 +145,7 @@ def calibrate_views(
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
     residual: str = "auto",
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> CalibrationResult:
     """Calibrate the microscope from views of a planar grid.
 
@@ -170,6 +171,9 @@ def calibrate_views(
     residual
         Whether a residual field describes what the distortion parameters cannot (only ``"joint"``): ``"on"``,
         ``"off"``, or ``"auto"``, where cross-validation decides.
+    on_stage
+        Called with the name of what begins and the fraction of the work that is done, 0 to 1 (only ``"joint"``, which
+        begins anew after leaving out views).
 
     Raises
     ------
@@ -189,7 +193,7 @@ def calibrate_views(
         raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
     outliers: tuple[OutlyingView, ...] = ()
     if method == "joint":
-        fit, setup, outliers = _fit_joint(setup, residual)
+        fit, setup, outliers = _fit_joint(setup, residual, on_stage)
         fitted = _about_joint(setup, fit)
     elif residual == "on":
         raise InvalidValueError(f"a residual field with method {method}", expected='method "joint"')
@@ -244,11 +248,13 @@ def _model(
     )
 
 
-def _fit_joint(setup: Setup, residual: str) -> tuple[JointFit, Setup, tuple[OutlyingView, ...]]:
+def _fit_joint(
+    setup: Setup, residual: str, on_stage: Callable[[str, float], None]
+) -> tuple[JointFit, Setup, tuple[OutlyingView, ...]]:
     """The adjustment without the views that disagree with the others, and these."""
     outliers: list[OutlyingView] = []
     while True:
-        fit = fit_joint(setup, residual)
+        fit = fit_joint(setup, residual, on_stage)
         reasons = outlying_views(fit.problem, fit.result)
         if not reasons:
             return fit, setup, tuple(outliers)

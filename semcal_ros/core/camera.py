@@ -184,8 +184,10 @@ class ScanCamera:
         jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
         if self.residual is None:
             return jacobians.d_parameters
-        known = np.all(np.isfinite(jacobians.xy), axis=1)
+        known = np.flatnonzero(np.all(np.isfinite(jacobians.xy), axis=1))
         q = self._normalised(self._with_residual(jacobians.xy[known]))
+        found = np.all(np.isfinite(q), axis=1)
+        known, q = known[found], q[found]
         size = self.residual.coefficients.size
         own = np.zeros((len(q), 2, 10 + size))
         own[:, :, :10] = jacobians.d_parameters[known]

@@ -29,7 +29,8 @@ from semcal_ros.core.drift_look import Found, joins, look
 from semcal_ros.core.drift_map import still
 from semcal_ros.core.drift_measure import at_itself, becoming_keyframe, bow_s2, loosened
 from semcal_ros.core.drift_operations import Drop, Measure, Move
-from semcal_ros.core.drift_types import DriftForecast, DriftSettings, DriftUpdate
+from semcal_ros.core.drift_outlook import DriftForecast, DriftOutlook
+from semcal_ros.core.drift_types import DriftSettings, DriftUpdate
 from semcal_ros.core.drift_uncertainty import carry_covariance, centre_covariance, scale_covariance
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.keyframe import keyframe_of
@@ -38,7 +39,7 @@ from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.registration import Registration
 from semcal_ros.core.shot import Shot, Stills, resampleable
 
-__all__ = ["DriftForecast", "DriftSettings", "DriftTracker", "DriftUpdate"]
+__all__ = ["DriftForecast", "DriftOutlook", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 Array = NDArray[np.float64]
 
@@ -384,16 +385,15 @@ class DriftTracker:
 
     # -- other times ------------------------------------------------------------------------------
 
-    def forecast(self, time_s: float) -> DriftForecast:
-        """Drift at a time after the last frame's.
+    def outlook(self) -> DriftOutlook:
+        """What is known now of the drift at times after the last frame's.
 
         Raises
         ------
         InvalidValueError
-            If there was no frame yet, or the time is before the last one's.
+            If there was no frame yet.
         """
         if self._filter is None or self._last is None:
             raise InvalidValueError("a forecast before the first frame", expected="a frame before")
-        state = self._filter.forecast(time_s)
-        scale = scale_covariance(self._last[0], state.position, state.velocity)
-        return DriftForecast(time_s, state.position, state.velocity, state.own + scale)
+        state = self._filter.state.without_keyframes()
+        return DriftOutlook(state, self._filter.restlessness, self._last[0])

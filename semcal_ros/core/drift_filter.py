@@ -146,7 +146,3 @@ class DriftFilter:
         least = 3.0 * _LEAST_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
         psd = max(self.restlessness.psd * float(np.exp(_PACE * excess)), least)
         self.restlessness = replace(self.restlessness, psd=psd)
-
-    def forecast(self, time_s: float) -> DriftMap:
-        """The state at a later time, from what is known now."""
-        return Move(time_s)(self.state, self.restlessness)

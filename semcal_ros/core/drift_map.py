@@ -103,6 +103,10 @@ class DriftMap:
         row[:, :2], row[:, at : at + 2] = np.eye(2), -np.eye(2)
         return row @ self.mean, row @ self.covariance @ row.T
 
+    def without_keyframes(self) -> DriftMap:
+        """The same drift with nothing to compare pictures with: small, for what needs no more."""
+        return DriftMap(self.time_s, self.mean[:OWN].copy(), self.covariance[:OWN, :OWN].copy())
+
 
 def still(time_s: float, centre_covariance: Array | None = None) -> DriftMap:
     """The beginning: no drift, by definition, and no velocity known yet.

@@ -89,8 +89,10 @@ class Move(Operation):
         step = _same(state)
         if dt > 0.0:
             move, noise = restlessness.over(dt)
-            step.matrix[:MOVING, :MOVING] = np.kron(move, np.eye(2))
-            step.covariance[:MOVING, :MOVING] = np.kron(noise, np.eye(2))
+            for axis in (0, 1):
+                of_axis = slice(axis, MOVING, 2)
+                step.matrix[of_axis, of_axis] = move
+                step.covariance[of_axis, of_axis] = noise
         return replace(step, time_s=self.time_s)
 
 

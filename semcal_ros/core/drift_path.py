@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.drift_types import DriftUpdate
-from semcal_ros.core.rectify import RasterDrift
+from semcal_ros.core.raw_map import RasterDrift
 
 __all__ = ["DriftPath", "path_of_updates"]
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.rectify import RasterDrift
+from semcal_ros.core.raw_map import RasterDrift
 from semcal_ros.core.reference import RegistrationSettings
 
-__all__ = ["DriftForecast", "DriftSettings", "DriftUpdate", "kind_of"]
+__all__ = ["DriftSettings", "DriftUpdate", "kind_of"]
 
 Array = NDArray[np.float64]
 
@@ -157,23 +157,3 @@ class DriftUpdate:
     def raster(self) -> RasterDrift:
         """The drift during this frame, as :class:`~semcal_ros.core.rectify.Rectifier` wants it."""
         return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
-
-
-@dataclass(frozen=True)
-class DriftForecast:
-    """Drift at another time, from what is known now.
-
-    Attributes
-    ----------
-    time_s
-        Time of the forecast.
-    drift_m, velocity_m_s
-        (2,) as in :class:`DriftUpdate`.
-    covariance
-        (4, 4) of ``[x, y, vx, vy]``.
-    """
-
-    time_s: float
-    drift_m: Array
-    velocity_m_s: Array
-    covariance: Array

@@ -21,17 +21,18 @@ Array = NDArray[np.float64]
 _SCALES, _CENTRE = slice(0, 3), slice(3, 5)
 
 
-def _scale_jacobian(camera: ScanCamera, vector: Array) -> Array:
-    """(2, 3) derivative by m, aspect and skew of a length in the sem frame that spans given
+def _scale_jacobian(camera: ScanCamera, *vectors: Array) -> Array:
+    """(2 n, 3) derivative by m, aspect and skew of n lengths in the sem frame that span given
     pixels.
     """
     m, a, s = camera.m, camera.aspect, camera.skew
-    x, y = vector
-    by_m = np.array([a * x + s * y, y / a])
-    by_aspect = m * np.array([x, -y / a**2])
-    by_skew = m * np.array([y, 0.0])
-    pixels = np.stack([by_m, by_aspect, by_skew], axis=1)
-    return np.asarray(-np.linalg.solve(camera.ideal_from_sem_jacobian, pixels))
+    u: list[float] = []
+    v: list[float] = []
+    for x, y in (vector.tolist() for vector in vectors):
+        u += (a * x + s * y, m * x, m * y)
+        v += (y / a, -m * y / a**2, 0.0)
+    by = -np.linalg.solve(camera.ideal_from_sem_jacobian, np.array([u, v]))
+    return np.asarray(by.reshape(2, -1, 3).swapaxes(0, 1).reshape(-1, 3))
 
 
 def scale_covariance(camera: ScanCamera | None, drift: Array, velocity: Array) -> Array:
@@ -41,7 +42,7 @@ def scale_covariance(camera: ScanCamera | None, drift: Array, velocity: Array) -
     """
     if camera is None or camera.covariance is None:
         return np.zeros((4, 4))
-    jacobian = np.vstack([_scale_jacobian(camera, drift), _scale_jacobian(camera, velocity)])
+    jacobian = _scale_jacobian(camera, drift, velocity)
     return np.asarray(jacobian @ camera.covariance[_SCALES, _SCALES] @ jacobian.T)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.polynomial import chebyshev, legendre
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -46,15 +46,22 @@ def _ode_row(value: float, weights: Array) -> Array:
     return np.asarray(expm(companion * value)[0], dtype=np.float64)
 
 
+def _chebyshev_row(value: float, size: int) -> Array:
+    """First Chebyshev polynomials by their recurrence: at one place faster than numpy's for many."""
+    row = [1.0, value]
+    while len(row) < size:
+        row.append(2.0 * value * row[-1] - row[-2])
+    return np.array(row[:size])
+
+
 def basis_row(kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array) -> Array:
     """(size,) values of the basis functions at a magnification inside of ``g_range``."""
     low, high = g_range
     if kind == "chebyshev_log":
         u = _unit_interval(np.log(g), np.log(low), np.log(high))
-        return np.asarray(chebyshev.chebvander(u, size - 1), dtype=np.float64).reshape(size)
+        return _chebyshev_row(float(u), size)
     if kind == "chebyshev":
-        u = _unit_interval(g, low, high)
-        return np.asarray(chebyshev.chebvander(u, size - 1), dtype=np.float64).reshape(size)
+        return _chebyshev_row(float(_unit_interval(g, low, high)), size)
     if kind == "legendre":
         u = _unit_interval(g, low, high)
         return np.asarray(legendre.legvander(u, size - 1), dtype=np.float64).reshape(size)

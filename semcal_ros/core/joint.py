@@ -6,7 +6,7 @@ from its neighbours and nothing has to be interpolated afterwards (design sectio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -334,18 +334,25 @@ def _adjusted(setup: Setup, stage: _Stage, theta: Array, *, choosing: bool) -> _
     return replace(stage, functions=functions, problem=problem, result=result)
 
 
-def fit_joint(setup: Setup, residual: str = "off") -> JointFit:
+def fit_joint(
+    setup: Setup,
+    residual: str = "off",
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
+) -> JointFit:
     """Calibrate from nominal values alone.
 
     The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
     both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
     one magnification at a time, until the choice no longer changes. With ``residual`` ``"on"``, or ``"auto"`` where
-    cross-validation finds it worthwhile, a residual field is estimated with them.
+    cross-validation finds it worthwhile, a residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
     """
     thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
-    stage = _selected(setup, *_started(thin))
-    field = None
+    on_stage("start values", 0.0)
+    start = _started(thin)
+    on_stage("number of coefficients", 0.3)
+    stage, field = _selected(setup, *start), None
     if residual != "off":
+        on_stage("residual field", 0.5)
         stage, field = _with_field(setup, stage, residual == "on")
     excess = excess_sigma_px(setup.views, stage.result.residuals_px, 6 * len(setup.views))
     if excess > 0.0:
@@ -354,6 +361,7 @@ def fit_joint(setup: Setup, residual: str = "off") -> JointFit:
     if excess > 0.0:
         height = _height_sigma(setup, stage.result)
         stage = _selected(final, stage.functions, stage.result.state, height, _sizes_of(stage))
+    on_stage("final adjustment", 0.75)
     stage = _finished(final, stage)
     if field is not None:
         system = field_system(setup, stage.problem, stage.result, field.field)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.reference import Reference, Region, RegistrationSettings
-from semcal_ros.core.registration import Registration, prepare_reference
+from semcal_ros.core.registration import Registration, gray_of, prepare_reference
 from semcal_ros.core.shot import Shot
 from semcal_ros.core.subpixel import FINE, sampled
 
@@ -70,7 +70,7 @@ class Keyframe:
         self, picture: NDArray[np.generic], region: Region, registration: Registration
     ) -> Keyframe:
         """The keyframe with another frame in its mean, where the two overlap."""
-        gray = _gray(picture)
+        gray = np.asarray(gray_of(picture), dtype=np.float32)
         shift = registration.shift_px
         whole = np.floor(shift).astype(int)
         spans = []
@@ -97,17 +97,13 @@ class Keyframe:
         return replace(self, mean=mean, averaged=self.averaged + 1)
 
 
-def _gray(picture: NDArray[np.generic]) -> NDArray[np.float32]:
-    if picture.ndim == 3:
-        return np.asarray(picture.mean(axis=2), dtype=np.float32)
-    return np.asarray(picture, dtype=np.float32)
-
-
 def keyframe_of(
     shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
 ) -> Keyframe:
     """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
-    return Keyframe(shot, removed.copy(), _gray(picture).copy(), region, time_s)
+    return Keyframe(
+        shot, removed.copy(), np.array(gray_of(picture), dtype=np.float32), region, time_s
+    )
 
 
 def scale_ratio(before: Shot, now: Shot) -> float:

@@ -26,6 +26,7 @@ __all__ = [
     "Region",
     "Registration",
     "RegistrationSettings",
+    "gray_of",
     "prepare_reference",
     "register",
 ]
@@ -93,7 +94,14 @@ class Registration:
     nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
 
 
-def _gray(image: ArrayLike) -> Picture:
+def gray_of(image: ArrayLike) -> Picture:
+    """The mean of the channels, in a type that can be compared.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no picture.
+    """
     picture = np.asarray(image)
     if picture.ndim == 3 and picture.shape[2] == 3:
         return np.asarray(picture.mean(axis=2, dtype=np.float32))
@@ -106,7 +114,7 @@ def _gray(image: ArrayLike) -> Picture:
 
 
 def _cropped(image: ArrayLike, region: Region | None) -> tuple[Picture, Region]:
-    gray = _gray(image)
+    gray = gray_of(image)
     height, width = gray.shape
     if region is None:
         region = (0, 0, width, height)

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 # Gauss-Legendre quadrature, and up to how many memories it is used.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _MEMORIES = 4.0
+# Of a time: where the quadrature looks, and all of it.
+_PARTS = np.append(0.5 * (_NODES + 1.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,12 @@ class Restlessness:
         doublings = max(0, int(np.ceil(np.log2(max(dt_s * rate, 1e-300) / _MEMORIES))))
         part_s = dt_s / 2.0**doublings
         # What is left of an acceleration, and what it has done to velocity and drift, after a time.
+        effects = _of_acceleration(part_s * _PARTS, rate)
         move = np.eye(3)
-        move[:, 2] = _of_acceleration(np.array([part_s]), rate)[:, 0]
+        move[:, 2] = effects[:, -1]
         move[0, 1] = part_s
         # The noise that enters with some time left acts for that time.
-        acted = _of_acceleration(0.5 * part_s * (_NODES + 1.0), rate)
+        acted = effects[:, :-1]
         noise = (acted * (0.5 * part_s * _WEIGHTS)) @ acted.T
         for _ in range(doublings):
             noise = move @ noise @ move.T + noise

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, Rectifier, camera_key, raw_from_output
+from semcal_ros.core.raw_map import RasterDrift, camera_key, raw_from_output
+from semcal_ros.core.rectify import Rectifier
 from semcal_ros.core.reference import Region
 
 __all__ = ["Shot", "Stills", "resampleable"]

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, Rectifier
+from semcal_ros.core.raw_map import RasterDrift
+from semcal_ros.core.rectify import Rectifier
 
 __all__ = ["Stack", "StackedImage", "scanned"]
 

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import tempfile
 from pathlib import Path
 
 __all__ = ["atomic_write_bytes", "atomic_write_text"]
 
 _NEW_FILE_MODE = 0o666
+# A temporary name longer than what file systems take would refuse names that are themselves short enough.
+_NAME_PART = 100
 
 
 def _mode_for(path: Path) -> int:
     """Permission bits of the finished file: those of the file it replaces, else the usual ones."""
     try:
-        return path.stat().st_mode & 0o7777
+        mode = path.stat().st_mode
     except FileNotFoundError:
         mask = os.umask(0)
         os.umask(mask)
         return _NEW_FILE_MODE & ~mask
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        # Moving a file over a device or a pipe would remove it for everybody.
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    return stat.S_IMODE(mode)
 
 
 def atomic_write_bytes(path: Path, data: bytes) -> None:
@@ -31,11 +41,14 @@ def atomic_write_bytes(path: Path, data: bytes) -> None:
     Raises
     ------
     OSError
-        The folder is missing or not writable, or the disk is full; an existing file is untouched.
+        The folder is missing or not writable, the disk is full, or ``path`` is a folder, a device or a pipe; what
+        exists is untouched.
     """
     target = Path(os.path.realpath(path))
     mode = _mode_for(target)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    handle, name = tempfile.mkstemp(
+        prefix=f".{target.name[:_NAME_PART]}.", suffix=".tmp", dir=target.parent
+    )
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import apsw
-from rosbags.rosbag2 import ReaderError, WriterError
+from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
 from ruamel.yaml.error import YAMLError
@@ -21,7 +21,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports.zstd import ZstdError
 
-__all__ = ["LIBRARY_ERRORS", "one_line", "reading", "unreadable"]
+__all__ = ["LIBRARY_ERRORS", "check_types", "one_line", "reading", "unreadable"]
 
 # Damaged bytes surface from the parsers as many kinds of errors: lengths that overflow, unknown
 # keys, failed internal checks. The lz4 backend has no error class but RuntimeError. These are only
@@ -48,12 +48,36 @@ LIBRARY_ERRORS: tuple[type[Exception], ...] = (
 )
 
 _MAX_REASON = 200
+_MAX_NAME = 255  # of DDS
 
 
 def one_line(error: BaseException) -> str:
     """Short description of a library's error without line breaks, never empty."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
+
+
+def check_types(reader: Reader) -> None:
+    """Raise where an open reader has values that the library does not look at.
+
+    Columns of sqlite3 and values of YAML have any type and length.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A name is no text or too long, or the list of files is none.
+    """
+    files = getattr(reader.storage, "files", [])
+    if not isinstance(files, list):
+        # Else the library could not close what it opened.
+        setattr(reader.storage, "files", [])  # noqa: B010
+        raise TypeError(f"the list of files is a {type(files).__name__}")
+    for connection in reader.connections:
+        if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+            raise TypeError(f"topic {connection.topic!r} of type {connection.msgtype!r}")
+        longest = max(len(connection.topic), len(connection.msgtype))
+        if longest > _MAX_NAME:
+            raise ValueError(f"a name of a topic or type of {longest} characters")
 
 
 def unreadable(path: Path, error: BaseException, what: str = "") -> BagError:

@@ -16,16 +16,18 @@ from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
     MessageDefinitionFormat,
+    Nodetype,
     QosDurability,
 )
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from semcal_ros.core.errors import BagError
-from semcal_ros.files.bag_errors import LIBRARY_ERRORS, one_line, reading, unreadable
+from semcal_ros.core.errors import BagError, CalibrationFileError
+from semcal_ros.files.bag_errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
 from semcal_ros.files.bag_writer import BagWriter
 from semcal_ros.files.messages import blank_message, jazzy_types
+from semcal_ros.files.plain_yaml import check_plain_yaml
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -43,6 +45,7 @@ __all__ = [
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"
+_MAX_UNROLLED = 1000
 _IDL_RULE = "=" * 80 + "\n"
 
 
@@ -109,7 +112,12 @@ def _locate(path: Path) -> Path:
             )
         return _checked_name(path, [path])
     files = _storage_files(path)
-    if (path / "metadata.yaml").exists():
+    metadata = path / "metadata.yaml"
+    if metadata.exists():
+        try:
+            check_plain_yaml(metadata.read_text(encoding="utf-8"), str(metadata))
+        except CalibrationFileError as error:
+            raise BagError(error.seen, expected="metadata as a recorder writes them") from error
         return _checked_name(path, files)
     if len(files) == 1:
         return _checked_name(files[0], files)
@@ -148,11 +156,16 @@ class BagReader:
         with reading(path):
             self._reader = Reader(_locate(path))
             self._reader.open()
-            self._connections = list(self._reader.connections)
-            self.topics: tuple[BagTopic, ...] = _topic_table(self._connections)
-            self._start_ns = int(self._reader.start_time)
-            self._end_ns = int(self._reader.end_time)
-            self.message_count = int(self._reader.message_count)
+            try:
+                check_types(self._reader)
+                self._connections = list(self._reader.connections)
+                self.topics: tuple[BagTopic, ...] = _topic_table(self._connections)
+                self._start_ns = int(self._reader.start_time)
+                self._end_ns = int(self._reader.end_time)
+                self.message_count = int(self._reader.message_count)
+            except BaseException:
+                self._reader.close()
+                raise
         self._stores: dict[str, Typestore] = {}
 
     def __enter__(self) -> Self:
@@ -228,6 +241,13 @@ class BagReader:
                 return
             except LIBRARY_ERRORS as error:
                 raise unreadable(self.path, error) from error
+            if not (isinstance(item[1], int) and isinstance(item[2], bytes)):
+                raise BagError(
+                    f"a message on {item[0].topic} in {self.path} of type {type(item[2]).__name__} "
+                    f"at a time of type {type(item[1]).__name__}",
+                    expected="bytes and whole nanoseconds",
+                    do="copy the recording again",
+                )
             yield item
 
     def _check_delivered(self, chosen: list[Connection], seen: dict[str, int]) -> None:
@@ -302,13 +322,14 @@ def _store_of(connection: Connection, path: Path) -> Typestore:
     encoding = getattr(connection.ext, "serialization_format", "cdr")
     if encoding != "cdr":
         raise BagError(
-            f"messages on {connection.topic} in {path} are {encoding!r}", expected="'cdr'"
+            f"messages on {connection.topic} in {path} are {str(encoding)[:40]!r}", expected="'cdr'"
         )
     jazzy = jazzy_types()
     known = connection.msgtype in jazzy.fielddefs
     if known and connection.digest and connection.digest == jazzy.hash_rihs01(connection.msgtype):
         return jazzy
     own = _own_types(connection)
+    _check_arrays(own, f"{connection.msgtype} on {connection.topic} in {path}")
     if not own:
         if known:
             return jazzy
@@ -337,6 +358,20 @@ def _own_types(connection: Connection) -> dict[str, Any]:
             )
         return types
     return {}
+
+
+def _check_arrays(types: dict[str, Any], what: str) -> None:
+    """Refuse arrays of texts or messages of enormous fixed length: the library writes code for each element."""
+    for _, fields in types.values():
+        for name, (kind, detail) in fields:
+            if kind != Nodetype.ARRAY:
+                continue
+            (inner_kind, inner), length = detail
+            if length > _MAX_UNROLLED and (inner_kind != Nodetype.BASE or "string" in inner[0]):
+                raise BagError(
+                    f"{length} elements in field {name} of {what}",
+                    expected=f"at most {_MAX_UNROLLED} texts or messages in an array of fixed length",
+                )
 
 
 def open_bag(path: str | Path) -> BagReader:

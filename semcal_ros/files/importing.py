@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.bridge.config import IMAGE_TYPE, MicroscopeConfig, load_config
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
@@ -74,6 +74,12 @@ def _topic(name: str) -> str:
 
 
 def _check_config(config: MicroscopeConfig) -> None:
+    if config.image.type != IMAGE_TYPE:
+        raise BagError(
+            f"configuration {config.name!r} has its images in {config.image.type}",
+            expected=f"{IMAGE_TYPE} for an import",
+            do="import with --config generic",
+        )
     source = config.magnification
     if source.type not in _NUMBER_TYPES or source.field != "data":
         raise BagError(
@@ -109,7 +115,7 @@ def _write_image(
     # A player that keeps the recording's order then announces the magnification before its image.
     before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
     writer.write(_topic(config.magnification.topic), before_ns, number)
-    message = blank_message("sensor_msgs/msg/Image")
+    message = blank_message(IMAGE_TYPE)
     header = blank_message("std_msgs/msg/Header")
     fill_header(header, entry.stamp_ns, config.frame_id)
     fill_image(message, image.image, "mono8" if image.image.itemsize == 1 else "mono16", header)

@@ -34,7 +34,12 @@ def read_plain_image(path: Path) -> NDArray[Any]:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}", expected="a readable image") from error
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
+    try:
+        image = (
+            cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
+        )
+    except cv2.error:
+        image = None  # it refuses absurd sizes by raising
     if image is None or image.dtype.name not in ("uint8", "uint16"):
         raise BagError(f"{path}: no readable image", expected="an intact 8 or 16 bit image file")
     return image

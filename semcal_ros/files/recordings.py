@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.bridge.compressed import decoded_image
+from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.bridge.fields import require_fields
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
 from semcal_ros.core.model import checked_magnification
 from semcal_ros.files.bag_errors import reading
 from semcal_ros.files.bags import BagTopic, RawMessage, is_bag, open_bag
+from semcal_ros.files.image_topics import find_image_topic
 from semcal_ros.files.magnifications import MagnificationTrack
 from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
 from semcal_ros.files.tiff import is_tiff
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 __all__ = ["Frame", "Recording", "Rejected", "open_recording"]
-
-IMAGE_TYPE = "sensor_msgs/msg/Image"
 
 
 @dataclass(frozen=True)
@@ -167,19 +167,22 @@ class _BagRecording(Recording):
         super().__init__(path, config)
         self._reader = open_bag(path)
         try:
-            self._image_topic = self._find("image", config.image.topic, IMAGE_TYPE)
-            magnification_topic = self._find(
-                "magnification", config.magnification.topic, config.magnification.type
-            )
+            self._image_topic, notes = find_image_topic(path, self._reader.topics, config.image)
+            self._notes.extend(notes)
+            magnification_topic = self._find_magnification(config.magnification)
             self._track = MagnificationTrack(self._reader, magnification_topic.name, config)
         except BaseException:
             self._reader.close()
             raise
         self._note_bad_magnifications(magnification_topic)
 
-    def _find(self, what: str, wanted: str, type_name: str) -> BagTopic:
+    def _find_magnification(self, source: MagnificationConfig) -> BagTopic:
         topic, note = find_topic(
-            self.path, self._reader.topics, what=what, wanted=wanted, type_name=type_name
+            self.path,
+            self._reader.topics,
+            what="magnification",
+            wanted=source.topic,
+            type_name=source.type,
         )
         if note:
             self._notes.append(note)
@@ -215,7 +218,7 @@ class _BagRecording(Recording):
     def _frames(self) -> Iterator[Frame]:
         without, unstamped, images = 0, 0, 0
         for raw in self._reader.raw_messages([self._image_topic.name]):
-            if raw.type != IMAGE_TYPE:
+            if raw.type != self._image_topic.type:
                 continue
             images += 1
             try:
@@ -242,8 +245,10 @@ class _BagRecording(Recording):
     def _frame(self, raw: RawMessage) -> tuple[Frame | None, bool]:
         """The frame of a message (``None`` without magnification); whether it has a stamp."""
         message = self._reader.decode(raw)
-        image = self._cut(image_from_message(message), self.config.image.databar_rows)
+        pixels, encoding = decoded_image(message)
+        image = self._cut(pixels, self.config.image.databar_rows)
         stamp_ns = stamp_ns_from_msg(message)
+        require_fields(message.header, ("frame_id",), "std_msgs/msg/Header")
         magnification = self._track.at(stamp_ns or raw.log_time_ns, raw.log_time_ns, image.shape[1])
         if magnification is None:
             return None, stamp_ns != 0
@@ -254,7 +259,7 @@ class _BagRecording(Recording):
                 log_time_ns=raw.log_time_ns,
                 magnification=magnification,
                 frame_id=str(message.header.frame_id),
-                encoding=str(message.encoding),
+                encoding=encoding,
             ),
             stamp_ns != 0,
         )

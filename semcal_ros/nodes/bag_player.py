@@ -20,6 +20,7 @@ from semcal_ros.nodes.message_types import message_class
 from semcal_ros.nodes.pacing import Pacer
 from semcal_ros.nodes.qos import overridable, stream_output, value_input
 from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.services import service_queue
 from semcal_ros.nodes.settings import Setting
 
 __all__ = ["BagPlayer", "main"]
@@ -39,9 +40,10 @@ _SETTINGS = (
         fixed=True,
     ),
 )
-_IMAGE = "sensor_msgs/msg/Image"
 _TICK_S = 0.02
-_ACK_S = 2.0
+# Parts of a message that were lost are sent again every three seconds.
+_ACK_S = 10.0
+_HEARD_S = 10.0
 _DEPTH = 10
 
 
@@ -60,6 +62,9 @@ class BagPlayer(SemNode):
             )
         self.exit_status = 0
         self._bag = open_bag(self.settings["bag"])
+        # Topics whose last message reaches those who come later.
+        self._lasting: set[str] = set()
+        self._unheard = self.settings["wait_for_subscribers"] > 0
         self._publishers_by_topic = self._make_publishers()
         self._clock_publisher = (
             self.create_publisher(ClockMessage, "/clock", 10) if self.settings["clock"] else None
@@ -68,7 +73,9 @@ class BagPlayer(SemNode):
         # Shutting the context down from the replay's own thread would make that thread wait for itself.
         self._end = self.create_guard_condition(self._leave)
         self.settings.on_change("rate", self._set_rate)
-        self._service = self.create_service(SetBool, "~/pause", self._on_pause)
+        self._service = self.create_service(
+            SetBool, "~/pause", self._on_pause, qos_profile=service_queue()
+        )
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
         self._thread.start()
 
@@ -114,6 +121,8 @@ class BagPlayer(SemNode):
             return None
         # A magnification stays valid: who comes later must learn it.
         lasting = topic.latched or self._is_magnification(topic)
+        if lasting:
+            self._lasting.add(topic.name)
         profile = value_input(1) if lasting else stream_output(_DEPTH)
         return self.create_publisher(
             message_type, topic.name, profile, qos_overriding_options=overridable()
@@ -165,7 +174,8 @@ class BagPlayer(SemNode):
 
     def _wait_for_subscribers(self) -> None:
         wanted = self.settings["wait_for_subscribers"]
-        streams = [t for t in self._bag.topics if t.type == _IMAGE or self._is_magnification(t)]
+        images = self.config.image.type
+        streams = [t for t in self._bag.topics if t.type == images or self._is_magnification(t)]
         names = {t.name for t in streams} & set(self._publishers_by_topic)
         awaited = [self._publishers_by_topic[name] for name in names or self._publishers_by_topic]
         while not self._ended and any(p.get_subscription_count() < wanted for p in awaited):
@@ -186,8 +196,20 @@ class BagPlayer(SemNode):
             if not self._wait_until(message.log_time_ns):
                 return
             self._publish_clock(message.log_time_ns)
-            self._publishers_by_topic[message.topic].publish(bytes(message.data))
+            publisher = self._publishers_by_topic[message.topic]
+            publisher.publish(bytes(message.data))
             self.count_published(None)
+            if self._unheard and message.topic in self._lasting:
+                self._be_heard(publisher, message.log_time_ns)
+
+    def _be_heard(self, publisher: Any, position_ns: int) -> None:
+        """Wait until subscribers have found this node, too: that it knows of them does not say so. They get a lasting
+        message however late they find it, and only then answer.
+        """
+        self._unheard = False
+        publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
+        with self._changed:
+            self._pacer.seek(position_ns)
 
     def _wait_until(self, target_ns: int) -> bool:
         """Wait for a position of the recording; False if the replay shall end."""

@@ -33,6 +33,8 @@ NODE_ERRORS = (SemcalError, cv2.error)
 """What a message can cause; a node counts it, reports it and goes on."""
 
 _LOG_AGAIN_S = 10.0
+# Different warnings within that time, so that one whose numbers change does not flood the log.
+_LOGGED_AT_ONCE = 100
 # A stamp further away than this is that of another clock, such as a replay without simulated time.
 _OTHER_CLOCK_S = 3600.0
 
@@ -118,8 +120,11 @@ class SemNode(Node):
         now_s = time.monotonic()
         if now_s - self._logged.get(text, -_LOG_AGAIN_S) < _LOG_AGAIN_S:
             return
-        if len(self._logged) > 100:
-            self._logged.clear()
+        if len(self._logged) >= _LOGGED_AT_ONCE:
+            recent = {t: s for t, s in self._logged.items() if now_s - s < _LOG_AGAIN_S}
+            self._logged = recent
+            if len(recent) >= _LOGGED_AT_ONCE:
+                return
         self._logged[text] = now_s
         self.get_logger().warning(text)
 

@@ -8,6 +8,7 @@ from semcal_ros.bridge import MicroscopeConfig
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.rectify import Rectifier
 from semcal_ros.nodes.calibration_input import CalibrationInput
+from semcal_ros.nodes.compressed import compressed_settings
 from semcal_ros.nodes.outputs import RectifiedOutput
 from semcal_ros.nodes.settings import CALIBRATION, INTERPOLATION, Setting
 from semcal_ros.nodes.stream import Frame, StreamNode
@@ -19,12 +20,21 @@ class CalibratedStreamNode(StreamNode):
     """A stream node with a calibration, a rectifier, and the outputs ``image_rect`` and ``camera_info``."""
 
     def __init__(self, name: str, settings: Iterable[Setting] = ()) -> None:
-        super().__init__(name, (CALIBRATION, INTERPOLATION, *settings))
+        super().__init__(
+            name, (CALIBRATION, INTERPOLATION, *compressed_settings("image_rect"), *settings)
+        )
         self.rectifier = Rectifier(self.settings["interpolation"])
         self.settings.on_change("interpolation", self._set_interpolation)
         self.calibration = CalibrationInput(self, on_change=self.on_calibration)
         self.output = RectifiedOutput(self)
         self._out_of_range = False
+        # The latest: most frames have the magnification of the one before.
+        self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
+
+    def destroy_node(self) -> None:
+        """As in the base class, after the last compressed image."""
+        self.output.close()
+        super().destroy_node()
 
     def on_calibration(self) -> None:
         """Called when another calibration is in force."""
@@ -39,7 +49,10 @@ class CalibratedStreamNode(StreamNode):
 
     def camera(self, frame: Frame, magnification: float) -> ScanCamera | None:
         """Calibrated camera of a frame, or None while there is no calibration."""
-        camera = self.calibration.camera(magnification, *frame.size)
+        current, seen_at = self.calibration.current, (magnification, *frame.size)
+        if self._camera is None or self._camera[0] is not current or self._camera[1] != seen_at:
+            self._camera = current, seen_at, self.calibration.camera(*seen_at)
+        camera = self._camera[2]
         self._out_of_range = camera is not None and not camera.in_range
         self.statistics.note("in_calibrated_range", camera is not None and camera.in_range)
         return camera

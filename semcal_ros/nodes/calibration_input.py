@@ -1,26 +1,86 @@
-"""The calibration in force: from a file or from the topic, whichever came last."""
+"""The calibration in force: of all that files and the topic have brought, the one that came last."""
 
 from __future__ import annotations
 
+import hashlib
+import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from std_msgs.msg import String
 
-from semcal_ros.bridge import MicroscopeConfig, calibration_text_from_message
+from semcal_ros.bridge import (
+    MicroscopeConfig,
+    calibration_text_from_message,
+    fill_calibration_text,
+)
+from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.errors import CalibrationFileError, SemcalError
+from semcal_ros.files.confined import read_plain_text
+from semcal_ros.nodes.background import NewestWork
 from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.qos import latched
+from semcal_ros.nodes.qos import value_input
 from semcal_ros.nodes.subscription import MessageInfo, published_ns
 
-__all__ = ["CalibrationInput"]
+__all__ = ["CalibrationInput", "calibration_digest"]
+
+_TOPIC = "topic"
+# Of the clock that the middleware stamps with, beside that of this process.
+_CLOCK_STEP_NS = 1_000_000
+_KEPT_WORDS = 16
+# Several nodes publish calibrations, one of them perhaps this one: with a depth of 1, the own words that come back
+# would push out another's that has not been taken yet.
+_QUEUE = 10
+
+
+def calibration_digest(text: str) -> str:
+    """First 12 hexadecimal digits of the SHA-256 of a calibration's text in UTF-8."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """A calibration with its text, where it is from, and when it came into force, ns; 0 if it only fills in."""
+
+    calibration: Calibration
+    text: str
+    source: str
+    since_ns: int
+
+
+@dataclass(frozen=True, order=True)
+class _Arrived:
+    """A text from the topic, not yet parsed; ordered by when it was published."""
+
+    since_ns: int
+    text: str
+
+
+def _loaded(text: str, name: str, source: str, since_ns: int) -> _Loaded:
+    return _Loaded(Calibration.loads(text, source=name), text, source, since_ns)
+
+
+def _parsed(arrived: _Arrived) -> _Loaded | SemcalError:
+    try:
+        return _loaded(arrived.text, "topic calibration", _TOPIC, arrived.since_ns)
+    except SemcalError as error:
+        return error
+    except (MemoryError, RecursionError) as error:
+        return CalibrationFileError(f"topic calibration: {type(error).__name__}")
 
 
 class CalibrationInput:
     """Holds the last good calibration; a bad one is refused, counted, and leaves the old one in force.
+
+    What came into force last wins: a message counts from when it was published, a file from when it was named or
+    reloaded. The file given at start only fills in: it is older than anything on the topic, so that a node that is
+    started again finds its way back.
+
+    Texts are parsed beside the stream, and take effect between two frames.
 
     Parameters
     ----------
@@ -38,21 +98,31 @@ class CalibrationInput:
     def __init__(self, node: SemNode, *, on_change: Callable[[], None] | None = None) -> None:
         self._node = node
         self._on_change = on_change
-        self._checked: tuple[str, Calibration] | None = None
-        self.current: Calibration | None = None
-        self.source = "none"
+        self._checked: tuple[str, _Loaded] | None = None
+        self._loaded: _Loaded | None = None
         self._config = node.config
-        self._topic_ns = 0
+        self._own_words: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_WORDS)
+        self._parser = NewestWork(node, _parsed, self._on_parsed)
         path = node.settings["calibration"]
         if path:
-            self._install(Calibration.load(path), path)
+            self._install(replace(self._read(path), since_ns=0))
         node.settings.on_change("calibration", self._apply_file, self._check_file)
-        node.listen(String, "calibration", self._on_message, latched())
+        node.listen(String, "calibration", self._on_message, value_input(_QUEUE))
+
+    @property
+    def current(self) -> Calibration | None:
+        """The calibration in force, or None while there is none."""
+        return None if self._loaded is None else self._loaded.calibration
 
     @property
     def config(self) -> MicroscopeConfig:
         """The node's configuration with the display width of the calibration in force."""
         return self._config
+
+    @property
+    def has_published(self) -> bool:
+        """Whether :meth:`publish` has published anything."""
+        return bool(self._own_words)
 
     def camera(self, magnification: float, width: int, height: int) -> ScanCamera | None:
         """Camera for frames of that size, or None while there is no calibration; raises as ``Calibration.at``."""
@@ -60,39 +130,84 @@ class CalibrationInput:
             return None
         return self.current.at(magnification).resized(width, height)
 
+    def publish(self, publisher: Any) -> None:
+        """Publish the text of the calibration in force on the topic that this object listens to."""
+        if self._loaded is None:
+            return
+        message = String()
+        fill_calibration_text(message, self._loaded.text)
+        started_ns = time.time_ns() - _CLOCK_STEP_NS
+        publisher.publish(message)
+        ended_ns = time.time_ns() + _CLOCK_STEP_NS
+        self._own_words.append((started_ns, ended_ns, calibration_digest(self._loaded.text)))
+
+    # -- files -------------------------------------------------------------------------------------
+
     def load(self, path: str) -> None:
-        """Take the calibration from a file; raises :class:`CalibrationFileError` and keeps the old one if it is bad."""
-        self._install(Calibration.load(path), path)
+        """Take the calibration from a file; raises :class:`SemcalError` and keeps the old one if it is bad."""
+        self._install(self._read(path))
+
+    def _read(self, path: str) -> _Loaded:
+        text = read_plain_text(self._node.settings.allowed_path(path), MAX_TEXT_BYTES)
+        return _loaded(text, path, path, time.time_ns())
 
     def _check_file(self, path: str) -> None:
-        self._checked = (path, Calibration.load(path)) if path else None
+        self._checked = (path, self._read(path)) if path else None
 
     def _apply_file(self, path: str) -> None:
         if self._checked is not None and self._checked[0] == path:
-            self._install(self._checked[1], path)
+            self._install(replace(self._checked[1], since_ns=time.time_ns()))
         self._checked = None
 
+    # -- topic -------------------------------------------------------------------------------------
+
+    def _is_older(self, since_ns: int) -> bool:
+        # Two latched publishers may answer a late joiner in any order.
+        return self._loaded is not None and since_ns < self._loaded.since_ns
+
+    def _is_own(self, text: str, since_ns: int) -> bool:
+        # A node that publishes what it takes over must not take over what it publishes: with two calibrations
+        # under way it would never come to rest.
+        return any(
+            start <= since_ns <= end and calibration_digest(text) == digest
+            for start, end, digest in self._own_words
+        )
+
+    def _is_same(self, text: str, since_ns: int) -> bool:
+        """Whether the text is in force already, from then on; no reason to start drift anew."""
+        if self._loaded is None or text != self._loaded.text:
+            return False
+        self._loaded = replace(self._loaded, since_ns=since_ns)
+        return True
+
     def _on_message(self, message: Any, info: MessageInfo) -> None:
-        # Two latched publishers may answer a late joiner in any order; the later calibration counts.
-        if published_ns(info) < self._topic_ns:
-            return
+        since_ns = published_ns(info)
         try:
             text = calibration_text_from_message(message)
-            calibration = Calibration.loads(text, source="topic calibration")
-            self._topic_ns = published_ns(info)
-            # The same again, from another node or as an echo, is no reason to start drift anew.
-            if self.current is None or calibration.dumps() != self.current.dumps():
-                self._install(calibration, "topic")
         except SemcalError as error:
             self._node.reject(error)
+            return
+        if self._is_older(since_ns) or self._is_own(text, since_ns):
+            return
+        if not self._is_same(text, since_ns):
+            self._parser.submit(_Arrived(since_ns, text))
 
-    def _install(self, calibration: Calibration, source: str) -> None:
-        self.current, self.source = calibration, source
+    def _on_parsed(self, result: _Loaded | SemcalError) -> None:
+        if isinstance(result, SemcalError):
+            self._node.reject(result)
+        elif not (self._is_older(result.since_ns) or self._is_same(result.text, result.since_ns)):
+            self._install(result)
+
+    def _install(self, loaded: _Loaded) -> None:
+        calibration, source = loaded.calibration, loaded.source
+        self._loaded = loaded
         self._config = replace(self._node.config, display_width_m=calibration.display_width_m)
         low, high = calibration.magnification_range
+        digest = calibration_digest(loaded.text)
         self._node.get_logger().info(
-            f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x"
+            f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}"
         )
         self._node.statistics.note("calibration", source)
+        self._node.statistics.note("calibration_digest", digest)
         if self._on_change is not None:
             self._on_change()

@@ -6,14 +6,11 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from semcal_ros.bridge import (
     DiagnosticLevel,
@@ -28,9 +25,11 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.nodes.base import NODE_ERRORS
-from semcal_ros.nodes.calibration_worker import CalibrationJob, run_job, without_images
+from semcal_ros.nodes.calibration_input import calibration_digest
+from semcal_ros.nodes.calibration_process import CalibrationProcess
+from semcal_ros.nodes.calibration_worker import CalibrationJob, Stage, without_images
 from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.services import trigger_service
 from semcal_ros.nodes.settings import Setting
 from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode
 from semcal_ros.pipeline import FoundView
@@ -45,13 +44,15 @@ _SETTINGS = (
         "Field for what the distortion parameters cannot describe (joint).",
         choices=tuple(RESIDUAL_MODES),
     ),
-    Setting("output", "", "File that ~/save writes."),
+    Setting("output", "", "File that ~/save writes.", confined=True),
+    Setting("allow_writing", True, "Whether ~/save may write files.", fixed=True),
 )
-_THREADS = 4
+# Frames, the report, parameters, views, a calibration, and those who want to cancel it.
+_THREADS = 6
 
 
 class CalibrationServer(StreamNode):
-    """Services ~/add_view, ~/calibrate, ~/save and ~/clear; topics ``calibration``, ~/progress and ~/overlay.
+    """Services ~/add_view, ~/calibrate, ~/cancel, ~/save, ~/clear; topics ``calibration``, ~/progress, ~/overlay.
 
     ~/calibrate answers when the calibration is done; views can be added meanwhile for the next one.
     """
@@ -63,53 +64,47 @@ class CalibrationServer(StreamNode):
         self._added: Frame | None = None
         self._views: list[FoundView] = []
         self._calibration: Calibration | None = None
-        self._stopping = False
+        self._running: CalibrationProcess | None = None
+        self._stage: Stage | None = None
         self._text = self.latched_publisher(String, "calibration")
         self._progress = self.latched_publisher(DiagnosticStatus, "~/progress")
         self._overlay = self.stream_publisher(Image, "~/overlay")
         self._input = FrameInput(self, self._on_frame, group=MutuallyExclusiveCallbackGroup())
-        quick, slow = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        quick = MutuallyExclusiveCallbackGroup()
         handlers = (
             ("add_view", self._add_view, quick),
             ("save", self._save, quick),
             ("clear", self._clear, quick),
-            ("calibrate", self._calibrate, slow),
+            # Who calls while a calibration runs is refused at once, and not queued.
+            ("calibrate", self._calibrate, ReentrantCallbackGroup()),
+            ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
         )
         self._answers = [
-            self.create_service(
-                Trigger, f"~/{name}", self._answering(handler), callback_group=group
-            )
+            trigger_service(self, f"~/{name}", handler, group, self._report_answer)
             for name, handler, group in handlers
         ]
         self._report_progress("no views yet")
 
     def destroy_node(self) -> None:
-        """Give up a running calibration first."""
-        self._stopping = True
+        """End a running calibration first."""
+        with self._lock:
+            running = self._running
+        if running is not None:
+            running.cancel()
         super().destroy_node()
 
-    def _answering(self, handler: Any) -> Any:
-        def answer(_request: Any, response: Any) -> Any:
-            try:
-                response.message = handler()
-                response.success = True
-            except NODE_ERRORS as error:
-                response.message = " ".join(str(error).split())
-                response.success = False
-                self.get_logger().warning(response.message)
-            level = DiagnosticLevel.OK if response.success else DiagnosticLevel.WARN
-            self._report_progress(response.message, level)
-            return response
-
-        return answer
+    def _report_answer(self, success: bool, text: str) -> None:
+        self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
 
     def _report_progress(self, text: str, level: DiagnosticLevel = DiagnosticLevel.OK) -> None:
         with self._lock:
-            views = list(self._views)
+            views, stage = list(self._views), self._stage
         values = [("views", str(len(views)))]
         values.append(("corners", str(sum(len(view.detection.xy) for view in views))))
         counts = Counter(view.magnification for view in views)
         values += [(f"views at {g:g}x", str(counts[g])) for g in sorted(counts)]
+        if stage is not None:
+            values += [("stage", stage.name), ("fraction", f"{stage.fraction:.3f}")]
         status = DiagnosticStatus()
         name = f"{self.get_fully_qualified_name()}: calibration"
         summary = DiagnosticSummary(level, text, tuple(values))
@@ -119,7 +114,7 @@ class CalibrationServer(StreamNode):
     # -- stream ------------------------------------------------------------------------------------
 
     def _on_frame(self, frame: Frame) -> None:
-        if self.known_magnification(frame) is not None:
+        if self.known_magnification(frame) is not None and not frame.mixed:
             with self._lock:
                 self._newest = frame
 
@@ -161,29 +156,79 @@ class CalibrationServer(StreamNode):
         return f"{count} views removed"
 
     def _calibrate(self) -> str:
-        with self._lock:
-            views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
-        self._report_progress(f"calibrating from {len(views)} views")
-        config = self.config
-        job = CalibrationJob(
-            views,
-            config.display_width_m,
-            config.squares_m,
-            self.settings["method"],
-            self.settings["residual"],
-        )
-        result = run_job(job, lambda: self.context.ok() and not self._stopping)
-        if result.failed:
-            raise CalibrationError(result.summary)
-        calibration = Calibration.loads(result.text, source="the calibration process")
-        message = String()
-        fill_calibration_text(message, result.text)
-        self._text.publish(message)
+        running = self._begin()
+        text = ""
+        try:
+            result = running.run(self.context.ok, lambda stage: self._show(running, stage))
+            if result.failed:
+                raise CalibrationError(result.summary)
+            calibration = Calibration.loads(result.text, source="the calibration process")
+            text = result.text
+        finally:
+            wanted = self._finish(running, done=bool(text))
+        if not wanted:
+            raise CalibrationError("cancelled")
         with self._lock:
             self._calibration = calibration
+        message = String()
+        fill_calibration_text(message, text)
+        self._text.publish(message)
+        self.statistics.note("calibration_digest", calibration_digest(text))
         return result.summary
 
+    def _begin(self) -> CalibrationProcess:
+        with self._lock:
+            if self._running is not None:
+                raise CalibrationError(
+                    "a calibration is running", do="wait for its end, or call ~/cancel"
+                )
+            if not self._views:
+                raise CalibrationError("no usable view yet", do="call ~/add_view first")
+            views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
+            config, values = self.config, self.settings
+            job = CalibrationJob(
+                views,
+                config.display_width_m,
+                config.squares_m,
+                values["method"],
+                values["residual"],
+            )
+            self._running = CalibrationProcess(job)
+            return self._running
+
+    def _finish(self, running: CalibrationProcess, *, done: bool) -> bool:
+        """Make way for the next one; False if somebody has cancelled this one."""
+        with self._lock:
+            wanted = self._running is running
+            if wanted:
+                self._running = None
+                self._stage = Stage("done", 1.0) if done else None
+            return wanted
+
+    def _show(self, running: CalibrationProcess, stage: Stage) -> None:
+        with self._lock:
+            if self._running is not running:
+                return
+            self._stage = stage
+        self._report_progress(f"calibrating from {len(running.job.views)} views")
+
+    def _cancel(self) -> str:
+        with self._lock:
+            running, self._running, self._stage = self._running, None, None
+        if running is None:
+            raise CalibrationError("no calibration is running")
+        running.cancel()
+        job = running.job
+        return (
+            f"cancelled the {job.method} calibration from {len(job.views)} views"
+            f" after {running.elapsed_s:.1f} s"
+        )
+
     def _save(self) -> str:
+        if not self.settings["allow_writing"]:
+            raise InvalidValueError(
+                "writing files is switched off", do="start the node with allow_writing true"
+            )
         with self._lock:
             calibration = self._calibration
         path = self.settings["output"]
@@ -191,7 +236,7 @@ class CalibrationServer(StreamNode):
             raise InvalidValueError("no calibration to save", do="call ~/calibrate first")
         if not path:
             raise InvalidValueError("no file to save to", do="set the parameter output")
-        calibration.save(Path(path).expanduser())
+        calibration.save(self.settings.allowed_path(path))
         return f"saved to {path}"
 
 

@@ -1,25 +1,23 @@
-"""A calibration in a process of its own, so that the stream goes on and a stop need not wait for it."""
+"""What the process of a calibration does; it imports no ROS."""
 
 from __future__ import annotations
 
+import json
+import os
 import pickle
-import subprocess
 import sys
-import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.pipeline import FoundView, calibrate_found
 
-__all__ = ["CalibrationJob", "JobResult", "run_job", "serve", "without_images"]
+__all__ = ["CalibrationJob", "JobResult", "Stage", "serve", "without_images"]
 
-_POLL_S = 0.1
-# By name and not as a script, so that both sides pickle the same classes; this imports no ROS.
-_COMMAND = "from semcal_ros.nodes.calibration_worker import serve; serve()"
 # What numerics raise on degenerate views.
 _NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
@@ -36,6 +34,14 @@ class CalibrationJob:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """What a calibration is at, and the fraction of the work that is done."""
+
+    name: str
+    fraction: float
+
+
+@dataclass(frozen=True)
 class JobResult:
     """The text of the calibration file and a summary, or the reason why there is none."""
 
@@ -44,7 +50,11 @@ class JobResult:
     failed: bool = False
 
 
-def _calibrate(job: CalibrationJob) -> JobResult:
+def _refused(error: SemcalError) -> JobResult:
+    return JobResult("", str(error), failed=True)
+
+
+def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> JobResult:
     started_s = time.monotonic()
     try:
         done = calibrate_found(
@@ -54,16 +64,20 @@ def _calibrate(job: CalibrationJob) -> JobResult:
             squares_m=job.squares_m,
             method=job.method,
             residual=job.residual,
+            on_stage=on_stage,
         )
     except SemcalError as error:
-        return JobResult("", str(error), failed=True)
+        return _refused(error)
+    except MemoryError:
+        what = f"not enough memory for a calibration from {len(job.views)} views"
+        return _refused(CalibrationError(what, do="use fewer views, or residual off"))
     except _NUMERIC as error:
         reason = CalibrationError(
             f"views that cannot be solved for ({type(error).__name__}: {error})",
             expected="views of a grid from different directions",
             do="add tilted views",
         )
-        return JobResult("", str(reason), failed=True)
+        return _refused(reason)
     held_out = [v for v in done.result.held_out_rms_px.values() if np.isfinite(v)]
     worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
     low, high = done.calibration.magnification_range
@@ -75,45 +89,25 @@ def _calibrate(job: CalibrationJob) -> JobResult:
     return JobResult(done.calibration.dumps(), summary + notes)
 
 
+def _end_with_the_node() -> None:
+    # The node holds the other end open for as long as it lives, however it ends.
+    # Not through sys.stdin, whose lock would be missing at the end of the interpreter.
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
+
+
 def serve() -> None:
-    """Read one job from stdin and write its result to stdout, both pickled."""
+    """Read one pickled job from stdin; write stages and at last the result to stdout, one JSON object per line."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    # Whatever else prints shall not get among the answers.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     job: CalibrationJob = pickle.load(sys.stdin.buffer)
-    sys.stdout.buffer.write(pickle.dumps(_calibrate(job)))
+    threading.Thread(target=_end_with_the_node, daemon=True).start()
 
+    def tell(answer: Stage | JobResult) -> None:
+        print(json.dumps(asdict(answer)), file=answers, flush=True)
 
-def run_job(job: CalibrationJob, still_wanted: Callable[[], bool]) -> JobResult:
-    """Calibrate in a new process and wait for it; it is ended when the result is no longer wanted."""
-    with tempfile.TemporaryFile() as stdin:
-        # Not through a pipe: communicate() with a timeout stops feeding one that was once full.
-        pickle.dump(job, stdin)
-        stdin.seek(0)
-        # A session of its own: Ctrl-C is for the node, which decides what becomes of this process.
-        process = subprocess.Popen(
-            [sys.executable, "-c", _COMMAND],
-            stdin=stdin,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
-    try:
-        while still_wanted():
-            try:
-                answer, _ = process.communicate(timeout=_POLL_S)
-            except subprocess.TimeoutExpired:
-                continue
-            return _result_of(answer, process.returncode)
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-    return JobResult("", "stopped", failed=True)
-
-
-def _result_of(answer: bytes, status: int) -> JobResult:
-    if status != 0:
-        reason = f"the calibration process ended with status {status}"
-        return JobResult("", reason, failed=True)
-    result: JobResult = pickle.loads(answer)
-    return result
+    tell(_calibrate(job, lambda name, fraction: tell(Stage(name, fraction))))
 
 
 def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:

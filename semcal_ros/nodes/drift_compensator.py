@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.rectify import Rectifier
+from semcal_ros.nodes.compressed import compressed_settings
 from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
 from semcal_ros.nodes.outputs import DriftOutput, ImageOutput
 from semcal_ros.nodes.run import run_node
 from semcal_ros.nodes.settings import INTERPOLATION
-from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode
+from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode, nominal_camera
 
 __all__ = ["DriftCompensator", "main"]
 
@@ -22,13 +22,22 @@ class DriftCompensator(StreamNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("drift_compensator", (INTERPOLATION, *DRIFT_SETTINGS))
+        super().__init__(
+            "drift_compensator",
+            (INTERPOLATION, *DRIFT_SETTINGS, *compressed_settings("image_stabilized")),
+        )
         self._rectifier = Rectifier(self.settings["interpolation"])
         self.settings.on_change("interpolation", self._set_interpolation)
         self._drift = LiveDrift(self)
         self._images = ImageOutput(self, "image_stabilized")
         self._drifts = DriftOutput(self)
         self._input = FrameInput(self, self._on_frame)
+
+    def destroy_node(self) -> None:
+        """As in the base class, after the last compressed image."""
+        self._drift.close()
+        self._images.close()
+        super().destroy_node()
 
     def _set_interpolation(self, value: str) -> None:
         self._rectifier = Rectifier(value)
@@ -37,11 +46,14 @@ class DriftCompensator(StreamNode):
         g = self.known_magnification(frame)
         if g is None:
             return
-        camera = ScanCamera.nominal(g, *frame.size, self.config.display_width_m)
-        drift = self._drift.update(frame, camera)
-        image = self._rectifier.rectify(frame.image, camera, drift.raster, self.config.scan)
-        self._images.publish(image, frame)
-        self._drifts.publish(drift, frame)
+        camera = nominal_camera(g, *frame.size, self.config.display_width_m)
+        drift = None if frame.mixed else self._drift.of(frame, camera)
+        raster = None if drift is None else drift.raster
+        memory = self._images.memory(frame)
+        self._rectifier.rectify(frame.image, camera, raster, self.config.scan, out=memory)
+        self._images.publish(frame)
+        if drift is not None:
+            self._drifts.publish(drift, frame)
 
     def conditions(self) -> list[str]:
         """As in the base class; also whether the drift is only predicted."""

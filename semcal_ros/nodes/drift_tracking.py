@@ -1,19 +1,29 @@
-"""Drift tracking as the nodes use it: times from stamps, reset by service and by a new calibration."""
+"""Drift tracking as the nodes use it: in line or beside the stream, reset by service and by a new calibration."""
 
 from __future__ import annotations
 
-from typing import Any
+import pickle
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass
 
-from std_srvs.srv import Trigger
+import numpy as np
+from numpy.typing import NDArray
 
+from semcal_ros.bridge import TrackingPace
+from semcal_ros.core.binning import binned
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftSettings, DriftTracker, DriftUpdate
+from semcal_ros.core.raw_map import RasterDrift
+from semcal_ros.nodes.base import NODE_ERRORS
+from semcal_ros.nodes.drift_process import DriftProcess, Measured, measured
+from semcal_ros.nodes.services import trigger_service
 from semcal_ros.nodes.settings import Setting
 from semcal_ros.nodes.stream import Frame, StreamNode
 
-__all__ = ["DRIFT_SETTINGS", "LiveDrift"]
+__all__ = ["DRIFT_SETTINGS", "FrameDrift", "LiveDrift"]
 
-DRIFT_SETTINGS = (
+_RESTARTING = (
     Setting(
         "keyframe_overlap",
         0.6,
@@ -31,6 +41,56 @@ DRIFT_SETTINGS = (
         high=1.0,
     ),
 )
+_DETAIL = Setting(
+    "drift_detail",
+    1536,
+    "Pictures with a longer side than this are averaged down by a whole factor before their drift is"
+    " measured: 4096 x 4096 takes ten times as long, and its finest detail is mostly noise. What is"
+    " published keeps all pixels. A change starts the tracking anew.",
+    unit="px",
+    low=64,
+    high=32766,
+)
+_MODE = Setting(
+    "drift_tracking",
+    "auto",
+    "Which frames wait for their own drift to be measured. every_frame: all, however late they get."
+    " forecast: none; each is corrected by what the frames before it foretell, and as many as can be"
+    " are measured beside the stream. auto: every frame as long as the stream leaves the time.",
+    choices=("auto", "every_frame", "forecast"),
+)
+DRIFT_SETTINGS = (*_RESTARTING, _DETAIL, _MODE)
+
+# The process beside the stream has died, and the tracker with it.
+_LOST = (OSError, EOFError, pickle.PickleError)
+# A forecast of over so many turns is none.
+_FAR = 20.0
+# Between measurements beside the stream, in times of one.
+_REST = 2.0
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameDrift:
+    """Drift at one frame, in m.
+
+    Attributes
+    ----------
+    drift_m, velocity_m_s, covariance, raster
+        As in :class:`~semcal_ros.core.drift.DriftUpdate`.
+    measured
+        The latest frame of which the drift was measured: this one, or one before it.
+    is_forecast
+        Whether it is one before.
+    """
+
+    drift_m: Array
+    velocity_m_s: Array
+    covariance: Array
+    raster: RasterDrift
+    measured: DriftUpdate
+    is_forecast: bool
 
 
 class LiveDrift:
@@ -38,36 +98,135 @@ class LiveDrift:
 
     def __init__(self, node: StreamNode) -> None:
         self._node = node
-        self._origin_ns: int | None = None
-        self._tracker = self._new_tracker()
-        for setting in DRIFT_SETTINGS:
-            node.settings.on_change(setting.name, self._on_setting)
-        self._service = node.create_service(Trigger, "~/reset", self._on_reset)
-
-    def _new_tracker(self) -> DriftTracker:
-        values = self._node.settings
-        return DriftTracker(
-            DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
-        )
-
-    def _on_setting(self, _value: float) -> None:
-        self._tracker = self._new_tracker()
-
-    def _on_reset(self, _request: Any, response: Any) -> Any:
+        self._pace = TrackingPace()
+        self._failed = 0
+        self._beside = DriftProcess()
+        for setting in (*_RESTARTING, _DETAIL):
+            node.settings.on_change(setting.name, lambda _value: self.reset())
         self.reset()
-        response.success, response.message = True, "the next frame has zero drift"
-        return response
+        self._service = trigger_service(node, "~/reset", self._on_reset)
+
+    def _on_reset(self) -> str:
+        self.reset()
+        return "the next frame has zero drift"
 
     def reset(self) -> None:
         """The next frame has zero drift."""
-        self._tracker.reset()
+        values = self._node.settings
+        # A new one: the old one may be at work beside the stream.
+        self._tracker = DriftTracker(
+            DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
+        )
+        self._is_away = False
+        self._origin_ns: int | None = None
+        self._known: Measured | None = None
+        self._at_work: Future[Measured] | None = None
+        self._rest_until_s = 0.0
 
-    def update(self, frame: Frame, camera: ScanCamera) -> DriftUpdate:
-        """Drift at a frame, in m; raises as :meth:`DriftTracker.update`."""
-        config = self._node.config
-        if self._origin_ns is None or frame.stamp_ns < self._origin_ns:
+    def close(self) -> None:
+        """End what runs beside the stream."""
+        self._beside.close()
+
+    def of(self, frame: Frame, camera: ScanCamera) -> FrameDrift:
+        """Drift at a frame; raises as :meth:`DriftTracker.update`."""
+        if frame.interval_s is not None:
+            self._pace.frame(frame.interval_s)
+        time_s, centre_s = self._times(frame)
+        if self._known is not None and centre_s < self._known.outlook.time_s:
+            self.reset()
+            time_s, centre_s = self._times(frame)
+        waits = self._waits or self._is_far(centre_s)
+        self._collect(wait=waits)
+        scan = self._node.config.scan
+        if self._known is None or waits:
+            self._fetch()
+            time_s, centre_s = self._times(frame)
+            self._keep(measured(self._tracker, *self._binned(frame, camera), time_s, scan))
+        elif self._beside_is_free():
+            tracker = None if self._is_away else self._tracker
+            self._is_away = True
+            small = self._binned(frame, camera)
+            self._at_work = self._beside.measure(tracker, *small, time_s, scan)
+        assert self._known is not None
+        return _at(self._known, centre_s)
+
+    def _binned(self, frame: Frame, camera: ScanCamera) -> tuple[NDArray[np.generic], ScanCamera]:
+        return binned(frame.image, camera, self._node.settings[_DETAIL.name])
+
+    def _beside_is_free(self) -> bool:
+        rested = self._at_work is None and time.monotonic() >= self._rest_until_s
+        return rested and self._beside.is_ready()
+
+    def _is_far(self, centre_s: float) -> bool:
+        """Whether a forecast would look over a leap of the clock or a pause, which it knows nothing of."""
+        known = self._known
+        return known is not None and centre_s - known.outlook.time_s > _FAR * self._pace.turn_s
+
+    def _times(self, frame: Frame) -> tuple[float, float]:
+        """Start and centre of a frame's acquisition, in s since the first one."""
+        if self._origin_ns is None:
             # Seconds since 1970 in a float are only good to 0.2 us.
             self._origin_ns = frame.stamp_ns
-            self._tracker.reset()
+            self._node.statistics.note("drift_since", f"{frame.stamp_ns * 1e-9:.9f}")
+        config = self._node.config
         time_s = (frame.stamp_ns - self._origin_ns) * 1e-9 + config.start_offset_s
-        return self._tracker.update(frame.image, time_s, camera, config.scan)
+        return time_s, time_s + (0.0 if config.scan is None else config.scan.centre_offset_s)
+
+    @property
+    def _waits(self) -> bool:
+        mode = self._node.settings["drift_tracking"]
+        return mode == "every_frame" or (mode == "auto" and self._pace.keeps_up)
+
+    def _collect(self, *, wait: bool) -> None:
+        """Take in what was measured beside the stream, once it is ready."""
+        if self._at_work is None or not (wait or self._at_work.done()):
+            return
+        done, self._at_work = self._at_work, None
+        try:
+            self._keep(done.result())
+            # The rest of the time is for other nodes.
+            self._rest_until_s = time.monotonic() + _REST * self._pace.cost_s
+        except NODE_ERRORS as error:
+            self._complain(error)
+        except _LOST as error:
+            self._complain(error)
+            self.reset()
+
+    def _fetch(self) -> None:
+        """Have the tracker here."""
+        if not self._is_away:
+            return
+        try:
+            self._tracker = self._beside.fetch().result()
+            self._is_away = False
+        except _LOST as error:
+            self._complain(error)
+            self.reset()
+
+    def _complain(self, error: Exception) -> None:
+        # Its frame has gone out: it does not count as rejected.
+        self._failed += 1
+        self._node.statistics.note("drift_frames_failed", self._failed)
+        self._node.warn_seldom(f"drift: {error or type(error).__name__}")
+
+    def _keep(self, known: Measured) -> None:
+        self._known = known
+        self._pace.measured(known.cost_s)
+        self._node.statistics.note("drift_ms", 1e3 * self._pace.cost_s)
+
+
+def _at(known: Measured, centre_s: float) -> FrameDrift:
+    update = known.update
+    if centre_s == update.time_s:
+        return FrameDrift(
+            update.drift_m, update.velocity_m_s, update.covariance, update.raster, update, False
+        )
+    forecast = known.outlook.at(centre_s)
+    return FrameDrift(
+        forecast.drift_m,
+        forecast.velocity_m_s,
+        forecast.covariance,
+        forecast.raster,
+        update,
+        True,
+    )

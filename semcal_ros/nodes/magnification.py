@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from semcal_ros.bridge import (
     ZeroOrderHold,
     optional_stamp_ns,
     read_magnification,
+    scan_interval_ns,
 )
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.base import SemNode
@@ -21,6 +23,9 @@ from semcal_ros.nodes.subscription import MessageInfo, published_ns
 __all__ = ["MagnificationInput"]
 
 _KEPT = 4096
+# Smaller steps back are frames that came late.
+_CLOCK_STEP_NS = 1_000_000_000
+_PATIENCE_S = 1.0
 
 
 class MagnificationInput:
@@ -50,10 +55,14 @@ class MagnificationInput:
             message_type, source.topic, self._on_message, value_input(), group
         )
         self.received = 0
+        self._last_ns = 0
+        self._latest_sent_ns = 0
+        # Until when, on a steady clock, to wait for a message that was published after the other time.
+        self._doubted: tuple[float, int] | None = None
 
     def _on_message(self, message: Any, info: MessageInfo) -> None:
         self.received += 1
-        key_ns = published_ns(info)
+        key_ns = self._latest_sent_ns = published_ns(info)
         reading: MagnificationReading | None = None
         try:
             if self._has_stamp:
@@ -85,7 +94,42 @@ class MagnificationInput:
             The magnification is out of all reason for frames of this width.
         """
         self._subscription.take_waiting()
+        if self._has_stamp:
+            self._forget_if_back(stamp_ns)
         reading = self._history.at(stamp_ns if self._has_stamp else sent_ns)
-        if reading is None:
+        if reading is None or self._is_doubted():
             return None
         return replace(reading, config=config).magnification(image_width_px)
+
+    def doubt(self, since_ns: int) -> None:
+        """The microscope was started again after ``since_ns``: its magnification may be another one, of which it will
+        soon tell. Without a word from it, the old one holds on.
+        """
+        self._doubted = time.monotonic() + _PATIENCE_S, since_ns
+
+    def _is_doubted(self) -> bool:
+        if self._doubted is None:
+            return False
+        until_s, since_ns = self._doubted
+        if self._latest_sent_ns > since_ns or time.monotonic() > until_s:
+            self._doubted = None
+        return self._doubted is not None
+
+    def _forget_if_back(self, stamp_ns: int) -> None:
+        """The clock went back, but no magnification has come yet: what is known is of another time."""
+        newest_ns = self._history.newest_ns
+        went_back = stamp_ns < self._last_ns - _CLOCK_STEP_NS
+        if went_back and newest_ns is not None and newest_ns > stamp_ns + _CLOCK_STEP_NS:
+            self._history.clear()
+        self._last_ns = stamp_ns
+
+    def changed_during(self, stamp_ns: int, sent_ns: int) -> bool:
+        """Whether it changed while a frame was being scanned, as far as that can be told; the
+        arguments are those of :meth:`at`, after which this is to be called.
+        """
+        sent = None if self._has_stamp else sent_ns
+        interval = scan_interval_ns(stamp_ns, sent, self._node.config)
+        if interval is None:
+            return False
+        values = [self._history.at(interval[0]), *self._history.between(*interval)]
+        return len({None if value is None else value.value for value in values}) > 1

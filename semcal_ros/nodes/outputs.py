@@ -8,28 +8,49 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from semcal_ros.bridge import fill_camera_info, fill_drift, fill_drift_velocity, fill_image
+from semcal_ros.bridge import (
+    copy_header,
+    fill_camera_info,
+    fill_drift,
+    fill_drift_velocity,
+    pixel_memory,
+)
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftUpdate
 from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.compressed import CompressedOutput
+from semcal_ros.nodes.drift_tracking import FrameDrift
 from semcal_ros.nodes.stream import Frame
 
 __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 
 
 class ImageOutput:
-    """Publishes images on one topic."""
+    """Publishes images on one topic, from memory that is used again for each, and compressed beside it.
+
+    The node declares the parameters of :func:`~semcal_ros.nodes.compressed.compressed_settings`.
+    """
 
     def __init__(self, node: SemNode, topic: str) -> None:
         self._node = node
+        self._message = Image()
         self._publisher = node.stream_publisher(Image, topic)
+        self._compressed = CompressedOutput(node, topic)
+        self._pixels: NDArray[Any] | None = None
 
-    def publish(self, image: NDArray[Any], frame: Frame) -> None:
-        """Publish an image made from ``frame``."""
-        message = Image()
-        fill_image(message, image, frame.encoding, frame.header)
-        self._publisher.publish(message)
+    def memory(self, frame: Frame) -> NDArray[Any]:
+        """Where to write the pixels of the image made from ``frame``."""
+        self._pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
+        return self._pixels
+
+    def publish(self, frame: Frame) -> None:
+        """Publish what was written."""
+        self._publisher.publish(self._message)
         self._node.count_published(frame.stamp_ns)
+        self._compressed.publish(self._pixels, frame)
+
+    def close(self) -> None:
+        """Wait for the thread that compresses; before the node is destroyed."""
+        self._compressed.close()
 
 
 class RectifiedOutput:
@@ -38,14 +59,32 @@ class RectifiedOutput:
     def __init__(self, node: SemNode) -> None:
         self._image = ImageOutput(node, "image_rect")
         self._info = node.stream_publisher(CameraInfo, "camera_info")
+        self._message = CameraInfo()
+        # What the message describes, but for its header.
+        self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
-    def publish(self, image: NDArray[Any], camera: ScanCamera | None, frame: Frame) -> None:
-        """Publish a rectified image; ``camera`` is None while there is no calibration."""
-        info = CameraInfo()
-        fill_camera_info(info, camera, frame.header, image.shape[1], image.shape[0])
+    def memory(self, frame: Frame) -> NDArray[Any]:
+        """As :meth:`ImageOutput.memory`."""
+        return self._image.memory(frame)
+
+    def close(self) -> None:
+        """As :meth:`ImageOutput.close`."""
+        self._image.close()
+
+    def publish(self, camera: ScanCamera | None, frame: Frame) -> None:
+        """Publish the rectified image; ``camera`` is None where there is none for it."""
         # The description first: a consumer that has the image can then use it at once.
-        self._info.publish(info)
-        self._image.publish(image, frame)
+        if self._info.get_subscription_count():
+            self._describe(camera, frame)
+            self._info.publish(self._message)
+        self._image.publish(frame)
+
+    def _describe(self, camera: ScanCamera | None, frame: Frame) -> None:
+        known = self._described
+        if known is None or known[0] is not camera or known[1] != frame.size:
+            fill_camera_info(self._message, camera, frame.header, *frame.size)
+            self._described = camera, frame.size
+        copy_header(self._message.header, frame.header)
 
 
 class DriftOutput:
@@ -55,23 +94,31 @@ class DriftOutput:
         self._node = node
         self._drift = node.stream_publisher(PoseWithCovarianceStamped, "drift")
         self._velocity = node.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
+        self._messages = PoseWithCovarianceStamped(), TwistWithCovarianceStamped()
         self._coasting = 0
+        self._forecast = 0
         self.trouble = ""
 
-    def publish(self, drift: DriftUpdate, frame: Frame) -> None:
+    def publish(self, drift: FrameDrift, frame: Frame) -> None:
         """Publish the drift, in m, at the centre of a frame."""
-        pose, twist = PoseWithCovarianceStamped(), TwistWithCovarianceStamped()
-        fill_drift(pose, drift.drift_m, drift.covariance, frame.header)
-        fill_drift_velocity(twist, drift.velocity_m_s, drift.covariance, frame.header)
-        self._drift.publish(pose)
-        self._velocity.publish(twist)
-        self._coasting += 0 if drift.accepted else 1
-        self.trouble = "" if drift.accepted else f"drift {drift.status}"
+        pose, twist = self._messages
+        # A few matrices per frame, which nobody may want.
+        if self._drift.get_subscription_count():
+            fill_drift(pose, drift.drift_m, drift.covariance, frame.header)
+            self._drift.publish(pose)
+        if self._velocity.get_subscription_count():
+            fill_drift_velocity(twist, drift.velocity_m_s, drift.covariance, frame.header)
+            self._velocity.publish(twist)
+        measured = drift.measured
+        self._coasting += not (measured.accepted or drift.is_forecast)
+        self._forecast += drift.is_forecast
+        self.trouble = "" if measured.accepted else f"drift {measured.status}"
         notes = (
-            ("drift_status", drift.status),
-            ("drift_residual", float(drift.residual)),
-            ("drift_overlap", float(drift.overlap)),
+            ("drift_status", measured.status),
+            ("drift_residual", float(measured.residual)),
+            ("drift_overlap", float(measured.overlap)),
             ("drift_frames_coasted", self._coasting),
+            ("drift_frames_forecast", self._forecast),
         )
         for key, value in notes:
             self._node.statistics.note(key, value)

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
-from std_srvs.srv import Trigger
 
 from semcal_ros.bridge import (
     MagnificationReading,
-    fill_calibration_text,
     fill_camera_info,
     fill_projection,
     is_continuous_parameter,
@@ -24,6 +24,7 @@ from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.calibration_input import CalibrationInput
 from semcal_ros.nodes.magnification import MagnificationInput
 from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.services import trigger_service
 from semcal_ros.nodes.settings import CALIBRATION, Setting
 
 __all__ = ["ParameterServer", "main"]
@@ -36,6 +37,9 @@ _SIZE = (
         "image_height", 0, "Height of the live frames; 0: that of the calibration.", "px", 0, 65536
     ),
 )
+# For finding who else publishes a calibration, and for what they have to say once they are found.
+_LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
+_TICK_S = 0.5
 
 
 class ParameterServer(SemNode):
@@ -56,9 +60,13 @@ class ParameterServer(SemNode):
         for setting in _SIZE:
             self.settings.on_change(setting.name, lambda _value: self._refresh())
         self._magnification = MagnificationInput(self, self._on_reading)
-        self._reload = self.create_service(Trigger, "~/reload", self._on_reload)
-        if self._calibration.current is not None:
-            self._on_calibration()
+        self._reload = trigger_service(self, "~/reload", self._on_reload)
+        # A server that is started again must not set everybody back to its file while another node, such as
+        # calibration_server, still holds what has come into force since.
+        self._listened_s = 0.0
+        self._listening = self.create_timer(
+            _TICK_S, self._publish_start, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def idle(self) -> bool:
         """A magnification that does not change is no trouble."""
@@ -72,13 +80,22 @@ class ParameterServer(SemNode):
     # -- topics ------------------------------------------------------------------------------------
 
     def _on_calibration(self) -> None:
-        # During construction the publisher of the text comes first and this is called again at the end.
-        if self._calibration is None or self._calibration.current is None:
-            return
-        message = String()
-        fill_calibration_text(message, self._calibration.current.dumps())
-        self._text.publish(message)
+        # The file given at start is read before there is somebody to tell; it has to wait.
+        if self._calibration is not None:
+            self._calibration.publish(self._text)
         self._refresh()
+
+    def _publish_start(self) -> None:
+        """Publish the file given at start once it is clear that nothing else has come into force."""
+        self._listened_s += _TICK_S
+        others = self.count_publishers(self._text.topic_name) > 1
+        published = self._calibration is None or self._calibration.has_published
+        if not published and self._listened_s < (_LISTEN_AT_MOST_S if others else _LISTEN_FIRST_S):
+            return
+        self._listening.cancel()
+        if self._calibration is not None and not published:
+            self._calibration.publish(self._text)
+            self._refresh()
 
     def _on_reading(self, reading: MagnificationReading) -> None:
         self._reading = reading
@@ -93,6 +110,8 @@ class ParameterServer(SemNode):
         source = self._calibration
         if source is None or source.current is None or self._reading is None:
             return
+        if not source.has_published:
+            return  # the file given at start has to wait
         width = self.settings["image_width"] or source.current.image_width
         height = self.settings["image_height"] or source.current.image_height
         try:
@@ -126,20 +145,19 @@ class ParameterServer(SemNode):
 
     # -- services ----------------------------------------------------------------------------------
 
-    def _on_reload(self, _request: Any, response: Any) -> Any:
+    def _on_reload(self) -> str:
         path = self.settings["calibration"]
+        if not path or self._calibration is None:
+            raise InvalidValueError(
+                "no calibration file to read again",
+                expected="the parameter calibration to be set",
+            )
         try:
-            if not path or self._calibration is None:
-                raise InvalidValueError(
-                    "no calibration file to read again",
-                    expected="the parameter calibration to be set",
-                )
             self._calibration.load(path)
-            response.success, response.message = True, f"read {path}"
         except SemcalError as error:
             self.reject(error)
-            response.success, response.message = False, str(error)
-        return response
+            raise
+        return f"read {path}"
 
     # -- continuous parameters -----------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -12,6 +13,8 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 __all__ = ["image_input", "latched", "overridable", "relaxed", "stream_output", "value_input"]
+
+_LARGEST_DEPTH = 2**31 - 1
 
 
 def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
@@ -24,8 +27,11 @@ def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 
 
 def image_input() -> QoSProfile:
-    """Only the newest image waits while one is being processed."""
-    return _profile(1, DurabilityPolicy.VOLATILE)
+    """A few images wait while one is being processed, so that a hiccup loses none.
+
+    Those that have waited for too long are passed over by :class:`~semcal_ros.nodes.stream.FrameInput`.
+    """
+    return _profile(10, DurabilityPolicy.VOLATILE)
 
 
 def value_input(depth: int = 100) -> QoSProfile:
@@ -33,7 +39,7 @@ def value_input(depth: int = 100) -> QoSProfile:
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def stream_output(depth: int = 2) -> QoSProfile:
+def stream_output(depth: int = 8) -> QoSProfile:
     """Images and what goes with each of them."""
     return _profile(depth, DurabilityPolicy.VOLATILE)
 
@@ -51,7 +57,13 @@ def overridable() -> QoSOverridingOptions:
         QoSPolicyKind.RELIABILITY,
         QoSPolicyKind.DURABILITY,
     )
-    return QoSOverridingOptions(kinds)
+    return QoSOverridingOptions(kinds, callback=_checked)
+
+
+def _checked(profile: QoSProfile) -> SetParametersResult:
+    good = 0 <= profile.depth <= _LARGEST_DEPTH
+    reason = "" if good else f"a depth of {profile.depth}; expected 0 to {_LARGEST_DEPTH}"
+    return SetParametersResult(successful=good, reason=reason)
 
 
 def relaxed(profile: QoSProfile, refused: QoSPolicyKind) -> QoSProfile | None:

@@ -41,8 +41,8 @@ class RectifierNode(CalibratedStreamNode):
             if g is None:
                 return
             camera = self.camera(frame, g)
-        image = self.rectifier.rectify(frame.image, camera)
-        self.output.publish(image, camera, frame)
+        self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
+        self.output.publish(None if frame.mixed else camera, frame)
 
 
 def main(args: Sequence[str] | None = None) -> int:

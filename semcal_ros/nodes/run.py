@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import rclpy
 from rclpy.exceptions import (
@@ -20,10 +21,15 @@ from rclpy.executors import (
     SingleThreadedExecutor,
 )
 from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.errors import ConfigError, SemcalError
+from semcal_ros.nodes.security import check_security
 
 __all__ = ["run_node"]
+
+# A thread that computes beside the stream must not keep the interpreter for long when a frame has come.
+_SWITCH_S = 5e-4
 
 _START_ERRORS = (
     SemcalError,
@@ -32,6 +38,7 @@ _START_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,
     ParameterUninitializedException,
+    InvalidQosOverridesError,
 )
 
 
@@ -53,23 +60,49 @@ def run_node(
     -------
     Exit status: 0, or 2 after one line on stderr if the node cannot start with what it was given.
     """
+    sys.setswitchinterval(_SWITCH_S)
     try:
-        rclpy.init(args=None if args is None else [sys.argv[0], *args])
-        return _spin(factory, threads)
+        try:
+            check_security()
+            with _refusals():
+                rclpy.init(args=None if args is None else [sys.argv[0], *args])
+            node = _made(factory)
+        except _START_ERRORS as error:
+            print(" ".join(str(error).split()), file=sys.stderr)
+            return 2
+        # What goes wrong from here on is not a matter of what the node was given.
+        return 0 if node is None else _spin(node, threads)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except _START_ERRORS as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        return 2
     finally:
         rclpy.try_shutdown()
 
 
-def _spin(factory: Callable[[], Node], threads: int) -> int:
-    node: Node | None = None
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Turn what ROS refuses at the start, such as a process without its enclave, into an error of the suite."""
+    was_up = rclpy.ok()
+    try:
+        yield
+    except RuntimeError as error:
+        if was_up and not rclpy.ok():
+            raise  # a signal has shut the middleware down
+        raise ConfigError(f"ROS refuses to start: {error}") from error
+
+
+def _made(factory: Callable[[], Node]) -> Node | None:
+    """The node, or None where a signal has shut the middleware down while it was being made."""
+    try:
+        with _refusals():
+            return factory()
+    except RuntimeError:
+        # All others have become errors of the suite.
+        return None
+
+
+def _spin(node: Node, threads: int) -> int:
     executor: Executor | None = None
     try:
-        node = factory()
         executor = (
             MultiThreadedExecutor(num_threads=threads) if threads > 1 else SingleThreadedExecutor()
         )
@@ -78,12 +111,11 @@ def _spin(factory: Callable[[], Node], threads: int) -> int:
     except ExternalShutdownException:
         pass
     except RuntimeError:
-        # A signal can shut the middleware down at any moment, even while the node is being made.
+        # A signal can shut the middleware down at any moment.
         if rclpy.ok():
             raise
     finally:
         if executor is not None:
             executor.shutdown(timeout_sec=1.0)
-        if node is not None:
-            node.destroy_node()
+        node.destroy_node()
     return int(getattr(node, "exit_status", 0))

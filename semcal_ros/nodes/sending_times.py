@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 from collections import OrderedDict
 
-from sensor_msgs.msg import Image
-
+from semcal_ros.bridge.config import ImageConfig
 from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.message_types import message_class
 from semcal_ros.nodes.qos import stream_output
 from semcal_ros.nodes.subscription import MessageInfo, published_ns
 
@@ -30,16 +30,22 @@ class SendingTimes:
     ----------
     node
         The node.
-    topic
-        Topic of the originals; None where the frames are the originals.
+    source
+        The originals, whose type begins with a header; None where the frames are the originals.
     """
 
-    def __init__(self, node: SemNode, topic: str | None) -> None:
+    def __init__(self, node: SemNode, source: ImageConfig | None) -> None:
         self._times: OrderedDict[int, int] = OrderedDict()
         self._originals = (
             None
-            if topic is None
-            else node.listen(Image, topic, self._on_original, stream_output(10), raw=True)
+            if source is None
+            else node.listen(
+                message_class(source.type),
+                source.topic,
+                self._on_original,
+                stream_output(10),
+                raw=True,
+            )
         )
 
     def _on_original(self, serialized: bytes, info: MessageInfo) -> None:

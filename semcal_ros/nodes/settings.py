@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -17,8 +18,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.files.confined import AllowedPaths
 
-__all__ = ["CALIBRATION", "CONFIG", "INTERPOLATION", "Setting", "Settings"]
+__all__ = ["CALIBRATION", "CONFIG", "DIRECTORY", "INTERPOLATION", "Setting", "Settings"]
 
 Check = Callable[[Any], None]
 Apply = Callable[[Any], None]
@@ -40,6 +42,8 @@ class Setting:
         The accepted strings; any without.
     fixed
         Only read when the node starts.
+    confined
+        The name of a file, which once the node runs must lie inside of :data:`DIRECTORY`.
     """
 
     name: str
@@ -50,6 +54,7 @@ class Setting:
     high: float | None = None
     choices: tuple[str, ...] = ()
     fixed: bool = False
+    confined: bool = False
 
     @property
     def is_float(self) -> bool:
@@ -105,8 +110,17 @@ CONFIG = Setting(
     "Description of the microscope's topics: a msg_configs file or the name of one that is shipped.",
     fixed=True,
 )
+DIRECTORY = Setting(
+    "directory",
+    "",
+    "Folder in which files lie that are named while the node runs; empty: that of the file given at start.",
+    fixed=True,
+)
 CALIBRATION = Setting(
-    "calibration", "", "Calibration file; empty to wait for one on the topic `calibration`."
+    "calibration",
+    "",
+    "Calibration file; empty to wait for one on the topic `calibration`.",
+    confined=True,
 )
 INTERPOLATION = Setting(
     "interpolation",
@@ -138,14 +152,24 @@ class Settings:
         self._values: dict[str, Any] = {}
         self._checks: dict[str, Check] = {}
         self._applies: dict[str, Apply] = {}
+        confined = [name for name, setting in self._known.items() if setting.confined]
+        if confined:
+            self._known.setdefault(DIRECTORY.name, DIRECTORY)
         for setting in self._known.values():
             given = node.declare_parameter(setting.name, setting.default, setting.descriptor())
             self._values[setting.name] = setting.checked(given.value)
+        # Who starts the node is trusted with its files; who calls a service is not.
+        trusted = [self._values[name] for name in confined if self._values[name]]
+        self._allowed = AllowedPaths(self._values.get(DIRECTORY.name, ""), trusted)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]
+
+    def allowed_path(self, path: str) -> Path:
+        """The file behind a name, links resolved; raises :class:`InvalidValueError` if it lies elsewhere."""
+        return self._allowed.resolve(path)
 
     def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
         """Call ``apply(value)`` after each accepted change, and ``check(value)``, which may raise, before."""
@@ -160,6 +184,8 @@ class Settings:
                 if setting is None:
                     continue
                 value = setting.checked(parameter.value)
+                if setting.confined and value:
+                    self.allowed_path(value)
                 if parameter.name in self._checks:
                     self._checks[parameter.name](value)
         except SemcalError as error:

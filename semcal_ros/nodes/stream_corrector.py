@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.core.camera import ScanCamera
 from semcal_ros.nodes.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
 from semcal_ros.nodes.outputs import DriftOutput
 from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.stream import Frame, FrameInput
+from semcal_ros.nodes.stream import Frame, FrameInput, nominal_camera
 
 __all__ = ["StreamCorrector", "main"]
 
@@ -27,6 +26,12 @@ class StreamCorrector(CalibratedStreamNode):
         self._drifts = DriftOutput(self)
         self._input = FrameInput(self, self._on_frame)
 
+    def destroy_node(self) -> None:
+        """As in the base class, and the end of what runs beside the stream."""
+        if self._drift is not None:
+            self._drift.close()
+        super().destroy_node()
+
     def on_calibration(self) -> None:
         """A keyframe in the coordinates of the old calibration is of no use."""
         if self._drift is not None:
@@ -38,11 +43,14 @@ class StreamCorrector(CalibratedStreamNode):
             return
         camera = self.camera(frame, g)
         width_m = self.effective_config.display_width_m
-        used = camera or ScanCamera.nominal(g, *frame.size, width_m)
-        drift = self._drift.update(frame, used)
-        image = self.rectifier.rectify(frame.image, used, drift.raster, self.config.scan)
-        self.output.publish(image, camera, frame)
-        self._drifts.publish(drift, frame)
+        used = camera or nominal_camera(g, *frame.size, width_m)
+        drift = None if frame.mixed else self._drift.of(frame, used)
+        raster = None if drift is None else drift.raster
+        memory = self.output.memory(frame)
+        self.rectifier.rectify(frame.image, used, raster, self.config.scan, out=memory)
+        self.output.publish(None if frame.mixed else camera, frame)
+        if drift is not None:
+            self._drifts.publish(drift, frame)
 
     def conditions(self) -> list[str]:
         """As in the base class; also whether the drift is only predicted."""

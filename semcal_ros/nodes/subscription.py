@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 
 from semcal_ros.nodes.qos import overridable, relaxed
 
@@ -19,6 +20,8 @@ Callback = Callable[[Any, MessageInfo], None]
 
 # What a middleware reports that does not number its messages.
 _NO_NUMBER = 2**64 - 1
+# Of a publisher that has only just begun.
+_FIRST_NUMBERS = 5
 
 
 def published_ns(info: MessageInfo) -> int:
@@ -64,6 +67,8 @@ class AdaptiveSubscription:
         self._refused: list[QoSPolicyKind] = []
         self.topic = topic
         self.lost = 0
+        # How often a publisher has begun to count anew.
+        self.restarts = 0
         self._foreign_types: set[str] = set()
         self._guard = node.create_guard_condition(self._relax, callback_group=group)
         # The override parameters are written into the profile.
@@ -77,6 +82,12 @@ class AdaptiveSubscription:
             return ""
         kinds = ("reliability", "durability")
         return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._wished, k))
+
+    @property
+    def depth(self) -> float:
+        """How many messages may wait."""
+        profile = self._profile
+        return math.inf if profile.history == HistoryPolicy.KEEP_ALL else profile.depth
 
     def _subscribe(self, options: Any = None) -> Any:
         self._last_number = None
@@ -102,7 +113,9 @@ class AdaptiveSubscription:
             return
         # A smaller number is that of a publisher that started anew; several publishers count independently.
         missed = 0 if self._last_number is None else number - self._last_number - 1
-        if missed > 0 and self._subscription.get_publisher_count() == 1:
+        self.restarts += missed < -1 and number <= _FIRST_NUMBERS
+        # None any more: it has ended since.
+        if missed > 0 and self._subscription.get_publisher_count() <= 1:
             self.lost += missed
         self._last_number = number
 
@@ -112,13 +125,19 @@ class AdaptiveSubscription:
         An executor serves one message per topic and turn; without this, a newer image would be handled before the
         values published ahead of it.
         """
-        while True:
-            handle = self._subscription.handle
-            with handle:
-                taken = handle.take_message(self._type, self._raw)
-            if taken is None:
-                return
-            self._on_message(*taken)
+        while (taken := self.take()) is not None:
+            self._callback(*taken)
+
+    def take(self) -> tuple[Any, MessageInfo] | None:
+        """The next message that has already arrived and its information; None where none has."""
+        handle = self._subscription.handle
+        with handle:
+            taken = handle.take_message(self._type, self._raw)
+        if taken is None:
+            return None
+        message, info = taken
+        self._count_gap(info)
+        return message, info
 
     # -- quality of service ------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64, Header
 
 from semcal_ros.bridge import check_magnification, fill_header, fill_image
+from semcal_ros.bridge.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.qos import stream_output
@@ -94,6 +95,12 @@ class VirtualSem(SemNode):
 
     def _checked_source(self) -> str:
         source = self.config.magnification
+        if self.config.image.type != IMAGE_TYPE:
+            raise ConfigError(
+                f"config {self.config.name} with images in {self.config.image.type}",
+                expected=f"{IMAGE_TYPE}, which is what this node publishes",
+                do="use the configuration virtual_sem",
+            )
         if (source.quantity, source.type, source.field) != (
             "magnification",
             "std_msgs/msg/Float64",
@@ -145,7 +152,8 @@ class VirtualSem(SemNode):
 
     def _on_magnification(self, message: Any) -> None:
         try:
-            self._scene.set_magnification(check_magnification(message.data))
+            self._scene.set_magnification(check_magnification(message.data), self._now_s())
+            self._announce()
         except SemcalError as error:
             self.reject(error)
 
@@ -155,7 +163,7 @@ class VirtualSem(SemNode):
         return (self.get_clock().now().nanoseconds - self._start_ns) * 1e-9
 
     def _announce(self) -> None:
-        """Publish the magnification if it is not the published one; always before the first frame at it."""
+        """Publish the magnification if it is not the published one; the frame that is being scanned shows both."""
         if self._scene.magnification != self._announced:
             self._announced = self._scene.magnification
             self._magnification.publish(Float64(data=self._announced))
@@ -165,7 +173,6 @@ class VirtualSem(SemNode):
         # The frame that has just been completed: what the stamp means is when its first pixel was scanned.
         start_s = self._now_s() - self._scene.microscope.timing.acquisition_time_s
         try:
-            self._announce()
             frame = self._scene.frame(start_s)
             stamp_ns = self._start_ns + round((start_s - self.config.start_offset_s) * 1e9)
             header, message = Header(), Image()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,10 +15,14 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.plans import specimen_for
 from semcal_ros.synthetic.pose import Pose, rotation_about_beam
 from semcal_ros.synthetic.render import render_frame
+from semcal_ros.synthetic.specimens import Specimen
 
 __all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
 
 Array = NDArray[np.float64]
+
+# Changes of magnification that are remembered, for frames that have begun before them.
+_TURNS = 16
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,9 @@ class LiveFrame:
     start_time_s
         Stamp: start of the first pass.
     magnification
-        Magnification during the whole frame.
+        Magnification at the end of the frame.
+    mixed
+        Whether it changed while the frame was being scanned.
     pose
         Specimen plane at the centre of the acquisition without drift, stage travel included.
     drift_m
@@ -100,6 +107,7 @@ class LiveFrame:
     image: NDArray[np.uint8] | NDArray[np.uint16]
     start_time_s: float
     magnification: float
+    mixed: bool
     pose: Pose
     drift_m: Array
     square_m: float | None
@@ -146,25 +154,32 @@ class LiveScene:
         self.seed = seed
         self.stage = VirtualStage()
         self._taken = 0
-        self._magnification = 1.0
+        self._turns: list[tuple[float, float]] = []
         self.set_magnification(magnification)
-        specimen_for(kind, microscope.nominal_pixel_size_m(magnification), microscope.width, seed)
+        self._specimen(magnification)
 
     @property
     def magnification(self) -> float:
-        """Magnification of the next frame."""
-        return self._magnification
+        """Magnification that was set last."""
+        return self._turns[-1][1]
 
-    def set_magnification(self, magnification: float) -> None:
-        """Change the magnification from the next frame on.
+    def set_magnification(self, magnification: float, time_s: float = -math.inf) -> None:
+        """Change the magnification from a time on; a frame that is being scanned then shows both.
 
         Raises
         ------
         InvalidValueError
-            If it is not a positive finite number, or the microscope has no image there.
+            If it is not a positive finite number, the microscope has no image there, or the time is
+            before that of the last change.
         """
         self.microscope.camera_at(magnification)
-        self._magnification = float(magnification)
+        if self._turns and not self._turns[-1][0] <= time_s:
+            raise InvalidValueError(
+                f"a magnification set at {time_s} s",
+                expected=f"not before the last one at {self._turns[-1][0]} s",
+            )
+        self._turns = [turn for turn in self._turns if turn[0] < time_s][-_TURNS:]
+        self._turns.append((time_s, float(magnification)))
 
     def set_detector(self, **changes: object) -> None:
         """Change image settings by name, for instance ``bits=16``."""
@@ -196,19 +211,58 @@ class LiveScene:
         def displacement(time_s: Array) -> Array:
             return drift(time_s) + stage.position_at(time_s) - at_centre
 
-        g = self._magnification
-        pixel_m = self.microscope.nominal_pixel_size_m(g)
-        specimen, square_m = specimen_for(self.kind, pixel_m, self.microscope.width, self.seed)
-        image = render_frame(
+        parts = self._parts(start_time_s)
+        images = [self._image(g, start_time_s, pose, displacement) for g, _ in parts]
+        g = parts[-1][0]
+        image = images[-1]
+        if len(parts) > 1:
+            rows = self.microscope.height
+            mean = sum(part[:rows] * share for part, (_, share) in zip(images, parts, strict=True))
+            image[:rows] = np.rint(mean)
+        self._taken += 1
+        drift_m = drift(np.array([centre_s]))[0]
+        square_m = self._specimen(g)[1]
+        return LiveFrame(image, start_time_s, g, len(parts) > 1, pose, drift_m, square_m)
+
+    def _parts(self, start_time_s: float) -> list[tuple[float, Array]]:
+        """Magnifications during a frame, each with the part (h, w) of every pixel's passes that were
+        scanned at it.
+        """
+        timing = self.microscope.timing
+        height, width = self.microscope.height, self.microscope.width
+        end_s = start_time_s + timing.acquisition_time_s
+        before = sum(at_s <= start_time_s for at_s, _ in self._turns)
+        turns = [turn for turn in self._turns[max(before - 1, 0) :] if turn[0] < end_s]
+        if len(turns) < 2:
+            return [((turns or self._turns)[0][1], np.ones((height, width)))]
+        row, col = np.mgrid[:height, :width]
+        pass_s = replace(timing, averages=1).pixel_offset_s(row, col, height, width)
+        times_s = start_time_s + pass_s + timing.frame_time_s * _column(timing.averages)
+        # What each turn of the knob began, less what the next one took over.
+        begun = [np.mean(times_s >= at_s, axis=0) for at_s, _ in turns[1:]]
+        shares = [np.ones((height, width)), *begun]
+        left = [share - after for share, after in zip(shares, [*begun, 0.0], strict=True)]
+        return [(g, share) for (_, g), share in zip(turns, left, strict=True)]
+
+    def _specimen(self, magnification: float) -> tuple[Specimen, float | None]:
+        pixel_m = self.microscope.nominal_pixel_size_m(magnification)
+        return specimen_for(self.kind, pixel_m, self.microscope.width, self.seed)
+
+    def _image(
+        self, magnification: float, start_time_s: float, pose: Pose, drift: DriftFunction
+    ) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        return render_frame(
             self.microscope,
-            specimen,
+            self._specimen(magnification)[0],
             pose,
-            g,
+            magnification,
             start_time_s=start_time_s,
-            drift=displacement,
+            drift=drift,
             seed=(self.seed, self._taken),
             detector=self.detector,
         )
-        self._taken += 1
-        drift_m = drift(np.array([centre_s]))[0]
-        return LiveFrame(image, start_time_s, g, pose, drift_m, square_m)
+
+
+def _column(count: int) -> Array:
+    """(count, 1, 1) of 0, 1, 2..."""
+    return np.arange(count, dtype=np.float64)[:, None, None]

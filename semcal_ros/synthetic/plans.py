@@ -17,6 +17,7 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose, random_poses
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens import ChessGrid, FlatSpecimen, Specimen, square_for
+from semcal_ros.synthetic.target import TargetSpecimen
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",
@@ -32,7 +33,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat")
+SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target")
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
@@ -55,6 +56,8 @@ def specimen_for(
         return GoldOnCarbon(seed), None
     if kind == "flat":
         return FlatSpecimen(), None
+    if kind == "target":
+        return TargetSpecimen(), None
     raise InvalidValueError(f"specimen '{kind}'", expected=f"one of {', '.join(SPECIMEN_KINDS)}")
 
 

@@ -9,6 +9,9 @@ import pytest
 import yaml
 
 from semcal_ros.bridge.config import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    IMAGE_TYPES,
     ImageConfig,
     MagnificationConfig,
     config_names,
@@ -107,6 +110,13 @@ def test_all_keys_are_read() -> None:
         config.name = "other"  # type: ignore[misc]
 
 
+def test_images_may_be_compressed() -> None:
+    config = parse_config(edited("image.type", "sensor_msgs/msg/CompressedImage"))
+    assert config.image.type == COMPRESSED_IMAGE_TYPE
+    assert set(IMAGE_TYPES) == {IMAGE_TYPE, COMPRESSED_IMAGE_TYPE}
+    assert ImageConfig().type == IMAGE_TYPE
+
+
 @pytest.mark.parametrize(
     ("moment", "start_s", "centre_s"),
     [("start", 0.0, 1.0), ("centre", -1.0, 0.0), ("end", -2.0, -1.0)],
@@ -139,7 +149,8 @@ def test_without_scan_a_frame_is_an_instant() -> None:
         ("image.topic", "image_raw\n"),
         ("image.topic", "a//b"),
         ("image.topic", 5),
-        ("image.type", "sensor_msgs/msg/CompressedImage"),
+        ("image.type", "sensor_msgs/msg/PointCloud2"),
+        ("image.type", "sensor_msgs/CompressedImage"),
         ("image.stamp", "middle"),
         ("image.databar_rows", -1),
         ("image.databar_rows", 1.5),

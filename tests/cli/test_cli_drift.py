@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import tifffile
 from node_scenes import make_calibration
+from semcal_runs import refused, run
 
 from semcal_ros.bridge.headers import fill_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import fill_image, image_from_message
-from semcal_ros.cli import main
 from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.drift_path import DriftPath
 from semcal_ros.core.raster import ScanTiming
@@ -26,21 +26,6 @@ from semcal_ros.synthetic import Drift, drift_plan, preset
 
 FRAMES, SIZE, G = 9, 160, 20000.0
 Change = Callable[[int, np.ndarray, int], tuple[np.ndarray, int]]
-
-
-def run(*arguments: object) -> int:
-    return main([str(a) for a in arguments])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert run(*arguments) == 2
-    captured = capsys.readouterr()
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert captured.out == ""
-    return lines[0]
 
 
 def simulated(path: Path, *more: object) -> Path:

@@ -10,7 +10,7 @@ from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftTracker
 from semcal_ros.core.drift_history import DriftHistory
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, raw_from_output
+from semcal_ros.core.raw_map import RasterDrift, raw_from_output
 from semcal_ros.synthetic import Detector, Drift, GoldOnCarbon, Pose, preset, render_frame
 
 SIZE = 384

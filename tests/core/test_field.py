@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.field import ResidualField, zero_field
-from semcal_ros.core.rectify import RasterDrift, Rectifier, raw_from_output
+from semcal_ros.core.raw_map import RasterDrift, raw_from_output
+from semcal_ros.core.rectify import Rectifier
 
 SIZE = (640, 480)
 CAMERA = ScanCamera(

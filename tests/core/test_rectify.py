@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift, Rectifier, raw_from_output
+from semcal_ros.core.raw_map import RasterDrift, raw_from_output
+from semcal_ros.core.rectify import Rectifier
 
 SIZE = 192
 CAMERA = small_camera(1000.0, SIZE)
@@ -172,8 +173,64 @@ def test_bad_input_is_refused() -> None:
         Rectifier("nearest")
     with pytest.raises(InvalidValueError, match="uint8, uint16, float32"):
         Rectifier().rectify(good.astype(np.int32), CAMERA)
+    with pytest.raises(InvalidValueError, match="32766"):
+        Rectifier().rectify(np.zeros((2, 40_000), np.uint8), CAMERA)
     with pytest.raises(InvalidValueError, match="finite"):
         Rectifier().rectify(good, None, RasterDrift(np.array([np.nan, 0.0]), STILL))
     with pytest.raises(InvalidValueError, match="slow against"):
         fast = RasterDrift(STILL, np.array([0.0, 200.0]))
         Rectifier().rectify(good, None, fast, TIMING)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_writing_to_given_memory_gives_the_same_picture(dtype: type) -> None:
+    rng = np.random.default_rng(1)
+    picture = (200.0 * rng.random((100, SIZE))).astype(dtype)
+    drift = RasterDrift(np.array([1e-6, 2e-6]), np.array([1e-7, 0.0]))
+    memory = np.full(picture.nbytes + 1, 255, np.uint8)
+    # An odd address, as that of data inside of a message may be.
+    out = memory[1:].view(dtype).reshape(picture.shape) if dtype is np.uint8 else None
+    out = np.empty_like(picture) if out is None else out
+    rectifier = Rectifier()
+    for camera, moved in ((None, None), (CAMERA, None), (CAMERA, drift)):
+        for _ in range(3):
+            # The first time in bands, later from maps that were kept.
+            result = rectifier.rectify(picture, camera, moved, TIMING, out=out)
+            assert result is out
+            expected = Rectifier().rectify(picture, camera, moved, TIMING)
+            np.testing.assert_array_equal(out, expected)
+    assert memory[0] == 255
+
+
+def test_a_map_that_comes_again_gives_the_same_picture() -> None:
+    picture = np.random.default_rng(2).integers(0, 255, (300, 200), dtype=np.uint8)
+    drift = RasterDrift(np.array([1e-6, 2e-6]), np.array([1e-6, 3e-6]))
+    rectifier = Rectifier()
+    first, second, third = (rectifier.rectify(picture, CAMERA, drift, TIMING) for _ in range(3))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first, third)
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        np.empty((100, 101), np.uint8),
+        np.empty((100, 100), np.uint16),
+        np.empty((200, 200), np.uint8)[::2, ::2],
+        np.frombuffer(bytes(10_000), np.uint8).reshape(100, 100),
+    ],
+    ids=["shape", "type", "stride", "read-only"],
+)
+def test_an_output_that_does_not_fit_is_refused(out: np.ndarray) -> None:
+    with pytest.raises(InvalidValueError, match="output"):
+        Rectifier().rectify(np.zeros((100, 100), np.uint8), CAMERA, out=out)
+
+
+def test_frames_of_every_size_are_covered_by_bands() -> None:
+    # A gradient: a row that no band wrote, or that another one wrote, shows at once.
+    for width, height in ((1, 1), (7, 501), (501, 7), (20_000, 2), (333, 257)):
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        drift = RasterDrift(np.array([0.25, 0.5]), STILL)
+        out = Rectifier().rectify(x + y, None, drift)
+        inside = (slice(0, height - 1), slice(0, width - 1))
+        np.testing.assert_allclose(out[inside], (x + y + 0.75)[inside], rtol=1e-6, atol=1e-3)

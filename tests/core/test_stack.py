@@ -8,7 +8,7 @@ from drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.rectify import RasterDrift
+from semcal_ros.core.raw_map import RasterDrift
 from semcal_ros.core.stack import Stack, scanned
 
 SIZE = 128

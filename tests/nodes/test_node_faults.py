@@ -26,6 +26,7 @@ from ros_process import (
     BEST_EFFORT,
     LATCHED,
     RELIABLE,
+    REPOSITORY,
     TIMEOUT_S,
     NodeProcess,
     Peer,
@@ -39,19 +40,7 @@ from semcal_ros.core.rectify import Rectifier
 
 CALIBRATION = make_calibration()
 NODE = "/sem/rectifier"
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def calibration_file(tmp_path: Path) -> Path:
-    CALIBRATION.save(tmp_path / "cal.yaml")
-    return tmp_path / "cal.yaml"
+PROFILE = str(REPOSITORY / "dds" / "fastdds_large_images.xml")
 
 
 @dataclass
@@ -307,3 +296,35 @@ def test_a_truncated_recording_ends_the_player_with_one_line(tmp_path: Path) -> 
     assert status == 2, output
     assert "Traceback" not in output
     assert str(tmp_path) in output
+
+
+@pytest.mark.parametrize(
+    ("variables", "advised"),
+    [
+        ({}, True),
+        (
+            {
+                "FASTRTPS_DEFAULT_PROFILES_FILE": PROFILE,
+                "FASTDDS_DEFAULT_PROFILES_FILE": PROFILE,
+                "MALLOC_MMAP_THRESHOLD_": "268435456",
+                "MALLOC_TRIM_THRESHOLD_": "536870912",
+            },
+            False,
+        ),
+    ],
+    ids=["default", "profile"],
+)
+def test_images_too_large_for_the_transport_are_told(
+    peer: Peer, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], advised: bool
+) -> None:
+    """Only where it matters: a small image says nothing in either environment."""
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    publisher = peer.node.create_publisher(Image, "image_raw", RELIABLE)
+    with running("rectifier"):
+        peer.wait_for(lambda: publisher.get_subscription_count() == 1, "the subscription")
+        for count, size in enumerate((SIZE, 1100), 1):
+            publisher.publish(image_message(np.zeros((size, size), np.uint8)))
+            peer.wait_for(lambda n=count: peer.state(NODE).get("published") == str(n), "the frame")
+            said = peer.state(NODE)["message"]
+            assert ("shared memory" in said and "MALLOC" in said) == (advised and size > SIZE), said

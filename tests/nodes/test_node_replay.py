@@ -204,12 +204,15 @@ def test_ordinary_parameters_are_served_as_ever(replay: Replay) -> None:
 
 
 def test_a_bad_calibration_is_refused_and_the_old_one_stays(replay: Replay, tmp_path: Path) -> None:
-    broken = tmp_path / "broken.yaml"
+    (path,) = replay.peer.get_parameters(SERVER, "calibration")
+    # Beside the file of the start; elsewhere, its place alone would be reason enough.
+    broken = Path(path.string_value).with_name("broken.yaml")
     broken.write_text(CALIBRATION.dumps()[:500])
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(broken))
     result = replay.peer.set_parameter(SERVER, "calibration", value)
     assert not result.successful
     assert "broken.yaml" in result.reason
+    assert "a calibration" in result.reason
     (d,) = replay.peer.get_parameters(SERVER, "d@1000")
     assert d.double_array_value[0] == CALIBRATION.at(1000.0).xi_r
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,6 @@ SIZE = 192
 # A frame of eight passes at the default timing lasts 0.53 s.
 SETTINGS = {"specimen": "gold", "width": SIZE, "height": SIZE, "magnification": 4000.0}
 PIXEL_M = 0.12 / 4000.0 / SIZE
-
-
-@pytest.fixture
-def peer() -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.close()
 
 
 def pixels(message: Any) -> np.ndarray:
@@ -62,7 +54,8 @@ def test_frames_follow_magnification_and_depth(peer: Peer) -> None:
         assert not peer.set_parameter(SEM, "tilt_deg", steep).successful
 
 
-def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
+@pytest.mark.parametrize("tracking", ["every_frame", "forecast"])
+def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: str) -> None:
     """The stage moves at a known speed; the compensator finds that drift and holds the picture."""
     speed_px_s = np.array([6.0, -3.0])
     raw = peer.collect(Image, "image_raw")
@@ -70,7 +63,7 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
     drifts = peer.collect(PoseWithCovarianceStamped, "drift")
     rates = peer.collect(TwistWithCovarianceStamped, "drift_velocity")
     stage = peer.node.create_publisher(Twist, f"{SEM}/stage", RELIABLE)
-    config = {"config": "virtual_sem", **PATIENT}
+    config = {"config": "virtual_sem", "drift_tracking": tracking, **PATIENT}
     with running("drift_compensator", config), running("virtual_sem", SETTINGS):
         outputs = ("image_stabilized", "drift", "drift_velocity")
         peer.wait_heard("/sem/drift_compensator", *outputs)
@@ -83,6 +76,11 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
         peer.wait_for(lambda: min(map(len, (held, drifts, rates))) >= start + 12, "moving frames")
         twist.linear.x = twist.linear.y = 0.0
         stage.publish(twist)
+        counted = peer.wait_for(
+            lambda: peer.state("/sem/drift_compensator").get("drift_frames_forecast"), "the count"
+        )
+        # All but the first one.
+        assert (int(counted) > 10) == (tracking == "forecast")
     by_stamp = {stamp_of(m): m for m in raw}
     # This side may have found the SEM later than the compensator did.
     heard = {stamp_of(m) for m in held if stamp_of(m) >= min(by_stamp)}
@@ -95,8 +93,10 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer) -> None:
     moved = np.array([[m.pose.pose.position.x, m.pose.pose.position.y] for m in drifts])
     assert np.linalg.norm(moved[start + 10] - moved[0]) > 20.0 * PIXEL_M
     sigma = np.sqrt(drifts[start + 10].pose.covariance[0])
-    # A tenth of a px, and three per cent of the way: the scale of the display width is no better.
-    assert 0.0 < sigma < 0.1 * PIXEL_M + 0.031 * abs(moved[start + 10, 0])
+    # A tenth of a px, and three per cent of the way: the scale of the display width is no better. A
+    # forecast on a busy machine comes from a registration some frames back, when the stage had just set off.
+    base_px = 0.1 if tracking == "every_frame" else 1.0
+    assert 0.0 < sigma < base_px * PIXEL_M + 0.031 * abs(moved[start + 10, 0])
 
     def change(first: Any, last: Any) -> float:
         inner = (slice(48, -48), slice(48, -48))

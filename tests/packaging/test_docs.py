@@ -81,11 +81,17 @@ def test_every_command_is_described() -> None:
     assert described == COMMANDS
 
 
+def _options_of(command: str) -> set[str]:
+    """Options of a command and of the commands in it."""
+    module = importlib.import_module(f"semcal_ros.cli.{command}_command")
+    parts = [module.command, *getattr(module.command, "commands", {}).values()]
+    return {name for part in parts for option in part.params for name in option.opts}
+
+
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_option_is_described(command: str) -> None:
-    module = importlib.import_module(f"semcal_ros.cli.{command}_command")
     text = _text("cli.md")
-    options = {name for option in module.command.params for name in option.opts if "--" in name}
+    options = {name for name in _options_of(command) if "--" in name}
     # Those of the introduction: the output is in every example.
     options -= {"--output"}
     assert {name for name in options if name not in text} == set()
@@ -95,8 +101,7 @@ def test_named_options_exist() -> None:
     """Options in the examples and descriptions of the command line."""
     known = {"--help", "--version"}
     for command in COMMANDS:
-        module = importlib.import_module(f"semcal_ros.cli.{command}_command")
-        known |= {name for option in module.command.params for name in option.opts}
+        known |= _options_of(command)
     text = "".join(_text(name) for name in ("cli.md", "calibration.md", "sem_tiff.md", "paper.md"))
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known
 
@@ -106,7 +111,7 @@ def test_the_nodes_are_those_of_the_package() -> None:
     table = re.findall(r"^\| \[`(\w+)`\]\(#\w+\)", text, re.MULTILINE)
     sections = [h for h in re.findall(r"^## (\w+)$", text, re.MULTILINE) if "_" in h or h in NODES]
     run = re.findall(r"ros2 run semcal_ros (\w+)", "".join(p.read_text("utf-8") for p in PAGES))
-    assert len(NODES) == 7
+    assert len(NODES) == 8
     assert sorted(table) == sorted(sections) == sorted(NODES)
     assert set(run) <= set(NODES)
 

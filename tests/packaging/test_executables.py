@@ -24,6 +24,7 @@ NODES = (
     "rectifier",
     "stream_corrector",
     "virtual_sem",
+    "visual_servo",
 )
 # A process must import numpy, cv2 and rclpy and be discovered: 2 s alone, more on a busy machine.
 START_S = 60.0

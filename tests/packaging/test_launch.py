@@ -54,6 +54,18 @@ class ParameterValue:
 
 
 @dataclass
+class ShutdownProcess:
+    process_matcher: Callable[[Any], bool]
+
+    def __init__(self, *, process_matcher: Callable[[Any], bool]) -> None:
+        self.process_matcher = process_matcher
+
+
+def matches_action(action: Action) -> Callable[[Any], bool]:
+    return lambda other: other is action
+
+
+@dataclass
 class Action:
     """Any action: its arguments are kept for :func:`_visit`."""
 
@@ -75,6 +87,7 @@ ACTIONS = {
     name: type(name, (Action,), {})
     for name in (
         "DeclareLaunchArgument",
+        "EmitEvent",
         "IncludeLaunchDescription",
         "LaunchDescription",
         "Node",
@@ -91,6 +104,7 @@ STAND_INS = {
     "launch": ("LaunchDescription",),
     "launch.actions": (
         "DeclareLaunchArgument",
+        "EmitEvent",
         "IncludeLaunchDescription",
         "OpaqueFunction",
         "RegisterEventHandler",
@@ -100,6 +114,8 @@ STAND_INS = {
     ),
     "launch.conditions": (IfCondition,),
     "launch.event_handlers": ("OnProcessExit",),
+    "launch.events": (matches_action,),
+    "launch.events.process": (ShutdownProcess,),
     "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
     "launch.substitutions": (LaunchConfiguration,),
     "launch_ros": (),
@@ -120,6 +136,8 @@ class Started:
     parameters: dict[str, Any]
     ros_arguments: list[str]
     environment: dict[str, str]
+    respawn: bool
+    respawn_delay: float | None
     action: Action
 
 
@@ -166,6 +184,11 @@ def _start(action: Action, context: Context) -> None:
     options = dict(action.options)
     assert options.pop("output") == "screen"
     options.pop("condition", None)
+    # As the defaults of the original.
+    respawn = options.pop("respawn", False)
+    if isinstance(respawn, LaunchConfiguration):
+        respawn = _as_bool(respawn.perform(context))
+    options.setdefault("respawn_delay", None)
     files, parameters = [], {}
     for item in options.pop("parameters"):
         if isinstance(item, str):
@@ -181,6 +204,7 @@ def _start(action: Action, context: Context) -> None:
         files=files,
         parameters=parameters,
         environment=dict(context.environment),
+        respawn=respawn,
         action=action,
     )
     context.nodes.append(started)
@@ -377,6 +401,7 @@ def test_every_argument_is_described(run: Run) -> None:
         *REPLAY_EVERYTHING,
         "mode",
         "params_file",
+        "respawn",
         "large_images",
     }
     assert all(action.options["description"].endswith(".") for action in arguments.values())
@@ -455,36 +480,112 @@ def test_the_nodes_go_by_the_clock_that_the_player_publishes(run: Run) -> None:
         assert node.parameters[name] is True
 
 
-def _after_exit(context: Context, action: Action, status: int) -> Any:
-    """The actions that follow the exit of a process; None if nobody cares."""
-    (handler,) = context.on_exit
-    if not handler.options["target_action"](action):
-        return None
-    event = SimpleNamespace(action=action, returncode=status, process_name="name")
-    return handler.options["on_exit"](event, context)
+def _after_exit(context: Context, action: Action, status: int) -> list[Any]:
+    """The actions that follow the exit of a process."""
+    found: list[Any] = []
+    for handler in context.on_exit:
+        if handler.options["target_action"](action):
+            event = SimpleNamespace(action=action, returncode=status, process_name="name")
+            found += handler.options["on_exit"](event, context) or []
+    return found
+
+
+def _names(actions: list[Any]) -> list[str]:
+    return [type(action).__name__ for action in actions]
+
+
+def _is_started_again(context: Context, node: Started, status: int) -> bool:
+    """Whether launch does so: it waits for the delay and then looks whether the process was shut down meanwhile.
+
+    Whatever the status is: launch/actions/execute_local.py of https://github.com/ros2/launch.
+    """
+    if not node.respawn:
+        return False
+    assert node.respawn_delay, "without a delay launch does not wait for what follows the exit"
+    for action in _after_exit(context, node.action, status):
+        if type(action).__name__ == "Shutdown":
+            return False
+        if type(action).__name__ == "EmitEvent":
+            event = action.options["event"]
+            assert isinstance(event, ShutdownProcess)
+            if event.process_matcher(node.action):
+                return False
+    return True
 
 
 def test_the_end_of_the_replay_ends_everything(run: Run) -> None:
     context = run(REPLAY, BAG)
-    (timer,) = _after_exit(context, context.node("bag_player").action, 0)
+    player = context.node("bag_player")
+    (timer,) = [a for a in _after_exit(context, player.action, 0) if "period" in a.options]
     # Not at once: the last frame is still being worked on.
     assert 0.0 < timer.options["period"] <= 2.0
-    assert [type(action).__name__ for action in timer.options["actions"]] == ["Shutdown"]
+    assert _names(timer.options["actions"]) == ["Shutdown"]
 
 
 @pytest.mark.parametrize("executable", ["bag_player", "stream_corrector", "parameter_server"])
-def test_a_node_that_fails_ends_the_replay(run: Run, executable: str) -> None:
+def test_a_node_that_cannot_start_ends_the_replay(run: Run, executable: str) -> None:
     context = run(REPLAY, BAG)
-    (action,) = _after_exit(context, context.node(executable).action, 2)
-    assert type(action).__name__ == "Shutdown"
+    assert "Shutdown" in _names(_after_exit(context, context.node(executable).action, 2))
+
+
+@pytest.mark.parametrize("status", [-9, -11, 1])
+def test_a_node_that_dies_ends_the_replay_only_if_it_does_not_come_back(
+    run: Run, status: int
+) -> None:
+    for respawn in ("true", "false"):
+        context = run(REPLAY, {**BAG, "respawn": respawn})
+        for node in context.nodes:
+            ends = "Shutdown" in _names(_after_exit(context, node.action, status))
+            again = _is_started_again(context, node, status)
+            assert ends is not again
+            assert again is (respawn == "true" and node.executable != "bag_player")
 
 
 def test_other_ends_do_not_end_the_replay(run: Run) -> None:
     context = run(REPLAY, BAG)
-    assert _after_exit(context, context.node("stream_corrector").action, 0) is None
-    assert _after_exit(context, ACTIONS["Node"](package="another"), 1) is None
-    assert _after_exit(context, SimpleNamespace(), 1) is None
+    assert _names(_after_exit(context, context.node("stream_corrector").action, 0)) == ["EmitEvent"]
+    assert _after_exit(context, ACTIONS["Node"](package="another"), 1) == []
+    assert _after_exit(context, SimpleNamespace(), 1) == []
 
 
-def test_a_live_suite_survives_the_end_of_a_node(run: Run) -> None:
-    assert run(SUITE).on_exit == []
+# -- nodes that die ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["combined", "separate"])
+def test_a_node_that_dies_is_started_again_after_a_delay(run: Run, mode: str) -> None:
+    context = run(SUITE, {"mode": mode, "calibration_server": "true"})
+    for node in context.nodes:
+        assert 0.0 < node.respawn_delay <= 2.0
+        # kill -9, a crash, an exception.
+        assert all(_is_started_again(context, node, status) for status in (-9, -11, 1))
+        assert _after_exit(context, node.action, -9) == []
+
+
+@pytest.mark.parametrize("path", [SUITE, REPLAY])
+def test_a_node_that_ended_by_itself_is_not_started_again(run: Run, path: Path) -> None:
+    """Status 2: with what it was given it will never start. Status 0: it was asked to end."""
+    context = run(path, {**BAG, "calibration_server": "true"})
+    for node in context.nodes:
+        assert not _is_started_again(context, node, 2)
+        assert not _is_started_again(context, node, 0)
+
+
+def test_only_the_node_that_ended_stays_away(run: Run) -> None:
+    context = run(SUITE)
+    ended, other = context.nodes
+    (action,) = _after_exit(context, ended.action, 2)
+    matcher = action.options["event"].process_matcher
+    assert matcher(ended.action)
+    assert not matcher(other.action)
+
+
+def test_nodes_are_left_dead_if_so_wished(run: Run) -> None:
+    context = run(SUITE, {"respawn": "false"})
+    assert not any(node.respawn for node in context.nodes)
+
+
+def test_processes_of_other_packages_are_left_alone(run: Run) -> None:
+    context = run(SUITE)
+    for status in (0, 1, 2, -9):
+        assert _after_exit(context, ACTIONS["Node"](package="another"), status) == []
+        assert _after_exit(context, SimpleNamespace(), status) == []

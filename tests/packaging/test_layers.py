@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "schemas": {"core"},
     "bridge": {"core", "schemas"},
     "files": {"core", "bridge", "schemas", "calibration"},
+    "doctor": {"core", "bridge", "calibration", "nodes"},
 }
 # Layer -> distributions it may import beside the standard library.
 THIRD_PARTY = {
@@ -27,6 +28,10 @@ THIRD_PARTY = {
     "synthetic": {"numpy", "scipy", "cv2"},
     "bridge": {"numpy", "scipy", "cv2", "yaml", "jsonschema"},
 }
+# What the doctor takes from the nodes: the parts of them that need no ROS.
+FROM_NODES = {"dds_profile", "message_types", "transport"}
+# The places of ROS: the nodes, and the one module of the doctor that listens.
+ROS_PLACES = (PACKAGE / "nodes", PACKAGE / "doctor" / "live.py")
 # Files, clocks, processes and logging have no place in core.
 NOT_IN_CORE = {
     "asyncio",
@@ -116,16 +121,39 @@ def test_a_layer_imports_only_its_libraries(layer: str) -> None:
     assert not wrong
 
 
-def test_ros_is_imported_by_nodes_only() -> None:
+def test_ros_is_imported_by_nodes_and_the_listener_only() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}: {name}"
         for path in PACKAGE.rglob("*.py")
-        if "nodes" not in path.relative_to(PACKAGE).parts
+        if not any(path.is_relative_to(place) for place in ROS_PLACES)
         for name in _imports(path)
         if name.partition(".")[0] in {"rclpy", "ament_index_python", "std_srvs", "launch"}
         or name.partition(".")[0].endswith("_msgs")
     ]
     assert not wrong
+
+
+def test_the_doctor_takes_of_the_nodes_what_needs_no_ros() -> None:
+    taken = {
+        name.split(".")[2]
+        for path in _sources("doctor")
+        for name in _imports(path)
+        if name.startswith("semcal_ros.nodes.")
+    }
+    assert taken == FROM_NODES
+    for part in taken:
+        done = _run(
+            BLOCKER.partition("import semcal_ros.core")[0] + f"import semcal_ros.nodes.{part}"
+        )
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_doctor_works_without_ros() -> None:
+    """Its command and all checks; only the listener is loaded later."""
+    done = _run(
+        WITHOUT_ROS.partition("from semcal_ros")[0] + "import semcal_ros.cli.doctor_command"
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_core_has_no_files_clocks_or_logging() -> None:

@@ -292,6 +292,31 @@ def test_magnification_and_image_settings_change_while_running() -> None:
         LiveScene(preset("jsm820"), "wood")
 
 
+def test_a_frame_during_a_change_of_magnification_shows_both() -> None:
+    microscope = preset("jsm820").with_image_size(128, 128).with_timing(ScanTiming(1.0, 2))
+    scenes = [
+        LiveScene(microscope, "grid", magnification=g, detector=NOISE_FREE)
+        for g in (2000.0, 4000.0)
+    ]
+    before, after = (scene.frame(0.0).image.astype(int) for scene in scenes)
+    scene = scenes[0]
+    # In the second of two passes, at row 64: the rows above saw the old one twice.
+    scene.set_magnification(4000.0, 1.5)
+    mixed = scene.frame(0.0)
+    assert (mixed.mixed, mixed.magnification) == (True, 4000.0)
+    np.testing.assert_allclose(mixed.image[:64], before[:64], atol=1)
+    np.testing.assert_allclose(mixed.image[65:], 0.5 * (before + after)[65:], atol=1)
+    assert np.abs(before - after)[65:].max() > 50
+    # Before and after it, frames are whole.
+    assert not scene.frame(-1.0).mixed
+    assert scene.frame(-1.0).magnification == 2000.0
+    whole = scene.frame(1.5)
+    assert (whole.mixed, whole.magnification) == (False, 4000.0)
+    np.testing.assert_array_equal(whole.image, after)
+    with pytest.raises(InvalidValueError, match="before"):
+        scene.set_magnification(3000.0, 1.0)
+
+
 # -- layering -------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,42 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import TiffError
 
-__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "grey_image", "page_size"]
+__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
 
 MAX_SIDE_PX = 65_536
 MAX_PIXELS = 2**29
+_MAX_SAMPLES = 4
+# Above what Deflate (1032) and LZW reach: beyond, the pixels are not in the file.
+_MAX_PACKING = 4096
+# Tags of one number: sizes, compression, photometric, orientation, samples, rows per strip, planes, predictor, tiles.
+_SINGLE = frozenset({256, 257, 259, 262, 266, 274, 277, 278, 284, 317, 322, 323})
+# Offset of the first directory, number of its entries, and an entry's code, type, count and value.
+_LAYOUTS = {42: (4, "I", "H", "HHI4x"), 43: (8, "Q", "Q", "HHQ8x")}
 _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+
+
+def check_counts(path: Path) -> None:
+    """Refuse a first directory with several numbers where there is one: the parser would multiply them.
+
+    Other damage is left to the parser, ``struct.error`` and ``OSError`` included.
+    """
+    with path.open("rb") as file:
+        head = file.read(16)
+        order = {b"II": "<", b"MM": ">"}.get(head[:2])
+        layout = _LAYOUTS.get(struct.unpack_from(order + "H", head, 2)[0]) if order else None
+        if order is None or layout is None:
+            return
+        place, offset_code, number_code, entry_code = layout
+        file.seek(struct.unpack_from(order + offset_code, head, place)[0])
+        number_size = struct.calcsize(order + number_code)
+        (number,) = struct.unpack(order + number_code, file.read(number_size))
+        size = struct.calcsize(order + entry_code)
+        entries = file.read(min(number, 2**16) * size)
+    for code, _, count in struct.iter_unpack(
+        order + entry_code, entries[: len(entries) // size * size]
+    ):
+        if code in _SINGLE and count != 1:
+            raise TiffError(f"{path.name} has {count} values in tag {code}", expected="one")
 
 
 def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
@@ -25,7 +57,7 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
     Raises
     ------
     TiffError
-        The page is empty or too large to be an SEM image.
+        The page is empty, too large to be an SEM image, or larger than its file can hold.
     """
     width, height = int(page.imagewidth), int(page.imagelength)
     if not (
@@ -39,6 +71,18 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
     bits = page.bitspersample
     if bits not in (8, 16) or page.imagedepth != 1:
         raise TiffError(f"{path.name} has {bits} bits per sample", expected="8 or 16")
+    samples = int(page.samplesperpixel)
+    if not 1 <= samples <= _MAX_SAMPLES:
+        raise TiffError(
+            f"{path.name} has {samples} samples per pixel", expected=f"1 to {_MAX_SAMPLES}"
+        )
+    size, needed = path.stat().st_size, width * height * samples * bits // 8
+    if needed > size * (1 if page.compression == tifffile.COMPRESSION.NONE else _MAX_PACKING):
+        raise TiffError(
+            f"{path.name} declares {width} x {height} pixels in a file of {size} bytes",
+            expected="a file that holds its pixels",
+            do="copy it again from the microscope",
+        )
     return width, height
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff import tescan, thermo_fisher, zeiss
 from semcal_ros.files.tiff.jeol import jeol_pairs, jeol_settings
-from semcal_ros.files.tiff.pixels import grey_image, page_size
+from semcal_ros.files.tiff.pixels import check_counts, grey_image, page_size
 from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
 
 __all__ = ["is_tiff", "read_sem_settings", "read_sem_tiff"]
@@ -35,6 +36,7 @@ _PARSER_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     EOFError,
     struct.error,
+    zlib.error,
     cv2.error,
 )
 
@@ -46,14 +48,16 @@ def is_tiff(path: Path) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the TIFF parser from logging what is reported as an error here."""
+    """Keep the TIFF parsers from logging what is reported as an error here, and unknown tags."""
     logger = logging.getLogger("tifffile")
-    before = logger.disabled
+    before, opencv = logger.disabled, cv2.utils.logging.getLogLevel()
     logger.disabled = True
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
         logger.disabled = before
+        cv2.utils.logging.setLogLevel(opencv)
 
 
 def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
@@ -111,6 +115,14 @@ def _parsing(path: Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
+    with _parsing(path):
+        check_counts(path)
+        with tifffile.TiffFile(path) as file:
+            yield file
+
+
 def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
     page = file.pages.first
     if not isinstance(page, tifffile.TiffPage):
@@ -121,7 +133,7 @@ def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
 def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
     """Settings and stored (width, height), pixels undecoded; errors as :func:`read_sem_tiff`."""
     path = Path(path)
-    with _parsing(path), tifffile.TiffFile(path) as file:
+    with _opened(path) as file:
         page = _first_page(file, path)
         size_px = page_size(path, page)
         return _settings(path, page, size_px), size_px
@@ -143,7 +155,7 @@ def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemIm
         Missing, truncated or no TIFF; no known metadata; no usable pixel size; an absurd size.
     """
     path = Path(path)
-    with _parsing(path), tifffile.TiffFile(path) as file:
+    with _opened(path) as file:
         page = _first_page(file, path)
         settings = _settings(path, page, page_size(path, page))
         image: NDArray[Any] = grey_image(path, page)

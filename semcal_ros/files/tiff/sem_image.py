@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -105,7 +106,8 @@ class SemImage:
     def display_width_m(self) -> float | None:
         """Display width of the shown magnification: pixel size x columns x magnification."""
         shown = self.settings.displayed_magnification
-        return None if shown is None else self.field_width_m * shown
+        width_m = None if shown is None else self.field_width_m * shown
+        return width_m if width_m is not None and math.isfinite(width_m) else None
 
     @property
     def working_distance_m(self) -> float | None:

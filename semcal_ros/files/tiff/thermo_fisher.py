@@ -52,7 +52,7 @@ def _magnification(tag: Mapping[str, Any], field_width_m: float) -> tuple[float 
             "and the databar may show a third"
         )
     width = canvas or screen
-    return (None if width is None else width / field_width_m), notes
+    return (None if width is None else positive(width / field_width_m)), notes
 
 
 def thermo_fisher_settings(

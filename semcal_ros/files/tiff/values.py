@@ -21,16 +21,17 @@ __all__ = [
 PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)
 _YEARS = (1971, 2037)
 
-_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
 
 
 def _split(text: object) -> tuple[float, str] | None:
-    match = _NUMBER.match(str(text).replace("\x00", " "))
+    stripped = str(text).replace("\x00", " ").strip()
+    match = _NUMBER.match(stripped)
     if match is None:
         return None
-    value = float(match.group(1))
-    return (value, match.group(2)) if math.isfinite(value) else None
+    value = float(match.group())
+    return (value, stripped[match.end() :].lstrip()) if math.isfinite(value) else None
 
 
 def _unit_scale(unit: str, base: str) -> float | None:
@@ -61,7 +62,9 @@ def quantity(text: object, base: str, *, default_unit: str = "") -> float | None
         return None
     value, unit = parts
     scale = _unit_scale(unit or default_unit, base)
-    return None if scale is None else value * scale
+    if scale is None or not math.isfinite(value * scale):
+        return None
+    return value * scale
 
 
 def plain_number(text: object) -> float | None:

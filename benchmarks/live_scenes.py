@@ -1,0 +1,79 @@
+"""The microscope, the calibration and the pictures of the live benchmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros import Calibration
+from semcal_ros.core.functions import ContinuousFunction
+from semcal_ros.core.raster import ScanTiming
+
+
+@dataclass(frozen=True)
+class Config:
+    """A microscope that scans a frame in ``frame_time_s``."""
+
+    frame_time_s: float
+
+    @property
+    def scan(self) -> ScanTiming:
+        return ScanTiming(self.frame_time_s)
+
+    @property
+    def text(self) -> str:
+        return (
+            "name: benchmark\ndisplay_width_m: 0.12\n"
+            "magnification: {quantity: magnification}\n"
+            f"scan: {{frame_time_s: {self.frame_time_s}}}\n"
+        )
+
+
+CONFIG = Config(0.08)
+
+
+def calibration() -> Calibration:
+    """A calibration with a little of every distortion, for 512 x 512."""
+    limits = (500.0, 20000.0)
+    values = {"scale": 1.01, "aspect": 1.004, "skew": 0.001, "px": 250.0, "py": 262.0, "rho": 50.0}
+    values |= {"xi_r": 0.01, "xi_t": 0.001, "ex": 235.0, "ey": 268.0}
+    functions = {
+        name: ContinuousFunction("chebyshev_log", np.array([value]), limits)
+        for name, value in values.items()
+    }
+    return Calibration(
+        functions=functions,
+        covariance=np.eye(len(values)) * 1e-8,
+        image_width=512,
+        image_height=512,
+        display_width_m=0.12,
+        magnifications=limits,
+        method="joint",
+    )
+
+
+def pictures(size: int, depth: int = 8, count: int = 16) -> list[np.ndarray]:
+    """A random texture that drifts slowly on a circle, with noise.
+
+    A fifth of a pixel of 512 per frame, so that every frame can be tracked.
+    """
+    rng = np.random.default_rng(0)
+    wide = rng.standard_normal((size + 16, size + 16), dtype=np.float32)
+    wide = cv2.GaussianBlur(wide, (0, 0), 2.5)
+    wide *= 40.0 / wide.std()
+    # One noise, rolled: drawing it anew is slow at 4096.
+    noise = rng.standard_normal((size, size), dtype=np.float32) * 5.0
+    radius = 0.5 * size / 512
+    scale, kind = (1.0, np.uint8) if depth == 8 else (257.0, np.uint16)
+    out = []
+    for k in range(count):
+        angle = 2.0 * np.pi * k / count
+        x, y = radius * np.cos(angle) - 8.0, radius * np.sin(angle) - 8.0
+        moved = cv2.warpAffine(
+            wide, np.array([[1.0, 0.0, x], [0.0, 1.0, y]]), (size, size), flags=cv2.INTER_CUBIC
+        )
+        grey = np.clip(128.0 + moved + np.roll(noise, 37 * k), 0, 255)
+        out.append((scale * grey).astype(kind))
+    return out

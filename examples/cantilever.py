@@ -1,0 +1,186 @@
+"""Bending of a cantilever, as in section 4.3 of Malti et al. (2012), on the virtual SEM.
+
+1. A chess grid is recorded and calibrated with `semcal calibrate`.
+2. A cantilever of 35 x 3.5 um is recorded at 6450x, 7760x and 8890x, which were never calibrated: 11 poses, straight,
+   pushed by up to 250 nm at pose 7, and back, under drift and with the noise of 8-bit frames.
+3. `semcal measure cantilever` measures it; the result is compared with the truth.
+
+At a display width of 0.12 m, 35 um are more than the field (18.6 um at 6450x). So there are two experiments: `end` has
+the display width of the JSM-820 and only the free end in view; `whole` has one of 0.4 m and all of the cantilever.
+
+Everything lands in cantilever_output/. `--quick` takes fewer frames and magnifications.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import fill_image
+from semcal_ros.files.bags import BagWriter, blank_message
+from semcal_ros.synthetic import Drift, RecordingPlan, VirtualMicroscope, calibration_plan, preset
+from semcal_ros.synthetic.cantilever import CANTILEVER_PUSHES, CantileverPlan, cantilever_plan
+
+START_NS = 1_700_000_000_000_000_000
+GRID = (100, 250, 600, 1200, 2500, 4000, 5500, 7000, 8500, 10000)
+QUICK_GRID = (1500, 4000, 7000, 10000)
+LENGTH_M = 35e-6
+DRIFT = Drift(velocity_m_s=(1.1e-9, -0.8e-9), settling_m=(90e-9, -60e-9), wander_m=12e-9, seed=5)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is recorded."""
+
+    name: str
+    microscope: VirtualMicroscope
+    size: int
+    view: Any
+    frames_per_pose: int
+
+
+EXPERIMENTS = (
+    Experiment("end", preset("jsm820"), 512, "end", 1),
+    Experiment("whole", replace(preset("jsm820"), display_width_m=0.4), 1024, "whole", 2),
+)
+
+
+def semcal(*arguments: object) -> None:
+    """Run the command as a user would, and stop if it fails."""
+    command = [str(Path(sys.executable).with_name("semcal")), *map(str, arguments)]
+    print("\n$ semcal", *arguments, flush=True)
+    subprocess.run(command, check=True)
+
+
+def record(plan: RecordingPlan | CantileverPlan, folder: Path) -> None:
+    """Write a plan to a bag."""
+    magnification = None
+    with BagWriter(folder, overwrite=True) as writer:
+        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
+        for index, frame in enumerate(plan.frames):
+            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
+            if frame.magnification != magnification:
+                magnification = frame.magnification
+                value = blank_message("std_msgs/msg/Float64")
+                value.data = magnification
+                writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
+            header = blank_message("std_msgs/msg/Header")
+            fill_header(header, stamp_ns, "sem_optical")
+            image = blank_message("sensor_msgs/msg/Image")
+            fill_image(image, plan.render(index), "mono8", header)
+            writer.write("/sem/image_raw", stamp_ns, image)
+        if isinstance(plan, CantileverPlan):
+            writer.write_text("truth.json", json.dumps(plan.truth(), indent=1))
+    print(f"{len(plan)} frames: {folder}", flush=True)
+
+
+def config_of(microscope: VirtualMicroscope, folder: Path) -> Path:
+    """The microscope's configuration as a user would write it."""
+    timing = microscope.timing
+    path = folder / "microscope.yaml"
+    path.write_text(
+        "name: virtual SEM\n"
+        f"display_width_m: {microscope.display_width_m}\n"
+        "magnification: {quantity: magnification}\n"
+        f"scan: {{frame_time_s: {timing.frame_time_s}, averages: {timing.averages}, "
+        f"flyback_fraction: {timing.flyback_fraction}}}\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def compare(folder: Path) -> dict[str, float]:
+    """Errors against the truth, nm, and errors over stated sigma."""
+    truth = json.loads((folder / "bending" / "truth.json").read_text(encoding="utf-8"))["frames"]
+    stamps = {START_NS + round(f["start_time_s"] * 1e9): f for f in truth}
+    errors: dict[str, list[float]] = defaultdict(list)
+    poses: dict[tuple[str, int], list[float]] = defaultdict(list)
+    with (folder / "bending.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            true = stamps[int(row["stamp_ns"])]["deflection_m"]
+            if int(row["pose"]) == 1:
+                continue  # the reference
+            for name, value, sigma in (
+                ("calibrated", "deflection_m", "sigma_m"),
+                ("length", "deflection_by_length_m", "sigma_by_length_m"),
+            ):
+                error = float(row[value]) - true
+                errors[name].append(error)
+                errors[name + "_z"].append(error / float(row[sigma]))
+                poses[name, int(row["pose"])].append(error)
+    out = {name: float(np.sqrt(np.mean(np.square(v)))) for name, v in errors.items()}
+    for name in ("calibrated", "length"):
+        out[name + "_largest"] = float(np.max(np.abs(errors[name])))
+        out[name + "_bias"] = float(np.mean(errors[name]))
+    return out
+
+
+def run(experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: str) -> None:
+    folder = output / experiment.name
+    folder.mkdir(parents=True)
+    microscope = experiment.microscope
+    config = config_of(microscope, folder)
+    grid = calibration_plan(
+        microscope, magnifications=QUICK_GRID if quick else GRID, views=3 if quick else 5, seed=seed
+    )
+    record(grid, folder / "grid")
+    calibration = folder / "cal.yaml"
+    semcal("calibrate", folder / "grid", "--config", config, "-o", calibration)
+    size = experiment.size // 2 if quick and experiment.size > 512 else experiment.size
+    plan = cantilever_plan(
+        microscope.with_image_size(size, size),
+        view=experiment.view,
+        frames_per_pose=experiment.frames_per_pose,
+        pushes=(0.0, 0.4, 1.0, 0.0) if quick else CANTILEVER_PUSHES,
+        drift=DRIFT,
+        seed=seed,
+    )
+    record(plan, folder / "bending")
+    poses = len({frame.pose for frame in plan.frames})
+    measured = ("measure", "cantilever", folder / "bending", "--calibration", calibration)
+    where = ("--config", config, "--length", LENGTH_M, "--poses", poses, "--shape", shape)
+    outputs = ("-o", folder / "bending.csv", "--plot", folder / "poses.png")
+    semcal(*measured, *where, *outputs, "--strip", folder / "strip.png")
+    errors = compare(folder)
+    for name in ("calibrated", "length"):
+        if np.isfinite(errors[name]):
+            print(
+                f"{experiment.name}, scale from the {name}: error against the truth "
+                f"{1e9 * errors[name]:.2f} nm RMS, {1e9 * errors[name + '_largest']:.2f} nm at most, "
+                f"mean {1e9 * errors[name + '_bias']:.2f} nm; error over sigma {errors[name + '_z']:.2f}"
+            )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer frames and magnifications")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--shape", default="free")
+    parser.add_argument("--only", choices=[e.name for e in EXPERIMENTS])
+    parser.add_argument("-o", "--output", type=Path, default=Path("cantilever_output"))
+    given = parser.parse_args()
+    started = time.monotonic()
+    shutil.rmtree(given.output, ignore_errors=True)
+    for experiment in EXPERIMENTS:
+        if given.only in (None, experiment.name):
+            run(experiment, given.output, quick=given.quick, seed=given.seed, shape=given.shape)
+    print(
+        f"\nLook at {given.output}/*/poses.png and strip.png ({time.monotonic() - started:.0f} s)"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""A ball of 900 nm on a tip, reconstructed from a recording at 9000x to 10 000x.
+
+After section 4.4 of Malti et al. (2012). The virtual SEM records the chess grid and the ball; the grid is
+calibrated, the ball is reconstructed with that calibration and compared with the truth, which nothing before has
+seen.
+
+    .venv/bin/python examples/nano_ball.py            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
+    .venv/bin/python examples/nano_ball.py --quick    # 120 frames
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import trimesh
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from semcal_ros import Calibration
+from semcal_ros.bridge.config import load_config
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import fill_image
+from semcal_ros.cli import main as semcal
+from semcal_ros.core.structure import Keyframe, SequenceTracker
+from semcal_ros.files.bags import BagWriter, blank_message
+from semcal_ros.files.recordings import open_recording
+from semcal_ros.report.ball_figures import small_png
+from semcal_ros.report.style import INK, OURS, SECOND, new_figure, tidy
+from semcal_ros.synthetic.ball import BallPlan, ball_plan
+from semcal_ros.synthetic.drift import drift_preset
+
+START_NS = 1_700_000_000_000_000_000
+GRID_MAGNIFICATIONS = (100, 500, 1000, 2000, 3000, 4500, 6000, 7500, 9000, 10000)
+CONFIG = """\
+name: virtual SEM, ten strips per second
+display_width_m: 0.12
+magnification: {topic: magnification, quantity: magnification}
+scan: {frame_time_s: 0.1, averages: 1, flyback_fraction: 0.1}
+"""
+
+
+def run(*arguments: object) -> str:
+    """Call ``semcal`` as from a shell; returns what it prints."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        status = semcal([str(a) for a in arguments])
+    if status:
+        raise SystemExit(f"semcal {arguments[0]} ended with status {status}")
+    return printed.getvalue()
+
+
+# -- recording ------------------------------------------------------------------------------------
+
+
+def record(plan: BallPlan, path: Path) -> None:
+    """Write the ball to a bag with its truth beside it; frames are drawn on all processors."""
+    drawn = Parallel(n_jobs=-1, return_as="generator")(
+        delayed(plan.render)(index) for index in range(len(plan))
+    )
+    magnification = None
+    with BagWriter(path, overwrite=True) as writer:
+        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
+        bar = tqdm(drawn, total=len(plan), desc="simulating", unit="frame", disable=None)
+        for frame, pixels in zip(plan.frames, bar, strict=True):
+            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
+            if frame.magnification != magnification:
+                magnification = frame.magnification
+                value = blank_message("std_msgs/msg/Float64")
+                value.data = magnification
+                writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
+            header = blank_message("std_msgs/msg/Header")
+            fill_header(header, stamp_ns, "sem_optical")
+            image = blank_message("sensor_msgs/msg/Image")
+            fill_image(image, pixels, "mono8", header)
+            writer.write("/sem/image_raw", stamp_ns, image)
+        writer.write_text("truth.json", json.dumps(plan.truth()))
+
+
+# -- comparison -----------------------------------------------------------------------------------
+
+
+def distances_nm(points: np.ndarray, diameter_nm: float) -> np.ndarray:
+    """Distances of points (n, 3) from a sphere of the true size at the best place.
+
+    The place is free because nothing fixes it: drift and the manipulator move the ball as they like.
+    """
+    centre = points.mean(axis=0)
+    for _ in range(50):
+        offset = points - centre
+        length = np.linalg.norm(offset, axis=1)
+        outward = offset / length[:, None]
+        centre = centre + np.linalg.lstsq(outward, length - diameter_nm / 2.0, rcond=None)[0]
+    return np.linalg.norm(points - centre, axis=1) - diameter_nm / 2.0
+
+
+def compared(cloud: Path, mesh: Path, truth: dict, result: dict) -> dict[str, float]:
+    """What was measured against the truth."""
+    true_nm = 1e9 * truth["ball_diameter_m"]
+    made = trimesh.load(cloud, process=False)
+    raw = made.metadata["_ply_raw"]["vertex"]["data"]
+    points = np.asarray(made.vertices)[np.asarray(raw["on_ball"]).ravel() > 0.5]
+    vertices = np.asarray(trimesh.load(mesh, process=False).vertices)
+    low, high = (1e9 * v for v in result["diameter_interval_m"])
+    return {
+        "diameter_error_percent": 100.0 * (1e9 * result["diameter_m"] / true_nm - 1.0),
+        "interval_holds_truth": float(low <= true_nm <= high),
+        "points_rms_nm": float(np.sqrt(np.mean(distances_nm(points, true_nm) ** 2))),
+        "mesh_rms_nm": float(np.sqrt(np.mean(distances_nm(vertices, true_nm) ** 2))),
+    }
+
+
+# -- figures --------------------------------------------------------------------------------------
+
+
+def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) -> bytes:
+    """Some frames with the features that are followed, as in Fig. 17(a) of the paper."""
+    tracker = SequenceTracker()
+    with open_recording(bag, load_config(str(config))) as opened:
+        for number, frame in enumerate(opened.frames()):
+            if number >= frames:
+                break
+            height, width = frame.image.shape
+            camera = model.at(frame.magnification).resized(width, height)
+            tracker.add(frame.image, camera, (frame.stamp_ns - START_NS) * 1e-9)
+    keyframes = tracker.finish()
+    chosen = [keyframes[int(k)] for k in np.linspace(0, len(keyframes) - 1, 3)]
+    figure = new_figure(9.6, 2.6)
+    for column, frame in enumerate(chosen):
+        axes = figure.add_subplot(1, 3, column + 1)
+        axes.imshow(frame.image, cmap="gray", vmin=0, vmax=200)
+        draw_trails(axes, keyframes[: keyframes.index(frame) + 1])
+        left = np.percentile(frame.xy[:, 0], 1) - 40.0
+        axes.set(xlim=(left, left + 420.0), ylim=(319.5, -0.5), xticks=[], yticks=[])
+        title = f"frame {frame.index}, {frame.camera.magnification:g}x"
+        axes.set_title(title, fontsize=9, color=INK)
+    return small_png(figure, 100.0)
+
+
+def draw_trails(axes, keyframes: list[Keyframe]) -> None:
+    """Features of the last keyframe, and where they were in those before."""
+    last = keyframes[-1]
+    axes.plot(*last.xy.T, ".", color="#4fb3ff", markersize=2)
+    for number in last.ids[:: max(1, len(last.ids) // 120)]:
+        trail = [f.xy[f.ids == number] for f in keyframes[-8:]]
+        trail = np.concatenate([part for part in trail if len(part)])
+        axes.plot(*trail.T, "-", color="#ffb347", linewidth=0.6)
+
+
+def picture_of_error(mesh: Path, true_nm: float) -> bytes:
+    """Where the mesh departs from the true sphere."""
+    vertices = np.asarray(trimesh.load(mesh, process=False).vertices)
+    error = distances_nm(vertices, true_nm)
+    figure = new_figure(8.0, 3.0)
+    axes = figure.add_subplot(1, 2, 1)
+    reach = max(3.0, float(np.percentile(np.abs(error), 98)))
+    shown = axes.scatter(*vertices[:, :2].T, c=error, s=9, cmap="RdBu_r", vmin=-reach, vmax=reach)
+    tidy(axes, xlabel="X (nm)", ylabel="Y (nm)")
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
+    figure.colorbar(shown, ax=axes, label="distance from the true sphere (nm)")
+    axes = figure.add_subplot(1, 2, 2)
+    axes.hist(error, bins=31, color=OURS)
+    axes.axvline(0.0, color=SECOND, linewidth=1.0)
+    tidy(axes, xlabel="distance from the true sphere (nm)", ylabel="vertices")
+    return small_png(figure, 100.0)
+
+
+# -- all of it ------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--frames", type=int, help="of the ball (default 2000)")
+    parser.add_argument("--quick", action="store_true", help="120 frames, a smaller calibration")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("nano_ball_output"))
+    parser.add_argument("--images", type=Path, help="folder for the figures (default: the output)")
+    given = parser.parse_args()
+    frames = given.frames or (120 if given.quick else 2000)
+    out, images = given.output, given.images or given.output
+    out.mkdir(parents=True, exist_ok=True)
+    config = out / "strips.yaml"
+    config.write_text(CONFIG)
+
+    # 1. Calibrate with 512 x 512 images of the grid; the ball's frames have another size.
+    magnifications = GRID_MAGNIFICATIONS[-3:] if given.quick else GRID_MAGNIFICATIONS
+    wanted = [part for g in magnifications for part in ("--magnification", g)]
+    views = 4 if given.quick else 5
+    run("simulate", out / "grid", "--views", views, *wanted, "--seed", given.seed, "--overwrite")
+    print(run("calibrate", out / "grid", "-o", out / "cal.yaml"))
+
+    # 2. The ball, with drift, every line at its own time.
+    # Fewer frames are some of the same movement, not a faster one.
+    interval_s = 0.1 * max(1.0, 2000 / frames)
+    drift = drift_preset("settling")
+    plan = ball_plan(frames=frames, interval_s=interval_s, drift=drift, seed=given.seed)
+    record(plan, out / "ball")
+
+    # 3. Reconstruct.
+    begun = time.perf_counter()
+    command = ["reconstruct", out / "ball", "--calibration", out / "cal.yaml", "--config", config]
+    files = ["--cloud", out / "cloud.ply", "--figure", images / "nano_ball_mesh.png"]
+    printed = run(*command, "-o", out / "ball.ply", *files, "--json")
+    seconds = time.perf_counter() - begun
+    result = json.loads(printed)
+
+    # 4. Compare with the truth.
+    truth = json.loads((out / "ball" / "truth.json").read_text())
+    errors = compared(out / "cloud.ply", out / "ball.ply", truth, result)
+    summary = {"seconds": seconds, **result, **errors}
+    (out / "summary.json").write_text(json.dumps(summary, indent=1))
+    for name, value in summary.items():
+        print(f"{name:24} {value}")
+
+    # 5. Figures.
+    model = Calibration.load(out / "cal.yaml")
+    tracks = picture_of_tracks(out / "ball", config, model, min(frames, 200))
+    (images / "nano_ball_tracks.png").write_bytes(tracks)
+    error = picture_of_error(out / "ball.ply", 1e9 * truth["ball_diameter_m"])
+    (images / "nano_ball_error.png").write_bytes(error)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Visual servoing of the virtual SEM's stage while the magnification is stepped from 500x to 5000x.
+
+1. The microscope is calibrated on a simulated recording of a chess grid: once with the continuous model over all
+   magnifications, once with the magnifications 500, 1000, 2000 and 5000 one by one, linear in between.
+2. The same controller brings the same target to the same place of the sem frame, three times: on raw images with the
+   scale of the display, with the interpolated calibration, and with the continuous one.
+3. What is judged is where the target really is.
+
+    python examples/visual_servo.py [--quick] [--live] [--preset jsm820] [--drift slow] [--fixed-axis] [--output FOLDER]
+
+With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from joblib import Parallel, cpu_count, delayed
+from visual_servo_loop import Case, Run, Task, servo_run
+
+from semcal_ros import Calibration
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.servoing import PlanePose, ServoSettings
+from semcal_ros.pipeline import calibrate_found, find_views
+from semcal_ros.synthetic import (
+    DRIFTS,
+    PRESETS,
+    SQUARES_M,
+    Pose,
+    VirtualMicroscope,
+    calibration_plan,
+    preset,
+)
+
+CONTINUOUS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0, 7500.0, 10000.0)
+DISCRETE = (500.0, 1000.0, 2000.0, 5000.0)
+VIEWS = 4
+STEPS = 7
+GOAL = PlanePose(3e-6, -2e-6, math.radians(5.0))
+START = Pose.flat((40e-6, -28e-6, 0.0), math.radians(22.0))
+# Near enough to the goal, in the truth: a pixel.
+NEAR_PX = 1.0
+LAST = 5
+
+
+def calibrations(microscope: VirtualMicroscope, seed: int) -> tuple[Calibration, Calibration]:
+    """The continuous and the discrete calibration from one recording."""
+    plan = calibration_plan(microscope, magnifications=CONTINUOUS, views=VIEWS, seed=seed)
+    frames = (
+        (f"frame {i}", plan.render(i), frame.magnification) for i, frame in enumerate(plan.frames)
+    )
+    found, rejected = find_views(frames)
+    common = {"display_width_m": microscope.display_width_m, "squares_m": SQUARES_M}
+    continuous = calibrate_found(found, rejected, **common).calibration
+    some = [view for view in found if view.magnification in DISCRETE]
+    discrete = calibrate_found(some, [], method="discrete", **common).calibration
+    return continuous, discrete
+
+
+def schedule(quick: bool) -> list[tuple[float, int]]:
+    """(magnification, frames): 500x until the target is there, then up in equal ratios."""
+    if quick:
+        return [(500.0, 18), (1600.0, 5), (5000.0, 8)]
+    steps = np.geomspace(500.0, 5000.0, STEPS).round(-1)
+    return [(float(g), 22 if i == 0 else 12 if i == STEPS - 1 else 6) for i, g in enumerate(steps)]
+
+
+def cases_of(
+    scope: VirtualMicroscope, continuous: Calibration, discrete: Calibration
+) -> list[Case]:
+    def nominal(g: float) -> ScanCamera:
+        return ScanCamera.nominal(g, scope.width, scope.height, scope.display_width_m)
+
+    return [
+        Case("uncalibrated", nominal, corrected=False),
+        Case("interpolated", discrete.at, corrected=True),
+        Case("continuous", continuous.at, corrected=True),
+    ]
+
+
+def frames_to(near: np.ndarray) -> int | None:
+    """Frames until it is near and stays so; None where it does not."""
+    far = np.flatnonzero(~near)
+    first = 0 if len(far) == 0 else int(far[-1]) + 1
+    return None if first >= len(near) else first
+
+
+def summary(run: Run) -> dict[str, object]:
+    """Figures of one run, plain numbers for JSON."""
+    g = np.array(run.magnification)
+    true_px, true_m = np.array(run.true_px), run.true_m()
+    steps, jumps = {}, {}
+    for value in dict.fromkeys(run.magnification):
+        here = g == value
+        steps[value] = frames_to(true_px[here] < NEAR_PX)
+        jumps[value] = float(true_px[here][0])
+    last = slice(-LAST, None)
+    turn = np.abs(np.array(run.true_error)[last, 2])
+    return {
+        "final_true_nm": 1e9 * float(np.sqrt(np.mean(true_m[last] ** 2))),
+        "final_true_px": float(np.sqrt(np.mean(true_px[last] ** 2))),
+        "final_true_mrad": 1e3 * float(np.sqrt(np.mean(turn**2))),
+        "final_own_nm": 1e9 * float(np.nanmean(run.own_m[-LAST:])),
+        "final_own_px": float(np.nanmean(run.own_px[-LAST:])),
+        "final_sigma_nm": 1e9 * float(np.nanmean(run.sigma_m[-LAST:])),
+        "final_sigma_px": float(np.nanmean(run.sigma_px[-LAST:])),
+        "worst_true_px_at_a_step": max(list(jumps.values())[1:], default=float("nan")),
+        "frames_to_1_px": steps,
+        "first_frame_px": jumps,
+        "axis_found_px": [float(v) for v in run.axis_px[-1]],
+        "axis_sigma_px": run.axis_sigma_px[-1],
+        "true_px": run.true_px,
+        "true_nm": (1e9 * true_m).tolist(),
+        "converged_by_itself_at": frames_to(np.array(run.converged)),
+        "frames_refused": sum(bool(reason) for reason in run.reason),
+        "reasons": sorted({reason for reason in run.reason if reason}),
+    }
+
+
+def printed(results: dict[str, dict[str, object]]) -> None:
+    print(f"\n{'':14} final error, truth        own estimate +- 1 sigma      largest true error")
+    print(f"{'':14}     nm      px    mrad         nm             px       after a step, px")
+    for name, r in results.items():
+        print(
+            f"{name:14}{r['final_true_nm']:7.0f} {r['final_true_px']:7.2f} {r['final_true_mrad']:7.2f}"
+            f"   {r['final_own_nm']:6.1f} +- {r['final_sigma_nm']:<5.2f}"
+            f" {r['final_own_px']:5.2f} +- {r['final_sigma_px']:<5.3f} {r['worst_true_px_at_a_step']:10.2f}"
+        )
+    print(f"\nframes until the target is within {NEAR_PX:g} px of its place and stays there")
+    magnifications = next(iter(results.values()))["frames_to_1_px"]
+    print(f"{'':14}" + "".join(f"{g:>8g}x" for g in magnifications))
+    for name, r in results.items():
+        cells = ("never" if n is None else str(n) for n in r["frames_to_1_px"].values())
+        print(f"{name:14}" + "".join(f"{cell:>9}" for cell in cells))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer frames and magnifications")
+    parser.add_argument("--live", action="store_true", help="the nodes, over ROS")
+    parser.add_argument("--preset", choices=tuple(PRESETS), default="jsm820")
+    parser.add_argument("--drift", choices=tuple(DRIFTS), default="slow")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fixed-axis", action="store_true", help="do not learn where the axis is")
+    parser.add_argument("--output", type=Path, default=Path("visual_servo_output"))
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    scope = preset(options.preset)
+    continuous, discrete = calibrations(scope, seed=options.seed + 1)
+    print(f"calibrated {options.preset} ({time.monotonic() - began:.0f} s)", flush=True)
+    continuous.save(options.output / "cal.yaml")
+    if options.live:
+        from visual_servo_live import live
+
+        magnifications = [g for g, _ in schedule(options.quick)]
+        chosen = options.preset, options.drift, options.seed
+        travel_m = float(START.t_m[0]), float(START.t_m[1])
+        live(options.output, scope, *chosen, GOAL, travel_m, magnifications)
+        return 0
+    settings = ServoSettings(axis_sigma_px=0.0) if options.fixed_axis else ServoSettings()
+    task = Task(scope, START, GOAL, schedule(options.quick), options.drift, options.seed, settings)
+    work = Parallel(n_jobs=min(cpu_count(), 3))
+    cases = cases_of(scope, continuous, discrete)
+    runs = work(delayed(servo_run)(task, case) for case in cases)
+    print(f"servoed {len(runs)} times ({time.monotonic() - began:.0f} s)", flush=True)
+    results = {run.name: summary(run) for run in runs}
+    place = np.array([[GOAL.x_m, GOAL.y_m, 0.0]])
+    sigma = continuous.at(5000.0).project_sigma(place)[0]
+    printed(results)
+    print(
+        f"the continuous calibration itself knows that place at 5000x to {sigma.max():.2f} px (1 sigma)"
+    )
+    (options.output / "results.json").write_text(json.dumps(results, indent=1))
+    from visual_servo_picture import picture
+
+    picture(options.output / "visual_servo.png", runs)
+    print(
+        f"{options.output}/results.json, {options.output}/visual_servo.png ({time.monotonic() - began:.0f} s)"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,199 @@
+"""The servoing example with the real nodes, as processes of their own over DDS.
+
+The referee looks at the raw images with the true camera of the virtual microscope; the nodes have only the calibration.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Twist
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+from visual_servo_loop import Run
+
+from semcal_ros.bridge import image_from_message, stamp_ns_from_msg
+from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.servoing import NestedTarget, PlaneCamera, PlanePose, find_target, fit_pose
+from semcal_ros.synthetic import VirtualMicroscope
+
+NODES = ("parameter_server", "stream_corrector", "visual_servo", "virtual_sem")
+START_S, STAGE_S, DRIVE_S = 60.0, 90.0, 2.0
+# Frames at a magnification after it has converged there.
+HELD = 6
+# Frames after a change of the magnification that are waited for first.
+CHANGING = 6
+
+
+class Suite:
+    """The nodes, and what this process hears of them."""
+
+    def __init__(self, folder: Path, preset: str, drift: str, seed: int, goal: PlanePose) -> None:
+        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        calibrated = {"calibration": (folder / "cal.yaml").absolute()}
+        parameters = {
+            "parameter_server": calibrated,
+            "stream_corrector": calibrated,
+            "visual_servo": {
+                "goal_x_m": goal.x_m,
+                "goal_y_m": goal.y_m,
+                "goal_rotation_deg": math.degrees(goal.angle_rad),
+            },
+            "virtual_sem": {
+                "preset": preset,
+                "specimen": "target",
+                "drift": drift,
+                "seed": seed,
+                "magnification": 500.0,
+                "rotation_deg": 22.0,
+            },
+        }
+        self._logs = folder / "logs"
+        self._logs.mkdir(exist_ok=True)
+        self._processes = [self._started(name, parameters[name]) for name in NODES]
+        rclpy.init()
+        self._node = rclpy.create_node("referee", namespace="/sem")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self.images: dict[int, np.ndarray] = {}
+        self.states: dict[str, dict[str, str]] = {}
+        queue = QoSProfile(depth=50)
+        self._subscriptions = [
+            self._node.create_subscription(Image, "image_raw", self._on_image, queue),
+            self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, queue),
+        ]
+        self.stage = self._node.create_publisher(Twist, "virtual_sem/stage", queue)
+        self._start = self._node.create_client(Trigger, "visual_servo/start")
+        self.knob = self._node.create_publisher(Float64, "virtual_sem/set_magnification", queue)
+
+    def _started(self, name: str, parameters: dict[str, object]) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"semcal_ros.nodes.{name}"]
+        command += ["--ros-args", "-r", "__ns:=/sem", "-p", "config:=virtual_sem"]
+        for key, value in parameters.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ["-p", f"{key}:={text}"]
+        with open(self._logs / f"{name}.log", "wb") as log:
+            return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+
+    def _on_image(self, message: Image) -> None:
+        self.images[stamp_ns_from_msg(message)] = image_from_message(message).copy()
+
+    def _on_report(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            node = status.name.partition(":")[0].rpartition("/")[2]
+            self.states[node] = {value.key: value.value for value in status.values}
+
+    def close(self) -> None:
+        """End the nodes, the servo before the microscope."""
+        for process in self._processes:
+            process.send_signal(signal.SIGINT)
+        for process in self._processes:
+            process.wait(30.0)
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def spin_until(self, condition, limit_s: float) -> bool:
+        """Whether the condition came true in time."""
+        until = time.monotonic() + limit_s
+        while not condition():
+            self._executor.spin_once(timeout_sec=0.05)
+            if any(process.poll() is not None for process in self._processes):
+                raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+            if time.monotonic() > until:
+                return False
+        return True
+
+    def begin(self, travel_m: tuple[float, float]) -> None:
+        """Drive the stage away from where it is, then let the servo take over."""
+        ready = (
+            lambda: self.stage.get_subscription_count() and self.knob.get_subscription_count(),
+            lambda: self._start.service_is_ready() and len(self.images) > 2,
+        )
+        if not all(self.spin_until(condition, START_S) for condition in ready):
+            raise RuntimeError("the nodes were not found")
+        twist = Twist()
+        twist.linear.x, twist.linear.y = (way / DRIVE_S for way in travel_m)
+        self.stage.publish(twist)
+        self.spin_until(lambda: False, DRIVE_S)
+        self.stage.publish(Twist())
+        answer = self._start.call_async(Trigger.Request())
+        self.spin_until(answer.done, START_S)
+
+    def converged_at(self, g: float) -> bool:
+        """Whether the servo itself says so, of frames of that magnification."""
+        servo, corrector = (self.states.get(n, {}) for n in ("visual_servo", "stream_corrector"))
+        same = float(corrector.get("magnification", "nan").replace("unknown", "nan")) == g
+        return same and servo.get("servo_state") == "converged"
+
+
+def live(
+    folder: Path,
+    microscope: VirtualMicroscope,
+    preset: str,
+    drift: str,
+    seed: int,
+    goal: PlanePose,
+    travel_m: tuple[float, float],
+    magnifications: list[float],
+) -> Run:
+    """Servo with the nodes through all magnifications; the truth of every frame that was heard."""
+    run = Run("live nodes")
+    suite = Suite(folder, preset, drift, seed, goal)
+    try:
+        suite.begin(travel_m)
+        for g in magnifications:
+            began, first = time.monotonic(), len(suite.images)
+            suite.knob.publish(Float64(data=g))
+            # What is told right after the change may be of the frames before it.
+            suite.spin_until(lambda count=first + CHANGING: len(suite.images) >= count, STAGE_S)
+            reached = suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
+            frames = len(suite.images) - first
+            held = len(suite.images) + HELD
+            suite.spin_until(lambda count=held: len(suite.images) >= count, STAGE_S)
+            _judged(run, suite, microscope, goal, g, first)
+            own = suite.states.get("visual_servo", {})
+            print(
+                f"{g:6g}x {'converged' if reached else 'NOT converged'} after {frames:2} frames,"
+                f" {time.monotonic() - began:4.0f} s; own error {float(own['servo_error_px']):.3f} px;"
+                f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm; resets {own['servo_resets']}",
+                flush=True,
+            )
+    finally:
+        suite.close()
+    (folder / "live.json").write_text(
+        json.dumps({"magnification": run.magnification, "true_px": run.true_px}, indent=1)
+    )
+    return run
+
+
+def _judged(
+    run: Run, suite: Suite, microscope: VirtualMicroscope, goal: PlanePose, g: float, first: int
+) -> None:
+    """Where the target was in the frames since the last change, by the true camera; mixed frames fail."""
+    camera = microscope.camera_at(g)
+    rectifier, plane = Rectifier("cubic"), PlaneCamera.of(camera)
+    for stamp in list(suite.images)[first:]:
+        image = suite.images[stamp]
+        fit = fit_pose(find_target(rectifier.rectify(image, camera), NestedTarget()), plane)
+        if not fit.accepted or abs(fit.scale - 1.0) > 0.02:
+            continue
+        error = fit.pose.minus(goal)
+        run.magnification.append(g)
+        run.true_error.append(error)
+        run.true_px.append(float(np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2]))))
+        run.images[g] = image

@@ -1,0 +1,150 @@
+"""One run of visual servoing without ROS: the same loop as the nodes', frame by frame, with the truth beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.servoing import (
+    NestedTarget,
+    PlaneCamera,
+    PlanePose,
+    Servo,
+    ServoSettings,
+    find_target,
+)
+from semcal_ros.synthetic import LiveScene, Pose, VirtualMicroscope, drift_preset
+
+# Between the end of a frame and the moment from which the stage obeys: transport and work.
+LATENCY_S = 0.1
+# As the node's parameter reset_beyond.
+RESET_BEYOND = 0.15
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the controller knows of the microscope; images are corrected with it, or raw."""
+
+    name: str
+    camera_at: Callable[[float], ScanCamera]
+    corrected: bool
+
+
+@dataclass(frozen=True)
+class Task:
+    """The same for all cases."""
+
+    microscope: VirtualMicroscope
+    start: Pose
+    goal: PlanePose
+    schedule: Sequence[tuple[float, int]]
+    drift: str = "slow"
+    seed: int = 0
+    settings: ServoSettings = field(default_factory=ServoSettings)
+
+
+@dataclass
+class Run:
+    """One row per frame."""
+
+    name: str
+    magnification: list[float] = field(default_factory=list)
+    true_error: list[np.ndarray] = field(default_factory=list)
+    true_px: list[float] = field(default_factory=list)
+    own_px: list[float] = field(default_factory=list)
+    own_m: list[float] = field(default_factory=list)
+    sigma_px: list[float] = field(default_factory=list)
+    sigma_m: list[float] = field(default_factory=list)
+    axis_px: list[np.ndarray] = field(default_factory=list)
+    axis_sigma_px: list[float] = field(default_factory=list)
+    converged: list[bool] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
+    images: dict[float, np.ndarray] = field(default_factory=dict)
+
+    def true_m(self) -> np.ndarray:
+        """Distance of the target's origin from the goal, m."""
+        return np.hypot(*np.array(self.true_error)[:, :2].T)
+
+
+class Corrector:
+    """What stream_corrector does: rectify, and take the drift, the travel of the stage included, out of the picture."""
+
+    def __init__(self) -> None:
+        self._tracker = DriftTracker()
+        self._rectifier = Rectifier()
+
+    def corrected(self, image, start_s, camera, timing):
+        update = self._tracker.update(image, start_s, camera, timing)
+        picture = self._rectifier.rectify(image, camera, update.raster, timing)
+        if np.max(np.abs(update.drift_px)) > RESET_BEYOND * image.shape[1]:
+            # What the node asks ~/reset for: the next frame has zero drift.
+            self._tracker.reset()
+        return picture, update.drift_m
+
+    def reset(self) -> None:
+        self._tracker.reset()
+
+
+def servo_run(task: Task, case: Case) -> Run:
+    """Servo through all magnifications of the task."""
+    scope, run = task.microscope, Run(case.name)
+    scene = LiveScene(
+        scope,
+        "target",
+        magnification=task.schedule[0][0],
+        pose=task.start,
+        drift=drift_preset(task.drift),
+        seed=task.seed,
+    )
+    servo, corrector, target = Servo(task.goal, task.settings), Corrector(), NestedTarget()
+    period_s = scope.timing.acquisition_time_s + LATENCY_S
+    start_s = 0.0
+    for g, frames in task.schedule:
+        scene.set_magnification(g, start_s)
+        for _ in range(frames):
+            frame = scene.frame(start_s)
+            camera, picture, shift_m = case.camera_at(g), frame.image, np.zeros(2)
+            if case.corrected:
+                picture, shift_m = corrector.corrected(picture, start_s, camera, scope.timing)
+            view = find_target(picture, target)
+            if case.corrected and not view.accepted:
+                corrector.reset()
+            command_s = start_s + period_s
+            step = servo.update(
+                view,
+                PlaneCamera.of(camera),
+                start_s + scope.timing.centre_offset_s,
+                interval_s=period_s,
+                now_s=command_s,
+                shift_m=shift_m,
+            )
+            scene.set_twist(command_s, (step.twist[0], step.twist[1]), step.twist[2])
+            servo.sent(command_s, step.twist)
+            _record(run, task, g, frame, step)
+            start_s = command_s
+        run.images[g] = frame.image
+    return run
+
+
+def _record(run: Run, task: Task, g: float, frame, step) -> None:
+    place, turn = frame.pose.t_m[:2] + frame.drift_m, frame.pose.R
+    truth = PlanePose(float(place[0]), float(place[1]), math.atan2(turn[1, 0], turn[0, 0]))
+    error = truth.minus(task.goal)
+    slope = task.microscope.camera_at(g).ideal_from_sem_jacobian
+    run.magnification.append(g)
+    run.true_error.append(error)
+    run.true_px.append(float(np.hypot(*(slope @ error[:2]))))
+    run.own_px.append(step.error_px)
+    run.own_m.append(step.error_m)
+    run.sigma_px.append(step.sigma_px)
+    run.sigma_m.append(step.sigma_m)
+    run.axis_px.append(step.axis_px)
+    run.axis_sigma_px.append(step.axis_sigma_px)
+    run.converged.append(step.converged)
+    run.reason.append(step.reason)

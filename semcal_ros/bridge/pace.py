@@ -1,0 +1,86 @@
+"""Whether a stream leaves the time to measure the drift of every frame before it goes on."""
+
+from __future__ import annotations
+
+import math
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["TrackingPace"]
+
+_WEIGHT = 0.1
+_SETTLED = 2
+# Leave at the first, come back at the second; in between it stays as it is.
+_TOO_MUCH, _LITTLE_ENOUGH = 0.6, 0.4
+
+
+class TrackingPace:
+    """Compares the time that a measurement takes with the interval between frames.
+
+    Both are running means. As long as little has been seen there is time enough.
+
+    Examples
+    --------
+    >>> pace = TrackingPace()
+    >>> for _ in range(20):
+    ...     pace.frame(0.005)
+    ...     pace.measured(0.010)
+    >>> pace.keeps_up
+    False
+    """
+
+    def __init__(self) -> None:
+        self._interval_s: float | None = None
+        self._cost_s: float | None = None
+        self._frames = 0
+        self._keeps_up = True
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether a measurement fits between two frames, with room for the rest of the work."""
+        return self._keeps_up
+
+    @property
+    def turn_s(self) -> float:
+        """Mean time from one frame that can be measured to the next, s; infinite before it is known."""
+        if self._interval_s is None or self._cost_s is None:
+            return math.inf
+        return self._interval_s + self._cost_s
+
+    @property
+    def cost_s(self) -> float:
+        """Mean time of a measurement, s; NaN before the first."""
+        return math.nan if self._cost_s is None else self._cost_s
+
+    def frame(self, interval_s: float) -> None:
+        """The next frame was published ``interval_s`` after the one before.
+
+        Raises
+        ------
+        InvalidValueError
+            If it is negative or not finite.
+        """
+        self._interval_s = _mean(self._interval_s, _checked(interval_s))
+        self._frames += 1
+        self._decide()
+
+    def measured(self, cost_s: float) -> None:
+        """A measurement took ``cost_s``; raises as :meth:`frame`."""
+        self._cost_s = _mean(self._cost_s, _checked(cost_s))
+        self._decide()
+
+    def _decide(self) -> None:
+        if self._interval_s is None or self._cost_s is None or self._frames < _SETTLED:
+            return
+        share = _LITTLE_ENOUGH if not self._keeps_up else _TOO_MUCH
+        self._keeps_up = self._cost_s <= share * self._interval_s
+
+
+def _checked(seconds: float) -> float:
+    if not 0.0 <= seconds < math.inf:
+        raise InvalidValueError(f"a time of {seconds} s", expected="a finite number >= 0")
+    return seconds
+
+
+def _mean(before: float | None, now: float) -> float:
+    return now if before is None else before + _WEIGHT * (now - before)

@@ -1,0 +1,84 @@
+"""``semcal doctor``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.common import config_option, echo_json
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.doctor.examination import examine
+from semcal_ros.doctor.findings import Finding, Level
+
+__all__ = ["command"]
+
+
+@click.command("doctor")
+@config_option
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Check this one instead of that of the topic `calibration`.",
+)
+@click.option(
+    "--namespace", default="/sem", show_default=True, help="Of the suite's nodes and topics."
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0.1, 3600.0),
+    default=3.0,
+    show_default=True,
+    help="How long to listen; more than one frame takes.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+def command(
+    config: str, calibration: Path | None, namespace: str, seconds: float, as_json: bool
+) -> None:
+    """Look for what keeps a live stream from working, and say what to do.
+
+    One line for each check: ok, note or problem. The exit status is 1 if there is a problem.
+
+    \b
+    Example:
+      semcal doctor --config jsm820 --calibration cal.yaml --seconds 10
+    """
+    found = examine(config, calibration, _full(namespace), seconds)
+    if as_json:
+        echo_json({"findings": [_as_dict(finding) for finding in found], **_counts(found)})
+    else:
+        for finding in found:
+            click.echo(f"{finding.level.value:<8} {finding}")
+        click.echo(", ".join(f"{count} {name}" for name, count in _counts(found).items()))
+    if any(finding.level is Level.PROBLEM for finding in found):
+        sys.exit(1)
+
+
+def _full(namespace: str) -> str:
+    parts = namespace.strip("/").split("/")
+    if not all(part.isidentifier() for part in parts):
+        raise InvalidValueError(
+            f"namespace {namespace!r}", expected="a ROS namespace such as /sem", do="correct it"
+        )
+    return "/" + "/".join(parts)
+
+
+def _counts(found: list[Finding]) -> dict[str, int]:
+    levels = [finding.level for finding in found]
+    return {
+        "problems": levels.count(Level.PROBLEM),
+        "notes": levels.count(Level.NOTE),
+        "ok": levels.count(Level.OK),
+    }
+
+
+def _as_dict(finding: Finding) -> dict[str, str]:
+    return {
+        "level": finding.level.value,
+        "subject": finding.subject,
+        "seen": finding.seen,
+        "expected": finding.expected,
+        "do": finding.do,
+    }

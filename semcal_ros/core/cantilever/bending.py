@@ -1,0 +1,299 @@
+"""From displacements along the beam to the deflection of its end.
+
+The displacement across the axis of a clamped beam at the arc length ``s = u L`` is
+
+    D(u) = r0 + r1 u + bending,    bending = d (u^2 + c (u^3 - u^2))
+
+r0 and r1 are what is left of drift and rotation, held by what is known of those; d is the
+deflection: the bending at u = 1, at the arc length L from the base. c is the shape: 0 is the
+second-order polynomial of Malti et al. (2012), -1/2 a beam that is loaded at its end (Euler and
+Bernoulli). Where it is free it is still the same for all frames, since the beam is pushed at one
+place, so that it costs a single frame little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "SHAPES",
+    "Bending",
+    "Shape",
+    "common_shape",
+    "curve_of",
+    "end_along_axis",
+    "fit_bending",
+    "shape_of",
+]
+
+Array = NDArray[np.float64]
+
+SHAPES = ("free", "beam", "parabola")
+
+# Of the line of sight's turn between frames, rad: the raster and a clamp are that stable.
+_TURN_RAD = 1e-5
+# Mean and 1-sigma of a shape that nobody knows: a parabola and a beam loaded at its end are likely.
+_PRIOR = (-0.25, 0.35)
+_TINY = 1e-30
+_TUKEY = 4.685
+_ROUNDS = 12
+_MAD = 1.4826
+_LEAST = 6
+
+
+@dataclass(frozen=True)
+class Bending:
+    """Fit of one frame against the reference.
+
+    Attributes
+    ----------
+    deflection_m, sigma_m
+        Bending at the end of the beam, and its 1-sigma without that of the scale.
+    coefficients
+        (4,) r0, r1, and the factors of u^2 and u^3 of the bending, in m.
+    covariance
+        (2, 2) of the deflection and of the factor of u^3, m^2; the latter is zero where the shape
+        was given.
+    rms_m
+        RMS of what the fit leaves in the blocks that were used.
+    residuals
+        (blocks, 2) what the fit leaves over its 1-sigma; NaN where the edge was not used.
+    used
+        (blocks, 2) bool: the edges that were used.
+    """
+
+    deflection_m: float
+    sigma_m: float
+    coefficients: Array
+    covariance: Array
+    rms_m: float
+    residuals: Array
+    used: NDArray[np.bool_]
+
+    def curve(self, u: Array) -> Array:
+        """Bending alone at fractions of the length; it goes on straight beyond the ends."""
+        return curve_of(self.coefficients[2:], u)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The shape of the bent beam.
+
+    Attributes
+    ----------
+    value, sigma
+        c and its 1-sigma.
+    relative
+        1-sigma of what all deflections are wrong by in proportion to them, because of the ground
+        beside the edges.
+    """
+
+    value: float
+    sigma: float
+    relative: float = 0.0
+
+
+def shape_of(name: str) -> Shape | None:
+    """The shape of a name in :data:`SHAPES`; None where it is free.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no such name.
+    """
+    if name not in SHAPES:
+        raise InvalidValueError(f"shape {name!r}", expected="one of " + ", ".join(SHAPES))
+    return {"beam": Shape(-0.5, 0.0), "parabola": Shape(0.0, 0.0)}.get(name)
+
+
+def common_shape(
+    frames: Sequence[Bending], reference_sigma_m: float, reference_count: int
+) -> Shape:
+    """The shape that several frames have in common.
+
+    The factor of u^3 is c d plus a constant that the noise of the reference makes.
+
+    Parameters
+    ----------
+    frames
+        Fits with a free shape.
+    reference_sigma_m
+        1-sigma of the factor of u^3 that the noise of the reference makes.
+    reference_count
+        Number of frames in the reference.
+    """
+    good = [f for f in frames if np.isfinite(f.sigma_m)]
+    d = np.array([f.deflection_m for f in good])
+    b = np.array([f.coefficients[3] for f in good])
+    spread = np.array([f.covariance for f in good]).reshape(-1, 2, 2)
+    c, normal = _PRIOR[0], np.eye(2)
+    for _ in range(3):
+        direction = np.array([-c, 1.0])
+        variance = np.maximum(np.einsum("i,nij,j->n", direction, spread, direction), _TINY)
+        rows = np.column_stack([d, np.ones(len(d))])
+        prior = np.array([1.0 / _PRIOR[1] ** 2, 1.0 / max(reference_sigma_m**2, _TINY)])
+        normal = (rows / variance[:, None]).T @ rows + np.diag(prior)
+        right = (rows / variance[:, None]).T @ b + np.array([prior[0] * _PRIOR[0], 0.0])
+        c = float(np.linalg.solve(normal, right)[0])
+    excess = _shared_excess(good, d, reference_count)
+    sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))
+    along = float(np.sum((d - d.mean()) ** 2)) if len(d) > 1 else 0.0
+    single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
+    relative = float(np.sqrt((excess - 1.0) / max(along, _TINY))) * single
+    return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
+
+
+def _shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) -> float:
+    """How many times more the residuals of an edge grow with the deflection than noise explains.
+
+    A bright grain beside an edge pulls it in all frames alike; what the reference did to it does
+    not depend on the deflection.
+    """
+    if len(frames) < 4:
+        return 1.0
+    left = np.stack([f.residuals.ravel() for f in frames])
+    seen = np.isfinite(left)
+    whole = seen.sum(axis=0) >= 4
+    left, seen = left[:, whole], seen[:, whole].astype(np.float64)
+    count = np.maximum(seen.sum(axis=0), 1.0)
+    away = (d[:, None] - (seen * d[:, None]).sum(axis=0) / count) * seen
+    power = np.sum(away**2, axis=0)
+    grown = np.sum(away * np.nan_to_num(left), axis=0)
+    usable = power > _TINY
+    if int(usable.sum()) < _LEAST:
+        return 1.0
+    own = reference_count / (reference_count + 1.0)
+    ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / own
+    # The fits have taken what two of their terms explain.
+    number = float(usable.sum())
+    return float(max(ratio * number / max(number - 4.0, 1.0), 1.0))
+
+
+def curve_of(terms: Array, u: Array) -> Array:
+    """Factors (2,) times u^2 and u^3 within the beam, and its tangent beyond."""
+    a, b = terms
+    inside = np.clip(u, 0.0, 1.0)
+    slope = 2.0 * a + 3.0 * b
+    return np.asarray(a * inside**2 + b * inside**3 + slope * np.maximum(u - 1.0, 0.0))
+
+
+def fit_bending(
+    u: Array,
+    displacement_m: Array,
+    sigma_m: Array,
+    length_m: float,
+    offset_sigma_m: float,
+    shape: Shape | None = None,
+) -> Bending:
+    """Fit displacements of both edges.
+
+    Parameters
+    ----------
+    u
+        (blocks,) arc length over the length.
+    displacement_m, sigma_m
+        (blocks, 2) of both edges against the reference, and 1-sigma; infinite where unknown.
+    length_m
+        Length of the beam.
+    offset_sigma_m
+        1-sigma of what drift may have left.
+    shape
+        Shape of the bending; None to fit it.
+
+    Returns
+    -------
+    Bending
+        With an infinite sigma where too little of the beam was seen.
+    """
+    usable = np.isfinite(sigma_m) & np.isfinite(displacement_m)
+    cubic = u**3 - u**2
+    terms = [u**2, cubic] if shape is None else [u**2 + shape.value * cubic]
+    design = np.column_stack([np.ones(len(u)), u, *terms])
+    rows = np.repeat(design, 2, axis=0)[usable.ravel()]
+    seen, sigma = displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
+    if len(seen) < _LEAST:
+        unknown = np.full((2, 2), np.inf)
+        nothing = np.full(4, np.nan)
+        none, nan = np.zeros_like(usable), float("nan")
+        unseen = np.full(usable.shape, nan)
+        return Bending(nan, float("inf"), nothing, unknown, nan, unseen, none)
+    prior = np.zeros(design.shape[1])
+    prior[0] = 1.0 / max(offset_sigma_m, 1e-13) ** 2
+    prior[1] = 1.0 / (_TURN_RAD * length_m) ** 2
+    solution, weight, scale, covariance = _robust(rows, seen, sigma, prior)
+    kept = weight > 0.05
+    used = np.zeros(usable.size, dtype=bool)
+    used[np.flatnonzero(usable.ravel())[kept]] = True
+    left = seen - rows @ solution
+    rms = float(np.sqrt(np.mean(left[kept] ** 2))) if kept.any() else float("nan")
+    residuals = np.full(usable.size, np.nan)
+    residuals[used] = (left / (scale * sigma))[kept]
+    d = float(solution[2])
+    whole = np.zeros((2, 2))
+    whole[: len(terms), : len(terms)] = covariance[2:, 2:]
+    b = float(solution[3]) if shape is None else shape.value * d
+    if shape is not None and shape.sigma > 0.0:
+        # A wrong shape makes a deflection wrong by what the fit takes its difference for.
+        plain = rows * (weight / sigma**2)[:, None]
+        wrong = np.repeat(cubic, 2)[usable.ravel()]
+        taken = np.linalg.solve(plain.T @ rows + np.diag(prior), plain.T @ wrong)[2]
+        whole[0, 0] += (taken * d * shape.sigma) ** 2 + (d * shape.relative) ** 2
+    return Bending(
+        d,
+        float(np.sqrt(whole[0, 0])),
+        np.array([solution[0], solution[1], d - b, b]),
+        whole,
+        rms,
+        residuals.reshape(usable.shape),
+        used.reshape(usable.shape),
+    )
+
+
+def _robust(
+    rows: Array, seen: Array, sigma: Array, prior: Array
+) -> tuple[Array, Array, float, Array]:
+    """Reweighted least squares (Tukey's biweight), with the scatter of the residuals as scale."""
+    plain = 1.0 / sigma**2
+    weight = np.ones(len(seen))
+    scale = 1.0
+    solution: Array = np.zeros(rows.shape[1])
+    for turn in range(_ROUNDS):
+        total = weight * plain / scale**2
+        normal = (rows * total[:, None]).T @ rows + np.diag(prior)
+        solution = np.asarray(np.linalg.solve(normal, (rows * total[:, None]).T @ seen))
+        residual = (seen - rows @ solution) / sigma
+        scale = max(_MAD * float(np.median(np.abs(residual))), 0.8)
+        # The first rounds do not yet know what is an outlier.
+        far = residual / (scale * _TUKEY * (2.0 if turn < 3 else 1.0))
+        weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
+    # Rounding of the weights costs a little more than the plain formula tells.
+    total = weight * plain / scale**2
+    meat = (rows * (weight**2 * plain / scale**2)[:, None]).T @ rows + np.diag(prior)
+    inverse = np.linalg.inv((rows * total[:, None]).T @ rows + np.diag(prior))
+    slope = float(np.mean(np.where(weight > 0.0, 1.0, 0.0)))
+    covariance = inverse @ meat @ inverse / max(slope, 0.5)
+    return solution, weight, scale, np.asarray(covariance)
+
+
+def end_along_axis(terms: Array, length_m: float) -> float:
+    """Where along the axis the end of the bent beam is, by its conserved arc length.
+
+    Parameters
+    ----------
+    terms
+        (2,) a and b of the bending in m.
+    length_m
+        Length of the beam.
+    """
+    u = np.linspace(0.0, 1.0, 129)
+    slope = (2.0 * terms[0] * u + 3.0 * terms[1] * u**2) / length_m
+    # ds = dx sqrt(1 + y'^2), so that dx/ds = 1 / sqrt(1 + y'^2).
+    shrink = 1.0 / np.sqrt(1.0 + slope**2)
+    middle = 0.5 * (shrink[1:] + shrink[:-1])
+    return float(length_m * np.sum(middle * np.diff(u)))

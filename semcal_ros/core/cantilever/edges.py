@@ -1,0 +1,254 @@
+"""Sub-pixel edges of the beam, in blocks along it.
+
+In each block the grey levels near an edge follow ``low + step * Phi((n - e) / width)``: a straight
+edge under a round beam. Low, step and e are fitted to the raw pixels by least squares, all blocks
+at once, with a taper that moves with the edge, so that no pixel enters or leaves at once. What the
+model lacks, such as a bright rim, shifts all frames alike; deflections are differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+__all__ = ["EdgeFit", "EdgeModel", "StepFit", "best_width", "fit_edges", "fit_step", "same_width"]
+
+Array = NDArray[np.float64]
+
+_STEPS = 5
+_LEAST_PIXELS = 12
+_WIDTHS_PX = tuple(0.55 * 1.16**k for k in range(16))
+_TINY = 1e-30
+# Both edges of the beam move alike: deviations beyond which one of them is not its own.
+_SAME_WIDTH = 4.5
+
+
+@dataclass(frozen=True)
+class EdgeModel:
+    """How edges are fitted; lengths in m.
+
+    Attributes
+    ----------
+    width_m
+        1-sigma of the edge.
+    reach_m
+        How far from the edge pixels count.
+    start_m, block_m, blocks
+        Arc length at which the first block begins, the length of a block, and how many there are.
+    half_width_m
+        Half the width of the beam.
+    """
+
+    width_m: float
+    reach_m: float
+    start_m: float
+    block_m: float
+    blocks: int
+    half_width_m: float
+
+    @property
+    def centres_m(self) -> Array:
+        """(blocks,) arc lengths."""
+        return np.asarray(self.start_m + self.block_m * (np.arange(self.blocks) + 0.5))
+
+
+@dataclass(frozen=True)
+class EdgeFit:
+    """Edges of one frame: the left (negative side) and the right one, as columns.
+
+    Attributes
+    ----------
+    across_m
+        (blocks, 2) where the edge is across the axis, at the blocks' centres.
+    sigma_m
+        (blocks, 2) 1-sigma from the noise of the pixels; infinite where there is no edge.
+    step
+        (blocks, 2) how much brighter the beam is.
+    chi2
+        Sum of squares that the model leaves, over all blocks, in squared grey levels.
+    """
+
+    across_m: Array
+    sigma_m: Array
+    step: Array
+    chi2: float
+
+
+@dataclass(frozen=True)
+class StepFit:
+    """One straight edge: its place and 1-sigma in m, and its step in grey levels."""
+
+    place_m: float
+    sigma_m: float
+    step: float
+
+
+def fit_edges(
+    along_m: Array, across_m: Array, grey: Array, model: EdgeModel, predicted_m: Array
+) -> EdgeFit:
+    """Fit both edges in all blocks.
+
+    Parameters
+    ----------
+    along_m, across_m, grey
+        (n,) coordinates and grey levels of pixels.
+    model
+        Blocks and edge.
+    predicted_m
+        (blocks, 2) where the edges are expected.
+    """
+    block = np.floor((along_m - model.start_m) / model.block_m).astype(np.intp)
+    inside = (block >= 0) & (block < model.blocks)
+    block = block[inside]
+    along, across, level = (v[inside] for v in (along_m, across_m, grey))
+    results, chi2 = [], 0.0
+    for side, sign in enumerate((1.0, -1.0)):
+        line = _along_line(along, model, predicted_m[:, side])
+        near = np.abs(across - line) < 2.0 * model.reach_m
+        # With the sign the beam is always on the side of growing coordinates.
+        distance = sign * (across - line)[near]
+        place, sigma, step, left = _fitted(block[near], distance, level[near], model, model.blocks)
+        results.append((predicted_m[:, side] + sign * place, sigma, step))
+        chi2 += left
+    across_fit, sigmas, steps = (np.stack(parts, axis=1) for parts in zip(*results, strict=True))
+    return EdgeFit(across_fit, sigmas, steps, chi2)
+
+
+def fit_step(
+    distance_m: Array, grey: Array, model: EdgeModel, *, rough_m: float | None = None
+) -> StepFit:
+    """Fit one straight edge to pixels at distances from where it is expected; bright is positive.
+
+    ``rough_m`` is how far from there it may be; it is searched for, then.
+    """
+    best: tuple[float, float, float, float] | None = None
+    reach = 0.0 if rough_m is None else rough_m
+    starts = np.arange(-reach, reach + 1e-15, 0.5 * model.reach_m) if reach > 0.0 else np.zeros(1)
+    for start in starts:
+        near = np.abs(distance_m - start) < 2.0 * model.reach_m
+        if near.sum() < _LEAST_PIXELS:
+            continue
+        zero = np.zeros(int(near.sum()), dtype=np.intp)
+        found = _fitted(zero, distance_m[near] - start, grey[near], model, 1)
+        place, sigma, step = (float(v[0]) for v in found[:3])
+        if np.isfinite(sigma) and step > 0.0 and (best is None or step / sigma > best[3]):
+            best = (start + place, sigma, step, step / sigma)
+    if best is None:
+        return StepFit(float("nan"), float("inf"), 0.0)
+    return StepFit(*best[:3])
+
+
+def best_width(
+    along_m: Array, across_m: Array, grey: Array, model: EdgeModel, predicted_m: Array, px_m: float
+) -> float:
+    """The width of the edges, m, that leaves least; ``px_m`` is the size of a pixel."""
+    widths = [w * px_m for w in _WIDTHS_PX]
+    left = [
+        fit_edges(along_m, across_m, grey, replace(model, width_m=w), predicted_m).chi2
+        for w in widths
+    ]
+    k = int(np.clip(np.argmin(left), 1, len(widths) - 2))
+    # Parabola through the least and its neighbours, in the logarithm of the width.
+    a, b, c = left[k - 1], left[k], left[k + 1]
+    shift = 0.5 * (a - c) / max(a - 2.0 * b + c, _TINY)
+    return float(widths[k] * 1.16 ** float(np.clip(shift, -1.0, 1.0)))
+
+
+def _along_line(along: Array, model: EdgeModel, values: Array) -> Array:
+    """Values at the blocks' centres, interpolated and continued to the pixels."""
+    centres = model.centres_m
+    if len(centres) < 2:
+        return np.full(along.shape, values[0])
+    at = np.clip((along - centres[0]) / model.block_m, 0.0, None)
+    k = np.minimum(at.astype(np.intp), len(centres) - 2)
+    part = (along - centres[k]) / model.block_m
+    return np.asarray(values[k] + part * (values[k + 1] - values[k]))
+
+
+def _fitted(
+    block: NDArray[np.intp], distance: Array, grey: Array, model: EdgeModel, count: int
+) -> tuple[Array, Array, Array, float]:
+    """Place, 1-sigma and step of each block's edge, and the squares that are left."""
+    place, slope = np.zeros(count), np.zeros(count)
+    low, step = np.zeros(count), np.zeros(count)
+    width, reach = model.width_m, model.reach_m
+    information = np.zeros((count, 3, 3))
+    squares, weight_sum = low.copy(), low.copy()
+    for turn in range(_STEPS):
+        z = distance - place[block]
+        taper = np.where(np.abs(z) < reach, np.cos(0.5 * np.pi * z / reach) ** 2, 0.0)
+        shape = ndtr(z / width)
+        if turn == 0:
+            third = np.zeros_like(z)
+        else:
+            # Scaled by the width, so that the equations are well conditioned.
+            third = -slope[block] * np.exp(-0.5 * (z / width) ** 2) / np.sqrt(2.0 * np.pi)
+        columns = (np.ones_like(z), shape, third)
+        information = _gram(block, taper, columns, count)
+        sums = [np.bincount(block, taper * c * grey, count) for c in columns]
+        right = np.asarray(np.stack(sums, axis=1), dtype=np.float64)
+        if turn == 0:
+            information[:, 2, 2] = 1.0
+        solution = _solved(information, right)
+        low, step = solution[:, 0], solution[:, 1]
+        slope = step
+        place = place + np.clip(solution[:, 2] * width, -0.5 * reach, 0.5 * reach)
+        place = np.clip(place, -reach, reach)
+        left = grey - low[block] - step[block] * shape - solution[block, 2] * third
+        squares = np.asarray(np.bincount(block, taper * left**2, count), dtype=np.float64)
+        weight_sum = np.asarray(np.bincount(block, taper, count), dtype=np.float64)
+    # The taper counts pixels at the rim less than they would deserve: its square is their noise.
+    noise = np.bincount(block, taper**2, count) / np.maximum(weight_sum, _TINY)
+    variance = squares / np.maximum(weight_sum - 3.0 * noise, 1.0)
+    inverse = np.linalg.pinv(information, hermitian=True)
+    sandwich = inverse @ _gram(block, taper**2, columns, count) @ inverse
+    sigma = width * np.sqrt(np.maximum(variance * sandwich[:, 2, 2], 0.0))
+    good = (weight_sum > _LEAST_PIXELS) & (np.abs(place) < 0.95 * reach) & (step > 0.0)
+    sigma = np.where(good & (sigma > 0.0), sigma, np.inf)
+    return place, sigma, step, float(squares.sum())
+
+
+def _gram(
+    block: NDArray[np.intp], weight: Array, columns: tuple[Array, Array, Array], count: int
+) -> Array:
+    gram = np.zeros((count, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            sums = np.bincount(block, weight * columns[i] * columns[j], count)
+            gram[:, i, j] = gram[:, j, i] = sums
+    return gram
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Solutions of (n, 3, 3) systems that may be singular."""
+    guard = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + _TINY
+    return np.asarray(np.linalg.solve(matrix + guard * np.eye(3), right[..., None])[..., 0])
+
+
+def same_width(moved: Array, noise: Array) -> NDArray[np.bool_]:
+    """(blocks,) where the width is what it was: elsewhere something lies on an edge.
+
+    The neighbours of such blocks are left out, too: it may reach into them a little.
+
+    Parameters
+    ----------
+    moved, noise
+        (blocks, 2) displacements of both edges, and 1-sigma; infinite where unknown.
+    """
+    both = np.isfinite(noise).all(axis=1)
+    if int(both.sum()) < 4:
+        return np.ones(len(moved), dtype=bool)
+    change = moved[:, 1] - moved[:, 0]
+    sigma = np.hypot(noise[:, 0], noise[:, 1])
+    away = np.zeros(len(moved))
+    # Focus or charging may change the width of all of it.
+    away[both] = (change[both] - np.median(change[both])) / sigma[both]
+    scale = max(1.4826 * float(np.median(np.abs(away[both]))), 1.0)
+    odd = ~both | (np.abs(away) > _SAME_WIDTH * scale)
+    near = odd.copy()
+    near[1:] |= odd[:-1]
+    near[:-1] |= odd[1:]
+    return np.asarray(~near)

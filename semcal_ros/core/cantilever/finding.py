@@ -1,0 +1,337 @@
+"""Find the cantilever in a picture: the strongest bright strip between two parallel edges.
+
+For every direction, the gradient across it is summed along lines (a Radon transform of the signed
+derivative). Texture averages out; a strip leaves a rising and a falling line close together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["Strip", "find_strip"]
+
+Array = NDArray[np.float64]
+
+# Larger pictures are reduced before they are searched.
+_SEARCHED_PX = 640
+_COARSE_PX = 256
+_BLUR_PX = 1.5
+_STEP_RAD = np.deg2rad(1.0)
+_FINE_RAD = np.deg2rad(np.arange(-2.0, 2.01, 0.2))
+_LEAST_WIDTH_PX = 4
+_LARGEST_WIDTH = 0.35
+# A strip is one where its edges are at least that strong, relative to where they are strong.
+_EDGE_SHARE = 0.35
+_GAP = 0.06
+# Of the picture's side: a strip is longer, and it is out of view if it ends closer to the border.
+_LEAST_LENGTH = 0.2
+_BORDER_PX = 7.0
+_GIVE_CLICKS = "give two points on its centre line, the base and the free end, as base and tip"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A cantilever in raw pixels.
+
+    Attributes
+    ----------
+    base_px, tip_px
+        (2,) ends of the centre line, as far as it is in view.
+    half_width_px
+        Half its width.
+    base_seen, tip_seen
+        Whether each end is that of the cantilever and not where it leaves the picture.
+    """
+
+    base_px: Array
+    tip_px: Array
+    half_width_px: float
+    base_seen: bool
+    tip_seen: bool
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Gradient of a picture that is ready for sums along lines."""
+
+    gx: Array
+    gy: Array
+    x: Array
+    y: Array
+    size: tuple[int, int]
+
+    def across(self, angle: float) -> tuple[Array, float]:
+        """Sums along lines in a direction, by distance from the origin, and the first distance."""
+        c, s = np.cos(angle), np.sin(angle)
+        distance = self.y * c - self.x * s
+        first = float(np.floor(distance.min()))
+        place = np.rint(distance - first).astype(np.intp)
+        return np.asarray(np.bincount(place, self.gy * c - self.gx * s), dtype=np.float64), first
+
+
+def find_strip(
+    image: NDArray[np.generic],
+    *,
+    base_px: ArrayLike | None = None,
+    tip_px: ArrayLike | None = None,
+) -> Strip:
+    """Find a bright cantilever on a darker ground.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey picture in which nothing touches the cantilever.
+    base_px, tip_px
+        (2,) raw pixels of the two ends of the centre line, good to a few pixels; they may lie
+        outside of the picture where the end is out of view. None finds them.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no strip, or it cannot be told which of its ends is the free one.
+    """
+    if (base_px is None) != (tip_px is None):
+        raise InvalidValueError("one end of the cantilever", expected="both or none")
+    shrink = max(1, int(np.ceil(max(image.shape) / _SEARCHED_PX)))
+    grey = np.asarray(image, dtype=np.float32)
+    if shrink > 1:
+        height, width = (n // shrink * shrink for n in grey.shape)
+        size = (width // shrink, height // shrink)
+        grey = np.asarray(
+            cv2.resize(grey[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32
+        )
+    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
+    if base_px is None or tip_px is None:
+        found = _searched(smooth)
+    else:
+        clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
+        found = _clicked(smooth, clicks[0], clicks[1])
+    return Strip(
+        (found.base_px + 0.5) * shrink - 0.5,
+        (found.tip_px + 0.5) * shrink - 0.5,
+        found.half_width_px * shrink,
+        found.base_seen,
+        found.tip_seen,
+    )
+
+
+def _lines(smooth: Array) -> _Lines:
+    gy, gx = np.gradient(smooth)
+    y, x = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
+    # The border of the picture is no edge.
+    inner = np.zeros(smooth.shape, dtype=bool)
+    inner[3:-3, 3:-3] = True
+    take = inner.ravel()
+    parts = [np.asarray(v.ravel()[take], dtype=np.float64) for v in (gx, gy, x, y)]
+    height, width = smooth.shape
+    return _Lines(parts[0], parts[1], parts[2], parts[3], (width, height))
+
+
+def _best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
+    """Rising line, and falling line after it, of which the weaker is strongest."""
+    best = (0.0, 0, 0)
+    for width in range(low, min(high, len(rise) - 1)):
+        pair = np.minimum(rise[:-width], fall[width:])
+        first = int(np.argmax(pair))
+        if pair[first] > best[0]:
+            best = (float(pair[first]), first, first + width)
+    return best
+
+
+def _widened(sums: Array) -> Array:
+    """An edge is some pixels wide, and a little bent."""
+    return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
+
+
+def _searched(smooth: Array) -> Strip:
+    """The strongest strip in any direction: found in a small picture, then in the large one."""
+    shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
+    size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
+    part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
+    small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
+    lines = _lines(small)
+    high = int(_LARGEST_WIDTH * min(small.shape))
+    best, angle, offset = 0.0, 0.0, 0.0
+    # Both senses of a direction are the same strip: rising and falling edge change places.
+    for turn in np.arange(0.0, np.pi, _STEP_RAD):
+        sums, first = lines.across(float(turn))
+        wide = _widened(sums)
+        strength, low, up = _best_pair(wide, -wide, _LEAST_WIDTH_PX // shrink + 1, high)
+        if strength > best:
+            best, angle, offset = strength, float(turn), 0.5 * (low + up) + first
+    if best <= 0.0:
+        raise InvalidValueError("no strip in the picture", expected="a cantilever", do=_GIVE_CLICKS)
+    across = np.array([-np.sin(angle), np.cos(angle)])
+    middle = 0.5 * (np.array(size) - 1.0)
+    point = middle + (offset - float(across @ middle)) * across
+    angle, offset, half = _pair_near(_lines(smooth), angle, (point + 0.5) * shrink - 0.5)
+    return _bounded(smooth, angle, offset, half)
+
+
+def _pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, float, float]:
+    """Direction, distance from the origin and half width of the strip around a point."""
+    reach = int(_LARGEST_WIDTH * min(lines.size))
+    best, found = 0.0, (nominal, 0.0, 0.0)
+    for angle in nominal + _FINE_RAD:
+        sums, first = lines.across(float(angle))
+        here = round(float(point[1] * np.cos(angle) - point[0] * np.sin(angle)) - first)
+        wide = _widened(sums)
+        left, right = max(here - reach, 0), min(here + reach, len(wide))
+        if not left < here < right:
+            continue
+        rise, fall = wide[left:right].copy(), -wide[left:right]
+        rise[here - left :], fall[: here - left] = -np.inf, -np.inf
+        strength, low, up = _best_pair(rise, fall, _LEAST_WIDTH_PX, right - left)
+        if strength > best:
+            best = strength
+            found = float(angle), 0.5 * (low + up) + left + first, 0.5 * (up - low)
+    if best <= 0.0:
+        raise InvalidValueError(
+            "no bright strip between base and tip", expected="two points on its centre line"
+        )
+    return found
+
+
+def _clicked(smooth: Array, base: Array, tip: Array) -> Strip:
+    """The strip around two points; what they say of its ends holds."""
+    if not float(np.hypot(*(tip - base))) > 10.0:
+        raise InvalidValueError("base and tip at the same place", expected="two ends of a beam")
+    nominal = float(np.arctan2(tip[1] - base[1], tip[0] - base[0]))
+    seen = [_inside(p, smooth.shape) for p in (base, tip)]
+    # Of what is in view: a click outside is only good for the direction.
+    points = [p for p, inside in zip((base, tip), seen, strict=True) if inside]
+    inwards = [(tip - base) / 20.0, (base - tip) / 20.0]
+    point = np.mean(points, axis=0) if points else 0.5 * (base + tip)
+    if len(points) == 1:
+        point = points[0] + inwards[0 if seen[0] else 1]
+    angle, offset, half = _pair_near(_lines(smooth), nominal, point)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    across = offset * np.array([-along[1], along[0]])
+    ends = [across + along * float(along @ p) for p in (base, tip)]
+    return Strip(*_within(ends, smooth.shape), half, seen[0], seen[1])
+
+
+def _within(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """The part of a line that is in view."""
+    steps = np.linspace(0.0, 1.0, 2001)[:, None]
+    points = ends[0] + steps * (ends[1] - ends[0])
+    inside = np.flatnonzero(
+        (points >= 0.0).all(axis=1) & (points <= [shape[1] - 1.0, shape[0] - 1.0]).all(axis=1)
+    )
+    if inside.size < 2:
+        raise InvalidValueError(
+            "base and tip between which nothing is in view", expected="a beam in the picture"
+        )
+    return points[inside[0]], points[inside[-1]]
+
+
+def _inside(point: Array, shape: tuple[int, ...]) -> bool:
+    x, y = point
+    return bool(
+        _BORDER_PX <= x <= shape[1] - 1 - _BORDER_PX
+        and _BORDER_PX <= y <= shape[0] - 1 - _BORDER_PX
+    )
+
+
+def _sampled(picture: Array, points: Array) -> Array:
+    """Grey levels at (n, 2) pixels; NaN outside."""
+    maps = [np.ascontiguousarray(points[None, :, k], dtype=np.float32) for k in (0, 1)]
+    out = cv2.remap(
+        picture.astype(np.float32),
+        maps[0],
+        maps[1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),
+    )
+    return np.asarray(out[0], dtype=np.float64)
+
+
+def _bounded(smooth: Array, angle: float, offset: float, half: float) -> Strip:
+    """Where along its lines the strip begins and ends, and which end is free."""
+    c, s = np.cos(angle), np.sin(angle)
+    along, across = np.array([c, s]), np.array([-s, c])
+    reach = float(np.hypot(*smooth.shape))
+    steps = np.arange(-reach, reach)
+    line = offset * across + steps[:, None] * along
+    places = (-half - 2.5, -half + 2.5, 0.0, half - 2.5, half + 2.5)
+    levels = [_sampled(smooth, line + d * across) for d in places]
+    lower, upper = levels[1] - levels[0], levels[3] - levels[4]
+    if half < 4.0:  # a narrow beam is brightest in its middle
+        lower, upper = levels[2] - levels[0], levels[2] - levels[4]
+    strength = np.minimum(lower, upper)
+    known = np.isfinite(strength)
+    weight = np.ones(9)
+    filled = np.convolve(np.where(known, strength, 0.0), weight, mode="same")
+    count = np.convolve(known.astype(float), weight, mode="same")
+    mean = np.where(count > 4, filled / np.maximum(count, 1.0), -np.inf)
+    strong = float(np.quantile(strength[known], 0.9)) if known.any() else 0.0
+    run = _longest_run(mean > _EDGE_SHARE * strong, max(4, int(_GAP * min(smooth.shape))))
+    side = min(smooth.shape)
+    if run is None or strong <= 0.0 or run[1] - run[0] < _LEAST_LENGTH * side:
+        raise InvalidValueError(
+            "no strip that is long enough in the picture", expected="a cantilever", do=_GIVE_CLICKS
+        )
+    ends = [offset * across + steps[k] * along for k in run]
+    seen = [
+        all(_inside(p, smooth.shape) for p in _corners(end, sign * along, across, half))
+        for end, sign in zip(ends, (-1.0, 1.0), strict=True)
+    ]
+    free = [
+        _free(smooth, end, sign * along, across, half)
+        for end, sign in zip(ends, (-1, 1), strict=True)
+    ]
+    return _told_apart(ends, seen, free, half)
+
+
+def _corners(end: Array, outwards: Array, across: Array, half: float) -> list[Array]:
+    """Points a little beyond both corners of an end: a strip may leave the picture askew."""
+    return [end + 4.0 * outwards + side * (half + 3.0) * across for side in (-1.0, 1.0)]
+
+
+def _longest_run(good: NDArray[np.bool_], gap: int) -> tuple[int, int] | None:
+    """First and last index of the longest stretch, gaps closed."""
+    places = np.flatnonzero(good)
+    if not places.size:
+        return None
+    breaks = np.flatnonzero(np.diff(places) > gap)
+    firsts = np.append(0, breaks + 1)
+    lasts = np.append(breaks, len(places) - 1)
+    longest = int(np.argmax(places[lasts] - places[firsts]))
+    return int(places[firsts[longest]]), int(places[lasts[longest]])
+
+
+def _free(picture: Array, end: Array, outwards: Array, across: Array, half: float) -> float:
+    """How dark it is beyond an end: 1 as beside the strip, 0 as in it; NaN out of view."""
+    spread = np.linspace(-0.5 * half, 0.5 * half, 5)
+    beyond = np.linspace(8.0, 8.0 + max(half, 8.0), 9)
+
+    def level(steps: Array, offsets: Array) -> float:
+        points = end + steps[:, None, None] * outwards + offsets[None, :, None] * across
+        values = _sampled(picture, points.reshape(-1, 2))
+        return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
+
+    inside = level(-beyond, spread)
+    beside = level(-beyond, np.concatenate([spread - half - 8.0, spread + half + 8.0]))
+    outside = level(beyond, spread)
+    return (inside - outside) / max(inside - beside, 1e-9)
+
+
+def _told_apart(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:
+    """Which end is the base: the one behind which it stays bright, or that is out of view."""
+    is_tip = [s and f > 0.5 for s, f in zip(seen, free, strict=True)]
+    is_base = [s and f <= 0.5 for s, f in zip(seen, free, strict=True)]
+    if is_tip[0] == is_tip[1] and is_base[0] == is_base[1]:
+        raise InvalidValueError(
+            "a strip of which base and free end cannot be told apart",
+            expected="a cantilever with at least one of its ends in view",
+            do=_GIVE_CLICKS,
+        )
+    tip = 0 if is_tip[0] or is_base[1] else 1
+    return Strip(ends[1 - tip], ends[tip], half, is_base[1 - tip], is_tip[tip])

@@ -1,0 +1,154 @@
+"""Where in the specimen every pixel of a raw frame looks, and which way the cantilever lies there.
+
+Edges are measured in the raw pixels, whose noise is independent; their places are freed of
+distortion and drift afterwards. So nothing is interpolated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.raw_map import RasterDrift
+
+__all__ = ["Axis", "PlaneMap", "drift_at"]
+
+Array = NDArray[np.float64]
+
+_NODE_SPACING_PX = 10.0
+_DEGREE = 5
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The cantilever at rest, in the sem frame.
+
+    Attributes
+    ----------
+    origin_m
+        (2,) point of the centre line from which arc lengths are counted: the base, where it is in
+        view.
+    direction
+        (2,) unit vector towards the free end.
+    half_width_m
+        Half the width of the beam.
+    visible_m
+        First and last arc length that is in view.
+    base_seen, end_seen
+        Whether base and free end are in view.
+    """
+
+    origin_m: Array
+    direction: Array
+    half_width_m: float
+    visible_m: tuple[float, float]
+    base_seen: bool
+    end_seen: bool
+
+    @property
+    def normal(self) -> Array:
+        """(2,) unit vector of positive deflections: to the right as seen from the base."""
+        return np.array([-self.direction[1], self.direction[0]])
+
+    def coordinates(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+        """Along the axis and across it, in m, of points in the sem frame."""
+        x, y = x_m - self.origin_m[0], y_m - self.origin_m[1]
+        along = x * self.direction[0] + y * self.direction[1]
+        across = y * self.direction[0] - x * self.direction[1]
+        return along, across
+
+    def point(self, along_m: Array, across_m: Array) -> Array:
+        """(n, 2) points in the sem frame; inverse of :meth:`coordinates`."""
+        along, across = np.asarray(along_m), np.asarray(across_m)
+        return np.asarray(
+            self.origin_m + along[:, None] * self.direction + across[:, None] * self.normal
+        )
+
+
+class PlaneMap:
+    """Sem-frame coordinates of the raw pixels of a frame, and when each is scanned.
+
+    Parameters
+    ----------
+    camera
+        Camera at the size of the frames.
+    timing
+        Raster timing; None takes frames as instants.
+
+    Raises
+    ------
+    InvalidValueError
+        If the camera's distortion has no inverse somewhere in the frame.
+    """
+
+    def __init__(self, camera: ScanCamera, timing: ScanTiming | None) -> None:
+        self.camera, self.timing = camera, timing
+        width, height = camera.width, camera.height
+        cols, rows = _nodes(width), _nodes(height)
+        xy = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
+        ideal = camera.undistort(xy)
+        if not np.all(np.isfinite(ideal)):
+            raise InvalidValueError(
+                f"a distortion at magnification {camera.magnification:g} without an inverse",
+                expected="a calibration that holds over the whole field",
+                do="calibrate again",
+            )
+        sem = camera.sem_from_ideal(ideal).reshape(len(rows), len(cols), 3)
+        self.x_m, self.y_m = (_upsampled(rows, cols, sem[..., k], (height, width)) for k in (0, 1))
+        self.since_s, self.square_s2 = _times(width, height, timing)
+
+    @property
+    def pixel_m(self) -> float:
+        """Mean size of an ideal pixel."""
+        x, y = self.camera.pixel_size_m
+        return float(np.sqrt(x * y))
+
+    def sem_of(self, xy_px: Array) -> Array:
+        """(n, 2) sem-frame points of raw pixels (n, 2), without drift."""
+        return self.camera.sem_from_ideal(self.camera.undistort(xy_px))[:, :2]
+
+    def raw_of(self, xy_m: Array) -> Array:
+        """(n, 2) raw pixels of sem-frame points (n, 2), without drift."""
+        return self.camera.project(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+
+    def specimen(self, pixels: NDArray[np.intp], drift: RasterDrift) -> tuple[Array, Array]:
+        """Coordinates, relative to where the specimen was at zero drift, of pixels by flat index."""
+        since = self.since_s.ravel()[pixels]
+        square = self.square_s2.ravel()[pixels]
+        x_moved, y_moved = drift_at(drift, since, square)
+        return self.x_m.ravel()[pixels] - x_moved, self.y_m.ravel()[pixels] - y_moved
+
+
+def drift_at(drift: RasterDrift, since_s: Array, square_s2: Array) -> tuple[Array, Array]:
+    """Drift along x and y at times after the centre of the acquisition, whose mean squares over
+    the passes are ``square_s2``.
+    """
+    position, velocity, turn = drift.position, drift.velocity, drift.acceleration
+    return (
+        position[0] + velocity[0] * since_s + 0.5 * turn[0] * square_s2,
+        position[1] + velocity[1] * since_s + 0.5 * turn[1] * square_s2,
+    )
+
+
+def _times(width: int, height: int, timing: ScanTiming | None) -> tuple[Array, Array]:
+    """(h, w) each: time after the centre of the acquisition, and its mean square over passes."""
+    if timing is None:
+        return np.zeros((height, width)), np.zeros((height, width))
+    rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]
+    since = timing.pixel_offset_s(rows, cols, height, width) - timing.centre_offset_s
+    return since, since**2 + timing.pass_variance_s2
+
+
+def _nodes(pixels: int) -> Array:
+    return np.linspace(0.0, pixels - 1.0, max(2 * _DEGREE, round(pixels / _NODE_SPACING_PX) + 1))
+
+
+def _upsampled(rows: Array, cols: Array, values: Array, shape: tuple[int, int]) -> Array:
+    spline = RectBivariateSpline(rows, cols, values, kx=_DEGREE, ky=_DEGREE)
+    return np.asarray(spline(np.arange(shape[0]), np.arange(shape[1])), dtype=np.float64)

@@ -1,0 +1,153 @@
+"""How well several magnifications agree about the same poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.cantilever.series import Series
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["Repeatability", "frames_of_poses", "repeatability"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Deflections by magnification and pose, m.
+
+    Attributes
+    ----------
+    magnifications
+        (m,) of the series.
+    deflection_m, sigma_m
+        (m, p) means over the frames of each pose, in calibrated metres, and 1-sigma.
+    by_length_m, by_length_sigma_m
+        The same in metres of the known length; NaN where that is not in view.
+    spread_m, by_length_spread_m
+        (p,) standard deviation among the magnifications (NaN for one); that of the reference pose
+        is zero by definition.
+    rms_spread_m, by_length_rms_spread_m
+        Root of its mean square over the poses but the first.
+    expected_spread_m
+        What the 1-sigmas make one expect for ``rms_spread_m``.
+    """
+
+    magnifications: tuple[float, ...]
+    deflection_m: Array
+    sigma_m: Array
+    by_length_m: Array
+    by_length_sigma_m: Array
+    spread_m: Array
+    by_length_spread_m: Array
+    rms_spread_m: float
+    by_length_rms_spread_m: float
+    expected_spread_m: float
+
+
+def frames_of_poses(frames: int, poses: int | None) -> list[list[int]]:
+    """Frames of each pose: ``frames`` in the order of time, cut into ``poses`` equal parts.
+
+    None makes each frame a pose of its own.
+
+    Raises
+    ------
+    InvalidValueError
+        If the frames cannot be cut so.
+    """
+    count = frames if poses is None else poses
+    if count < 1 or frames % count:
+        raise InvalidValueError(
+            f"{frames} frames for {count} poses",
+            expected="the same number of frames in each pose",
+            do="correct the number of poses, or cut the recording",
+        )
+    each = frames // count
+    return [list(range(k * each, (k + 1) * each)) for k in range(count)]
+
+
+def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeatability:
+    """Compare series whose k-th poses are the same.
+
+    Parameters
+    ----------
+    series
+        One per magnification.
+    poses
+        As for :func:`frames_of_poses`.
+
+    Raises
+    ------
+    InvalidValueError
+        If they have different numbers of poses.
+    """
+    if not series:
+        raise InvalidValueError("no series", expected="at least one magnification")
+    groups = [frames_of_poses(len(s.frames), poses) for s in series]
+    counts = sorted({len(g) for g in groups})
+    if len(counts) > 1:
+        seen = ", ".join(f"{s.magnification:g}: {len(s.frames)}" for s in series)
+        raise InvalidValueError(
+            f"different numbers of frames by magnification ({seen})",
+            expected="the same poses at each magnification",
+            do="state how many poses there are, or cut the recordings",
+        )
+    value, sigma = _means(series, groups, by_length=False)
+    known, known_sigma = _means(series, groups, by_length=True)
+    spread, known_spread = _spread(value), _spread(known)
+    return Repeatability(
+        tuple(s.magnification for s in series),
+        value,
+        sigma,
+        known,
+        known_sigma,
+        spread,
+        known_spread,
+        _rms(spread),
+        _rms(known_spread),
+        _rms(np.sqrt(np.mean(sigma**2, axis=0))) if len(series) > 1 else float("nan"),
+    )
+
+
+def _means(
+    series: Sequence[Series], groups: list[list[list[int]]], *, by_length: bool
+) -> tuple[Array, Array]:
+    value = np.full((len(series), len(groups[0])), np.nan)
+    sigma = np.full_like(value, np.nan)
+    for row, (one, parts) in enumerate(zip(series, groups, strict=True)):
+        for column, frames in enumerate(parts):
+            chosen = [one.frames[k] for k in frames]
+            chosen = [f for f in chosen if np.isfinite(f.noise_m)]
+            if not chosen:
+                continue
+            weight = np.array([1.0 / max(f.noise_m, 1e-15) ** 2 for f in chosen])
+            weight /= weight.sum()
+            parts_m = [(f.by_length_m, f.by_length_sigma_m) for f in chosen]
+            if not by_length:
+                parts_m = [(f.deflection_m, f.sigma_m) for f in chosen]
+            values, sigmas = np.array(parts_m).T
+            value[row, column] = float(weight @ values)
+            # A share of the noise is that of the reference, and the scale is common to all.
+            noise = np.array([f.noise_m for f in chosen])
+            share = 1.0 / (len(parts[0]) + 1.0)
+            common = float(weight @ (sigmas**2 - noise**2)) + share * float(weight @ noise**2)
+            own = (1.0 - share) * float(np.sum(weight**2 * noise**2))
+            sigma[row, column] = float(np.sqrt(max(common + own, 0.0)))
+    return value, sigma
+
+
+def _spread(value: Array) -> Array:
+    if len(value) < 2:
+        return np.full(value.shape[1], np.nan)
+    return np.asarray(np.std(value, axis=0, ddof=1))
+
+
+def _rms(values: Array) -> float:
+    """Over all poses but the first, which is the reference."""
+    rest = values[1:]
+    known = rest[np.isfinite(rest)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")

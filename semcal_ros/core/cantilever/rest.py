@@ -1,0 +1,234 @@
+"""The beam at rest: its axis, its edges, and where its base and its free end are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.cantilever.edges import (
+    EdgeFit,
+    EdgeModel,
+    StepFit,
+    best_width,
+    fit_edges,
+    fit_step,
+)
+from semcal_ros.core.cantilever.plane import Axis
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["REACH_PX", "Rest", "View", "beam_at_rest"]
+
+Array = NDArray[np.float64]
+#: Coordinates along and across the axis, m, and grey levels, (n,) each.
+View = tuple[Array, Array, Array]
+
+#: How far from an edge pixels count.
+REACH_PX = 6.0
+_EDGE_PX = 1.1
+_BLOCK_PX = 12.0
+_LEAST_BLOCKS = 6
+# Edges of a narrow beam must not see each other.
+_REACH_OF_HALF_WIDTH = 1.5
+# The ends are searched for around where the strip seemed to end.
+_END_SEARCH_PX = 14.0
+_BESIDE_PX = 3.0
+_BESIDE_REACH_PX = 24.0
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The beam at rest.
+
+    Attributes
+    ----------
+    axis
+        Its axis, with arc lengths counted from the base.
+    model
+        Blocks along it and the edges' width.
+    across_m, sigma_m, step
+        (blocks, 2) edges: place across the axis, 1-sigma, and grey levels by which the beam is
+        brighter.
+    length_m, length_sigma_m
+        Length in calibrated metres; NaN where base and end are not both in view.
+    notes
+        What a person should know.
+    """
+
+    axis: Axis
+    model: EdgeModel
+    across_m: Array
+    sigma_m: Array
+    step: Array
+    length_m: float
+    length_sigma_m: float
+    notes: tuple[str, ...]
+
+
+def beam_at_rest(rough: Axis, views: list[View], length_m: float, px_m: float) -> Rest:
+    """Measure the beam in the reference frames.
+
+    Parameters
+    ----------
+    rough
+        Its axis, good to a few px.
+    views
+        Pixels of the reference frames in the coordinates of that axis.
+    length_m
+        Length of the beam.
+    px_m
+        Size of a pixel.
+
+    Raises
+    ------
+    InvalidValueError
+        If no end of it is in view, or too little of its edges.
+    """
+    axis, width_m = _straightened(rough, views, px_m)
+    moved = [_moved(view, rough, axis) for view in views]
+    counted, seen_m, seen_sigma_m, notes = _with_ends(axis, moved, width_m, length_m, px_m)
+    final = [_moved(view, axis, counted) for view in moved]
+    model = _blocks(counted, width_m, px_m)
+    fits = [fit_edges(*view, model, _straight(model)) for view in final]
+    across, sigma, step = averaged(fits)
+    if int(np.isfinite(sigma).all(axis=1).sum()) < _LEAST_BLOCKS:
+        raise InvalidValueError(
+            "a strip whose edges cannot be measured",
+            expected="a beam that is brighter than what lies beside it",
+            do="give base and tip, or check focus and contrast",
+        )
+    return Rest(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
+
+
+def averaged(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
+    """Mean edges of several frames, their 1-sigma, and their steps, (blocks, 2) each."""
+    weight = np.stack([1.0 / fit.sigma_m**2 for fit in fits])
+    total = weight.sum(axis=0)
+    known = total > 0.0
+    share = np.where(known, weight / np.where(known, total, 1.0), 1.0 / len(fits))
+    across = np.sum(share * np.stack([fit.across_m for fit in fits]), axis=0)
+    step = np.sum(share * np.stack([fit.step for fit in fits]), axis=0)
+    sigma = np.where(known, 1.0 / np.sqrt(np.where(known, total, 1.0)), np.inf)
+    return across, sigma, step
+
+
+def _straight(model: EdgeModel) -> Array:
+    """(blocks, 2) edges of a straight beam."""
+    return np.asarray(np.ones((model.blocks, 1)) * np.array([-1.0, 1.0]) * model.half_width_m)
+
+
+def _blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
+    first, last = axis.visible_m
+    # The ends of the beam are edges of their own.
+    inset = REACH_PX * px_m
+    count = max(int((last - first - 2.0 * inset) / (_BLOCK_PX * px_m)), 1)
+    size = (last - first - 2.0 * inset) / count
+    reach = min(REACH_PX * px_m, _REACH_OF_HALF_WIDTH * axis.half_width_m)
+    return EdgeModel(width_m, reach, first + inset, size, count, axis.half_width_m)
+
+
+def _moved(view: View, before: Axis, now: Axis) -> View:
+    """A view in the coordinates of another axis."""
+    points = before.point(view[0], view[1])
+    return (*now.coordinates(points[:, 0], points[:, 1]), view[2])
+
+
+def _straightened(rough: Axis, views: list[View], px_m: float) -> tuple[Axis, float]:
+    """The axis along the middle of both edges, and the width of these."""
+    axis, width_m = rough, _EDGE_PX * px_m
+    for turn in range(4):
+        model = _blocks(axis, width_m, px_m)
+        moved = [_moved(view, rough, axis) for view in views]
+        if turn == 2:
+            width_m = best_width(*moved[0], model, _straight(model), px_m)
+            model = replace(model, width_m=width_m)
+        across, sigma, _ = averaged([fit_edges(*v, model, _straight(model)) for v in moved])
+        axis = _refined(axis, model, across, sigma)
+    return axis, width_m
+
+
+def _refined(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
+    good = np.isfinite(sigma).all(axis=1)
+    if int(good.sum()) < 3:
+        return axis
+    middle, half = across.mean(axis=1)[good], 0.5 * (across[:, 1] - across[:, 0])[good]
+    # What lies on an edge here and there must not turn the axis.
+    usual = np.abs(half - np.median(half)) < 4.0 * max(
+        1.4826 * float(np.median(np.abs(half - np.median(half)))), 1e-12
+    )
+    along = model.centres_m[good][usual]
+    if len(along) < 3:
+        return axis
+    slope, offset = np.polyfit(along, middle[usual], 1)
+    turned = axis.direction + slope * axis.normal
+    return replace(
+        axis,
+        origin_m=axis.origin_m + offset * axis.normal,
+        direction=turned / float(np.hypot(*turned)),
+        half_width_m=float(np.median(half)),
+    )
+
+
+# -- the ends -------------------------------------------------------------------------------------
+
+
+def _with_ends(
+    axis: Axis, views: list[View], width_m: float, length_m: float, px_m: float
+) -> tuple[Axis, float, float, list[str]]:
+    """The axis with arc lengths from the base; the length in view and its 1-sigma; notes."""
+    notes: list[str] = []
+    model = _blocks(axis, width_m, px_m)
+    first, last = axis.visible_m
+    unseen = StepFit(float("nan"), float("inf"), 0.0)
+    base = _mean([_base_edge(v, first, model, px_m) for v in views]) if axis.base_seen else unseen
+    end = _mean([_end_edge(v, last, model, px_m) for v in views]) if axis.end_seen else unseen
+    start_m, stop_m = first - base.place_m, last - end.place_m
+    if axis.base_seen and not np.isfinite(start_m):
+        notes.append("the edge of the holder is not seen: the base is where the beam fades")
+        start_m = first
+    if axis.end_seen and not np.isfinite(stop_m):
+        notes.append("the edge of the free end is not seen: it is where the beam fades")
+        stop_m = last
+    both = bool(np.isfinite([base.place_m, end.place_m]).all())
+    seen_m = stop_m - start_m if both else float("nan")
+    sigma_m = float(np.hypot(base.sigma_m, end.sigma_m)) if both else float("nan")
+    if axis.base_seen:
+        zero = start_m
+    elif axis.end_seen:
+        zero = stop_m - length_m
+        notes.append("the base is out of view: arc lengths are counted back from the free end")
+    else:
+        raise InvalidValueError(
+            "a cantilever without an end in view", expected="its base or its free end in view"
+        )
+    if not axis.end_seen:
+        notes.append("the free end is out of view: its deflection is extrapolated")
+    low, high = start_m if axis.base_seen else first, stop_m if axis.end_seen else last
+    origin = axis.origin_m + zero * axis.direction
+    counted = replace(axis, origin_m=origin, visible_m=(low - zero, high - zero))
+    return counted, seen_m, sigma_m, notes
+
+
+def _mean(steps: list[StepFit]) -> StepFit:
+    known = [s for s in steps if np.isfinite(s.sigma_m) and s.sigma_m > 0.0]
+    if not known:
+        return StepFit(float("nan"), float("inf"), 0.0)
+    weight = np.array([1.0 / s.sigma_m**2 for s in known])
+    place = float(np.sum(weight * np.array([s.place_m for s in known])) / weight.sum())
+    return StepFit(place, float(1.0 / np.sqrt(weight.sum())), known[0].step)
+
+
+def _base_edge(view: View, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+    """Edge of the holder on both sides of the beam; distances grow into the holder."""
+    along, across, grey = view
+    away = np.abs(across) - model.half_width_m
+    beside = (away > _BESIDE_PX * px_m) & (away < _BESIDE_REACH_PX * px_m)
+    return fit_step(at_m - along[beside], grey[beside], model, rough_m=_END_SEARCH_PX * px_m)
+
+
+def _end_edge(view: View, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+    """Edge of the free end; distances grow into the beam."""
+    along, across, grey = view
+    middle = np.abs(across) < max(model.half_width_m - _BESIDE_PX * px_m, 0.5 * model.half_width_m)
+    return fit_step(at_m - along[middle], grey[middle], model, rough_m=_END_SEARCH_PX * px_m)

@@ -1,0 +1,378 @@
+"""Deflections of a cantilever in the frames of one magnification."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.cantilever.bending import (
+    Bending,
+    Shape,
+    common_shape,
+    curve_of,
+    end_along_axis,
+    fit_bending,
+    shape_of,
+)
+from semcal_ros.core.cantilever.edges import EdgeFit, fit_edges, same_width
+from semcal_ros.core.cantilever.finding import Strip, find_strip
+from semcal_ros.core.cantilever.plane import Axis, PlaneMap
+from semcal_ros.core.cantilever.rest import REACH_PX, Rest, View, beam_at_rest
+from semcal_ros.core.cantilever.still import follow_background
+from semcal_ros.core.drift_path import DriftPath
+from semcal_ros.core.drift_uncertainty import scale_covariance
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.raster import ScanTiming
+
+__all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.generic]
+
+# Steps of an edge relative to the reference within which it is the same edge.
+_SAME_STEP = (0.5, 1.6)
+_WRONG_LENGTH = 0.03
+_LARGEST = 0.04
+_ABSURD = 1.5
+_LINE_POINTS = 65
+# Where the background was not tracked, the base alone tells what moved.
+_UNTRACKED_M = 1e-7
+
+
+@dataclass(frozen=True)
+class SeriesSettings:
+    """How a cantilever is measured.
+
+    Attributes
+    ----------
+    length_m
+        Its length, from its maker.
+    shape
+        One of :data:`~semcal_ros.core.cantilever.bending.SHAPES`; ``"free"`` is fitted, the same
+        for all frames.
+    base_px, tip_px
+        (2,) raw pixels of both ends of the centre line in the first frame; None finds them.
+    largest_m
+        Deflections beyond that are not looked for; None: a 25th of the length.
+    """
+
+    length_m: float
+    shape: str = "free"
+    base_px: ArrayLike | None = None
+    tip_px: ArrayLike | None = None
+    largest_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("length_m", "largest_m"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise InvalidValueError(f"{name} = {value}", expected="a positive length")
+        shape_of(self.shape)
+
+    @property
+    def reach_m(self) -> float:
+        """Largest deflection that is looked for."""
+        return _LARGEST * self.length_m if self.largest_m is None else self.largest_m
+
+
+@dataclass(frozen=True)
+class Deflection:
+    """One frame.
+
+    Attributes
+    ----------
+    deflection_m, sigma_m
+        Deflection of the end against the reference in calibrated metres, positive to the right as
+        seen from the base (where rows grow downwards), and its 1-sigma: noise, drift, reference,
+        and the scale of the calibration.
+    noise_m
+        The 1-sigma without that of the scale, which all frames of the magnification share.
+    by_length_m, by_length_sigma_m
+        The same in metres of the known length; NaN where base and end are not both in view.
+    tip_px
+        (2,) raw pixel of the end of the beam in this frame.
+    line_px
+        (n, 2) raw pixels of the centre line in this frame, as far as it is in view.
+    bending
+        The fit.
+    """
+
+    deflection_m: float
+    sigma_m: float
+    noise_m: float
+    by_length_m: float
+    by_length_sigma_m: float
+    tip_px: Array
+    line_px: Array
+    bending: Bending
+
+
+@dataclass(frozen=True)
+class Series:
+    """All frames of one magnification.
+
+    Attributes
+    ----------
+    magnification
+        Magnification g.
+    rest
+        The beam at rest.
+    frames
+        One result for each frame.
+    shape
+        Shape of the bending (see :mod:`~semcal_ros.core.cantilever.bending`).
+    drift
+        Drift of the background.
+    notes
+        What a person should know.
+    """
+
+    magnification: float
+    rest: Rest
+    frames: tuple[Deflection, ...]
+    shape: Shape
+    drift: DriftPath
+    notes: tuple[str, ...]
+
+
+def measure_series(
+    images: Sequence[Image],
+    times_s: Sequence[float],
+    camera: ScanCamera,
+    timing: ScanTiming | None,
+    settings: SeriesSettings,
+    *,
+    reference: Sequence[int] = (0,),
+    on_frame: Callable[[], None] = lambda: None,
+) -> Series:
+    """Measure the deflection of the free end in each frame.
+
+    Parameters
+    ----------
+    images
+        (h, w) raw grey pictures of one size, in the order of time; nothing touches the cantilever
+        in the first one.
+    times_s
+        Starts of their acquisitions.
+    camera
+        Calibrated camera of the magnification.
+    timing
+        Raster timing; None takes frames as instants.
+    settings
+        The cantilever.
+    reference
+        Frames that count as straight.
+    on_frame
+        Called twice for each frame.
+
+    Raises
+    ------
+    InvalidValueError
+        If pictures differ in size, or no cantilever is found.
+    """
+    _check(images, times_s, reference)
+    height, width = images[0].shape
+    plane = PlaneMap(camera.resized(width, height), timing)
+    strip = find_strip(images[0], base_px=settings.base_px, tip_px=settings.tip_px)
+    rough = _axis_of(strip, plane, settings.length_m)
+    margin_m = 2.0 * REACH_PX * plane.pixel_m
+    background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
+    work = _Work(images, plane, background.path, settings, rough)
+    rest = beam_at_rest(
+        rough, [work.view(rough, k) for k in reference], settings.length_m, plane.pixel_m
+    )
+    frames, shape = work.deflections(rest, tuple(reference), on_frame)
+    notes = _notes(rest, frames, background.path, settings)
+    return Series(camera.magnification, rest, tuple(frames), shape, background.path, notes)
+
+
+def _check(images: Sequence[Image], times_s: Sequence[float], reference: Sequence[int]) -> None:
+    if not images or len(images) != len(times_s):
+        raise InvalidValueError(
+            f"{len(images)} pictures at {len(times_s)} times", expected="one time for each"
+        )
+    shapes = sorted({image.shape for image in images})
+    if len(shapes) > 1 or len(shapes[0]) != 2:
+        raise InvalidValueError(f"pictures of shapes {shapes}", expected="grey ones of one size")
+    if not reference or not all(0 <= k < len(images) for k in reference):
+        raise InvalidValueError(
+            f"reference frames {list(reference)}", expected=f"some of 0 to {len(images) - 1}"
+        )
+
+
+def _axis_of(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
+    """The strip in the sem frame, with arc lengths as far as they are known yet."""
+    ends = plane.sem_of(np.stack([strip.base_px, strip.tip_px]))
+    seen_m = float(np.hypot(*(ends[1] - ends[0])))
+    direction = (ends[1] - ends[0]) / seen_m
+    half_m = strip.half_width_px * plane.pixel_m
+    base_at = length_m - seen_m if strip.tip_seen and not strip.base_seen else 0.0
+    origin = ends[0] - base_at * direction
+    visible = (base_at, base_at + seen_m)
+    return Axis(origin, direction, half_m, visible, strip.base_seen, strip.tip_seen)
+
+
+def _notes(
+    rest: Rest, frames: Sequence[Deflection], path: DriftPath, settings: SeriesSettings
+) -> tuple[str, ...]:
+    notes = list(rest.notes)
+    if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
+        notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
+    if lost := int(np.count_nonzero(~path.trusted)):
+        notes.append(f"no drift in {lost} of {len(path)} frames: they rest on the base alone")
+    if abs(rest.length_m / settings.length_m - 1.0) > _WRONG_LENGTH:
+        notes.append(
+            f"by the calibration the cantilever is {1e6 * rest.length_m:.4g} um long and not "
+            f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
+        )
+    return tuple(notes)
+
+
+class _Work:
+    """The pictures of a series, and what is done to each."""
+
+    def __init__(
+        self,
+        images: Sequence[Image],
+        plane: PlaneMap,
+        path: DriftPath,
+        settings: SeriesSettings,
+        rough: Axis,
+    ) -> None:
+        self._images, self._plane, self._path = images, plane, path
+        self._settings = settings
+        self._pixels = self._near_beam(rough)
+        self._seen: dict[int, tuple[Array, Array]] = {}
+
+    def _near_beam(self, axis: Axis) -> NDArray[np.intp]:
+        """Flat indices of the pixels that may show the beam in any frame."""
+        along, across = axis.coordinates(self._plane.x_m, self._plane.y_m)
+        moved = float(np.max(np.hypot(*self._path.drift_m.T), initial=0.0))
+        room = 5.0 * REACH_PX * self._plane.pixel_m + moved
+        wide = axis.half_width_m + room + self._settings.reach_m
+        first, last = axis.visible_m
+        near = (np.abs(across) < wide) & (along > first - room) & (along < last + room)
+        return np.flatnonzero(near)
+
+    def view(self, axis: Axis, frame: int) -> View:
+        """Pixels in coordinates of the axis, freed of drift, and their grey levels."""
+        x, y = self._plane.specimen(self._pixels, self._path.raster(frame))
+        grey = self._images[frame].ravel()[self._pixels].astype(np.float64)
+        return (*axis.coordinates(x, y), grey)
+
+    def deflections(
+        self, rest: Rest, reference: tuple[int, ...], on_frame: Callable[[], None]
+    ) -> tuple[list[Deflection], Shape]:
+        """All frames in the order of time, each begun where the one before was; their shape."""
+        edges, free = [], []
+        terms = np.zeros(2)
+        for frame in range(len(self._images)):
+            view = self.view(rest.axis, frame)
+            terms = np.zeros(2) if frame in reference else self._nearby(view, rest, terms)
+            edges.append(self._edges(view, rest, terms))
+            free.append(self._bending(frame, edges[-1], rest, reference, None))
+            if np.isfinite(free[-1].deflection_m):
+                terms = free[-1].coefficients[2:]
+            on_frame()
+        shape = shape_of(self._settings.shape)
+        if shape is None:
+            others = [f for k, f in enumerate(free) if k not in reference]
+            own = [free[k].covariance[1, 1] for k in reference]
+            shape = common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
+        bent = [self._bending(k, fit, rest, reference, shape) for k, fit in enumerate(edges)]
+        return [self._result(k, one, rest) for k, one in enumerate(bent)], shape
+
+    def _nearby(self, view: View, rest: Rest, terms: Array) -> Array:
+        """A bending to start from: that with the largest contrast between beam and surroundings."""
+        model, reach = rest.model, self._settings.reach_m
+        along, across, grey = view
+        line = curve_of(np.array([1.5, -0.5]), along / self._settings.length_m)
+        centres = model.centres_m
+        inside = (along > centres[0]) & (along < centres[-1])
+        inside &= np.abs(across) < model.half_width_m + reach + model.reach_m
+        across, line, grey = across[inside], line[inside], grey[inside]
+        now, step = float(terms.sum()), 0.5 * model.reach_m
+        count = int(np.ceil(2.0 * reach / step))
+        ends = now + step * np.arange(-count, count + 1)
+        best, found = -np.inf, now
+        for end in ends[np.abs(ends) <= reach]:
+            away = np.abs(across - end * line) - model.half_width_m
+            within = (away < 0.0) & (away > -model.reach_m)
+            beside = (away > 0.0) & (away < model.reach_m)
+            if not (within.any() and beside.any()):
+                continue
+            contrast = float(grey[within].mean() - grey[beside].mean())
+            if contrast > best:
+                best, found = contrast, float(end)
+        return terms if abs(found - now) < step else found * np.array([1.5, -0.5])
+
+    def _edges(self, view: View, rest: Rest, terms: Array) -> EdgeFit:
+        """Edges of a frame, looked for again where the first look has found the beam."""
+        length, model = self._settings.length_m, rest.model
+        u = model.centres_m / length
+        fit = fit_edges(*view, model, rest.across_m + curve_of(terms, u)[:, None])
+        for _ in range(2):
+            rough = fit_bending(u, fit.across_m - rest.across_m, fit.sigma_m, length, _UNTRACKED_M)
+            if not np.isfinite(rough.deflection_m):
+                break
+            r0, r1 = rough.coefficients[:2]
+            expected = r0 + r1 * u + rough.curve(u)
+            fit = fit_edges(*view, model, rest.across_m + expected[:, None])
+        return fit
+
+    def _bending(
+        self,
+        frame: int,
+        fit: EdgeFit,
+        rest: Rest,
+        reference: tuple[int, ...],
+        shape: Shape | None,
+    ) -> Bending:
+        """Bending against the reference."""
+        length, normal, path = self._settings.length_m, rest.axis.normal, self._path
+        covariance = path.covariance[:, :2, :2]
+        before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
+        offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
+        if not path.trusted[frame]:
+            offset = max(offset, _UNTRACKED_M)
+        # The reference against itself has its own noise only.
+        alone = frame in reference and len(reference) == 1
+        noise = fit.sigma_m if alone else np.hypot(fit.sigma_m, rest.sigma_m)
+        ratio = fit.step / np.maximum(rest.step, 1e-12)
+        same = (ratio > _SAME_STEP[0]) & (ratio < _SAME_STEP[1]) & np.isfinite(rest.sigma_m)
+        noise = np.where(same, noise, np.inf)
+        moved = fit.across_m - rest.across_m
+        noise = np.where(same_width(moved, noise)[:, None], noise, np.inf)
+        u = rest.model.centres_m / length
+        found = fit_bending(u, moved, noise, length, offset, shape)
+        if abs(found.deflection_m) > _ABSURD * self._settings.reach_m:
+            # Not the beam: as if nothing had been seen.
+            return fit_bending(u, moved, np.full_like(noise, np.inf), length, offset, shape)
+        return found
+
+    def _result(self, frame: int, bending: Bending, rest: Rest) -> Deflection:
+        length, axis, camera = self._settings.length_m, rest.axis, self._plane.camera
+        value, noise = bending.deflection_m, bending.sigma_m
+        known = 0.0 if np.isnan(value) else value
+        scale = scale_covariance(camera, known * axis.normal, np.zeros(2))[:2, :2]
+        sigma = float(np.sqrt(noise**2 + axis.normal @ scale @ axis.normal))
+        factor, relative = length / rest.length_m, rest.length_sigma_m / rest.length_m
+        terms = np.nan_to_num(bending.coefficients[2:])
+        end = axis.point(np.array([end_along_axis(terms, length)]), np.array([known]))
+        along = np.linspace(*axis.visible_m, _LINE_POINTS)
+        line = axis.point(along, curve_of(terms, along / length))
+        drift = self._path.drift_m[frame]
+        return Deflection(
+            value,
+            sigma,
+            noise,
+            factor * value,
+            float(factor * np.hypot(noise, relative * known)),
+            self._plane.raw_of(end + drift)[0],
+            self._plane.raw_of(line + drift),
+            bending,
+        )

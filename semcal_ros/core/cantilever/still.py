@@ -1,0 +1,230 @@
+"""Drift of what stands still while the cantilever and its pusher move.
+
+The tracker takes one shift for the whole picture, so all that moves by itself is smoothed away
+before it looks: the beam (where it is, is known) and every place whose picture changes over the
+recording by more than noise and drift explain. The covered places are fixed to the specimen and
+move with its drift, or their rims would hold the tracker back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.cantilever.plane import Axis, PlaneMap
+from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift_history import DriftHistory
+from semcal_ros.core.drift_path import DriftPath
+from semcal_ros.core.registration import prepare_reference, register
+
+__all__ = ["Background", "follow_background"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# The first look is at a picture that is reduced to some 256 px, in tiles: their number along each
+# side, their least side, and how many must be matched for their median to be trusted.
+_FIRST_PX = 256
+_TILES = 4
+_LEAST_TILE_PX = 64
+_LEAST_TILES = 3
+_MOSTLY = 0.5
+# Cells in which changes are looked for, px. Of n frames chance makes 1 in 10^4 cells exceed the usual
+# range by a factor of 1 + 4 / sqrt(n).
+_CELL_PX = 8
+_CHANCE = 4.0
+_ROUGH_PX = 0.4
+# A body moves if that many of its cells do, and that share of them.
+_LEAST_CELLS = 4
+_BODY_SHARE = 0.03
+_SOFT_PX = 3.0
+_FILL_PX = 14.0
+
+
+@dataclass(frozen=True)
+class Background:
+    """The drift, and what of the picture it rests on.
+
+    Attributes
+    ----------
+    path
+        Drift of all frames.
+    still
+        (h, w) float32 weights of the raw pixels at zero drift: 1 where nothing moves by itself.
+    """
+
+    path: DriftPath
+    still: Image
+
+
+def follow_background(
+    images: Sequence[NDArray[np.generic]],
+    times_s: Sequence[float],
+    plane: PlaneMap,
+    axis: Axis,
+    margin_m: float,
+    on_frame: Callable[[], None] = lambda: None,
+) -> Background:
+    """Track the drift of one magnification's frames.
+
+    Parameters
+    ----------
+    images
+        (h, w) grey pictures of one size.
+    times_s
+        Starts of their acquisitions.
+    plane
+        Coordinates of their pixels.
+    axis
+        The cantilever.
+    margin_m
+        How far from its edges at rest the beam may come.
+    on_frame
+        Called after each frame.
+    """
+    pictures = [np.asarray(image, dtype=np.float32) for image in images]
+    along, across = axis.coordinates(plane.x_m, plane.y_m)
+    first, last = axis.visible_m
+    beam = (np.abs(across) < axis.half_width_m + margin_m) & (along > first - margin_m)
+    beam &= along < last + margin_m
+    if axis.base_seen:
+        # The holder stands still.
+        beam &= along > first - 0.2 * axis.half_width_m
+    rough_px = _rough_drift(pictures, beam)
+    moving = _changes(pictures, rough_px, beam)
+    still = np.asarray(np.clip(2.0 * _soft(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
+    history = DriftHistory()
+    tracker = DriftTracker(history=history)
+    for picture, time_s, shift in zip(pictures, times_s, rough_px, strict=True):
+        weight = _shifted(still, shift)
+        tracker.update(_covered(picture, weight), time_s, plane.camera, plane.timing)
+        on_frame()
+    return Background(history.smoothed(), still)
+
+
+def _rough_drift(pictures: Sequence[Image], beam: NDArray[np.bool_]) -> Array:
+    """(n, 2) px: the shift against the first picture that most tiles agree on, to some 0.1 px.
+
+    A pusher moves or covers some of them only, and the median does not care.
+    """
+    shrink = max(1, min(beam.shape) // _FIRST_PX)
+    if shrink > 1:
+        size = (beam.shape[1] // shrink, beam.shape[0] // shrink)
+        small = [
+            np.asarray(
+                cv2.resize(
+                    p[: size[1] * shrink, : size[0] * shrink], size, interpolation=cv2.INTER_AREA
+                ),
+                dtype=np.float32,
+            )
+            for p in pictures
+        ]
+        reduced = beam[: size[1] * shrink : shrink, : size[0] * shrink : shrink]
+        return np.asarray(shrink * _rough_drift(small, reduced))
+    height, width = beam.shape
+    side = max(_LEAST_TILE_PX, min(height, width) // _TILES)
+    tiles = []
+    for top in np.linspace(0, height - side, max(height // side, 1)).astype(int):
+        for left in np.linspace(0, width - side, max(width // side, 1)).astype(int):
+            part = slice(top, top + side), slice(left, left + side)
+            if beam[part].mean() < _MOSTLY:
+                tiles.append((part, prepare_reference(_covered(pictures[0], _soft(beam))[part])))
+    shift, shifts = np.zeros(2), [np.zeros(2)]
+    spread = np.eye(2) * (0.2 * side) ** 2
+    for picture in pictures[1:]:
+        covered = _covered(picture, _shifted(_soft(beam), shift))
+        found = [
+            register(reference, covered[part], guess_px=shift, guess_covariance=spread)
+            for part, reference in tiles
+        ]
+        good = [f.shift_px for f in found if f.accepted]
+        if len(good) >= min(_LEAST_TILES, len(tiles)) and good:
+            shift = np.asarray(np.median(np.array(good), axis=0))
+        shifts.append(shift.copy())
+    return np.array(shifts)
+
+
+def _soft(beam: NDArray[np.bool_]) -> Image:
+    """1 outside of the beam, with a soft rim."""
+    return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), _SOFT_PX), np.float32)
+
+
+def _shifted(image: Image, shift: Array) -> Image:
+    """The image moved by a shift; its border goes on."""
+    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+    size = (image.shape[1], image.shape[0])
+    moved = cv2.warpAffine(
+        image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(moved, dtype=np.float32)
+
+
+def _changes(
+    pictures: Sequence[Image], shifts: Array, beam: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Where the picture changes by itself."""
+    if len(pictures) < 2:
+        return np.zeros_like(beam)
+    cells = []
+    for picture, shift in zip(pictures, shifts, strict=True):
+        cells.append(_cells(_shifted(picture, -shift)))
+    stack = np.stack(cells)
+    change = stack.max(axis=0) - stack.min(axis=0)
+    middle = np.median(stack, axis=0)
+    gy, gx = np.gradient(middle)
+    slope = np.hypot(gx, gy) / _CELL_PX
+    # Noise as most of the cells show it, growing with the root of the brightness.
+    ground = _cells(beam.astype(np.float32)) < 0.5
+    level = np.sqrt(np.maximum(middle / max(float(np.median(middle[ground])), 1.0), 0.25))
+    usual = float(np.median((change / level)[ground]))
+    limit = (1.0 + _CHANCE / np.sqrt(len(stack))) * usual * level + 2.0 * _ROUGH_PX * slope
+    strong = change > limit
+    wide = cv2.dilate(strong.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return _enlarged(wide | _moved_bodies(middle, strong, ground), beam.shape)
+
+
+def _moved_bodies(
+    middle: Array, strong: NDArray[np.bool_], ground: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Bright bodies with several changed cells: all of them, with edges along which they slid."""
+    grey = np.clip(255.0 * (middle - middle.min()) / max(float(np.ptp(middle)), 1e-9), 0.0, 255.0)
+    level, _ = cv2.threshold(grey.astype(np.uint8), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    # Between cells of one body that the beam separates there are cells of the beam.
+    bright = ((grey > level) & ground).astype(np.uint8)
+    count, labels = cv2.connectedComponents(bright, connectivity=4)
+    near = cv2.dilate(strong.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    moved = np.zeros_like(strong)
+    for label in range(1, count):
+        body = labels == label
+        if int((near & body).sum()) >= max(_LEAST_CELLS, _BODY_SHARE * int(body.sum())):
+            moved |= body
+    return np.asarray(cv2.dilate(moved.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool))
+
+
+def _enlarged(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Cells as pixels; the border that no whole cell covers is that of the last ones."""
+    large = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
+    rows, cols = shape[0] - large.shape[0], shape[1] - large.shape[1]
+    return np.pad(large, ((0, rows), (0, cols)), mode="edge")
+
+
+def _cells(picture: Image) -> Array:
+    rows, cols = (n // _CELL_PX for n in picture.shape)
+    cut = picture[: rows * _CELL_PX, : cols * _CELL_PX]
+    return np.asarray(
+        cut.reshape(rows, _CELL_PX, cols, _CELL_PX).mean(axis=(1, 3)), dtype=np.float64
+    )
+
+
+def _covered(picture: Image, weight: Image) -> Image:
+    """The picture with what moves replaced by the smooth level of what stands still around it."""
+    known = np.asarray(cv2.GaussianBlur(weight, (0, 0), _FILL_PX), dtype=np.float32)
+    level = np.asarray(cv2.GaussianBlur(picture * weight, (0, 0), _FILL_PX), dtype=np.float32)
+    mean = float((picture * weight).sum() / max(float(weight.sum()), 1.0))
+    share = known / (known + np.float32(0.02))
+    fill = share * level / np.maximum(known, np.float32(1e-6)) + (1.0 - share) * np.float32(mean)
+    return np.asarray(weight * picture + (1.0 - weight) * fill, dtype=np.float32)

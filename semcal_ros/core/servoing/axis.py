@@ -1,0 +1,93 @@
+"""Where the optical axis is seen: what a change of magnification tells, and a calibration hardly does.
+
+The origin of the sem frame lies on the axis, and the axis is the one point that stays where it is in the image when
+the magnification changes. A calibration on tilted grids knows it from the perspective alone, to some px. A target
+that rests while the magnification goes from one to another tells it to a fraction of a px: seen through cameras
+whose principal points are both wrong by d px, it lies at ``X + d / m1``, then at ``X + d / m2``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.servoing.plane_camera import PlaneCamera
+
+__all__ = ["AxisObserver"]
+
+Array = NDArray[np.float64]
+
+# Cameras of one magnification that differ: another calibration has come into force.
+_SAME_SCALE = 0.002
+# What the scale of a camera may be wrong by (1-sigma), as a fraction: that also moves what does not lie on the axis.
+_SCALE_SIGMA = 0.003
+
+
+class AxisObserver:
+    """Kalman filter of the offset of the axis in the image, common to all magnifications.
+
+    Parameters
+    ----------
+    sigma_px
+        1-sigma of the principal point that the cameras come with; 0 takes it as it is.
+    change_px
+        1-sigma by which it moves from one magnification to the next.
+    """
+
+    def __init__(self, sigma_px: float, change_px: float) -> None:
+        self._start, self._change = sigma_px**2, change_px**2
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was learnt."""
+        self.offset_px: Array = np.zeros(2)
+        self.covariance: Array = self._start * np.eye(2)
+
+    @property
+    def sigma_px(self) -> float:
+        """1-sigma in the worst direction, px."""
+        return float(np.sqrt(max(float(np.linalg.eigvalsh(self.covariance)[-1]), 0.0)))
+
+    def corrected(self, camera: PlaneCamera) -> PlaneCamera:
+        """The camera with its axis where it was found."""
+        if not np.any(self.offset_px):
+            return camera
+        shift = np.eye(3)
+        shift[:2, 2] = self.offset_px
+        return PlaneCamera(shift @ camera.matrix)
+
+    def update(
+        self,
+        before: PlaneCamera,
+        after: PlaneCamera,
+        place_m: Array,
+        surprise_m: Array,
+        covariance_m2: Array,
+    ) -> bool:
+        """Take in where a target was seen after a change of camera; whether that told anything.
+
+        Parameters
+        ----------
+        before, after
+            Both cameras.
+        place_m
+            (2,) where it lies.
+        surprise_m, covariance_m2
+            (2,) seen through ``after`` minus expected from ``before``, and its (2, 2) covariance.
+        """
+        if self._start == 0.0:
+            return False
+        m_from_px = [np.linalg.inv(camera.jacobian(place_m[None])[0]) for camera in (before, after)]
+        scale = np.sqrt(abs(np.linalg.det(m_from_px[0]) / np.linalg.det(m_from_px[1])))
+        if abs(float(scale) - 1.0) < _SAME_SCALE:
+            self.restart()
+            return False
+        slope = m_from_px[1] - m_from_px[0]
+        self.covariance = self.covariance + self._change * np.eye(2)
+        noise = covariance_m2 + (_SCALE_SIGMA * float(np.hypot(*place_m))) ** 2 * np.eye(2)
+        spread = slope @ self.covariance @ slope.T + noise
+        gain = np.linalg.solve(spread, slope @ self.covariance).T
+        self.offset_px = self.offset_px + gain @ surprise_m
+        rest = np.eye(2) - gain @ slope
+        self.covariance = rest @ self.covariance @ rest.T + gain @ noise @ gain.T
+        return True

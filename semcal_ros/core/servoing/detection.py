@@ -1,0 +1,170 @@
+"""Find the markers of a target in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.servoing.sides import refine_quads
+from semcal_ros.core.servoing.target import NestedTarget, dictionary
+
+__all__ = ["TargetView", "find_target"]
+
+Array = NDArray[np.float64]
+
+# Larger images are averaged down by a whole factor to find the markers; their sides are then measured at full
+# resolution.
+_SEARCHED_PX = 1024
+_SMALLEST_SIDE_PX = 18.0
+_NOISE_BLUR_PX = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class TargetView:
+    """Markers of a target in one image.
+
+    Attributes
+    ----------
+    ids
+        (n,) their numbers.
+    target_xy_m
+        (n, 4, 2) their corners in the frame of the target, m.
+    xy
+        (n, 4, 2) the same corners in the image, px.
+    covariance_px2
+        (n, 8, 8) covariance of the four corners of each.
+    reason
+        Why there are none; empty where there are.
+    """
+
+    ids: NDArray[np.int64]
+    target_xy_m: Array
+    xy: Array
+    covariance_px2: Array
+    reason: str = ""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the target was found."""
+        return not self.reason
+
+    def moved(self, xy: Array) -> TargetView:
+        """The same markers with their corners (n, 4, 2) elsewhere."""
+        return TargetView(self.ids, self.target_xy_m, xy, self.covariance_px2, self.reason)
+
+    def chosen(self, keep: NDArray[np.bool_]) -> TargetView:
+        """Some of the markers."""
+        return TargetView(
+            self.ids[keep],
+            self.target_xy_m[keep],
+            self.xy[keep],
+            self.covariance_px2[keep],
+            self.reason,
+        )
+
+
+def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
+    """Corners of all markers of ``target`` that can be read, to a few hundredths of a pixel.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey levels of integers or floats; markers are dark on white.
+    target
+        What to look for.
+
+    Returns
+    -------
+    The markers; none, with a reason, where the target is not in view or the image is blank.
+
+    Raises
+    ------
+    InvalidValueError
+        If the image is no two-dimensional array of at least 32 x 32 px.
+    """
+    grey = np.asarray(image)
+    if grey.ndim != 2 or min(grey.shape) < 32 or grey.dtype.kind not in "uif":
+        raise InvalidValueError(
+            f"an image of shape {grey.shape} and type {grey.dtype}",
+            expected="grey levels of at least 32 x 32 px",
+        )
+    picture = np.ascontiguousarray(grey, dtype=np.float32)
+    if not np.all(np.isfinite(picture)):
+        return _none("image: holds values that are not finite")
+    factor = -(-max(picture.shape) // _SEARCHED_PX)
+    stretched = _stretched(picture, factor)
+    if stretched is None:
+        return _none("image: blank")
+    ids, corners = _searched(stretched, factor, target)
+    if len(ids) == 0:
+        return _none("no marker of the target in view")
+    refined = refine_quads(picture, corners)
+    if not np.any(refined.good):
+        return _none("no marker of the target with four straight sides")
+    good = refined.good
+    return TargetView(
+        ids[good], target.corners_m(ids[good]), refined.xy[good], refined.covariance_px2[good]
+    )
+
+
+def _none(reason: str) -> TargetView:
+    return TargetView(
+        np.empty(0, np.int64),
+        np.empty((0, 4, 2)),
+        np.empty((0, 4, 2)),
+        np.empty((0, 8, 8)),
+        reason,
+    )
+
+
+def _stretched(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
+    """8 bits for the search, and less noise; None where there is nothing to see."""
+    small = picture
+    if factor > 1:
+        height, width = (side // factor for side in picture.shape)
+        cut = picture[: height * factor, : width * factor]
+        small = cut.reshape(height, factor, width, factor).mean(axis=(1, 3), dtype=np.float32)
+    smooth = cv2.GaussianBlur(small, (0, 0), _NOISE_BLUR_PX)
+    # What was not scanned is 0 in a rectified image and says nothing of the contrast.
+    seen = smooth[smooth > 0.0]
+    if seen.size < 1024:
+        return None
+    low, high = (float(v) for v in np.percentile(seen[:: max(seen.size // 65536, 1)], (1.0, 99.0)))
+    if not high - low > 1e-6 * max(abs(high), abs(low)):
+        return None
+    scaled = np.clip((smooth - low) * (255.0 / (high - low)), 0.0, 255.0)
+    return np.asarray(scaled, dtype=np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _detector() -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    # A code with a wrong bit is that of another marker as likely as not.
+    parameters.errorCorrectionRate = 0.0
+    parameters.minMarkerPerimeterRate = 0.04
+    parameters.adaptiveThreshWinSizeMin = 5
+    parameters.adaptiveThreshWinSizeMax = 45
+    parameters.adaptiveThreshWinSizeStep = 20
+    return cv2.aruco.ArucoDetector(dictionary(), parameters)
+
+
+def _searched(
+    picture: NDArray[np.uint8], factor: int, target: NestedTarget
+) -> tuple[NDArray[np.int64], Array]:
+    """Numbers (n,) and rough corners (n, 4, 2), in px of the whole image, of what can be read."""
+    found, numbers, _ = _detector().detectMarkers(picture)
+    if numbers is None or len(found) == 0:
+        return np.empty(0, np.int64), np.empty((0, 4, 2))
+    ids = np.asarray(numbers, dtype=np.int64).reshape(-1)
+    corners = np.asarray(found, dtype=np.float64).reshape(-1, 4, 2)
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    # The same marker twice: one of them is something else, and which is not to be known.
+    seen, count = np.unique(ids, return_counts=True)
+    keep = (ids < target.size) & np.isin(ids, seen[count == 1])
+    keep &= sides.min(axis=1) >= _SMALLEST_SIDE_PX
+    return ids[keep], (corners[keep] + 0.5) * factor - 0.5

@@ -1,0 +1,368 @@
+"""From the markers of one frame to the velocity of the stage.
+
+Image-based: what is brought to zero is the distance, in pixels of the frame, between the markers and where the goal
+has them. Goal and interaction matrix are those of P_g of the same frame, so a change of the magnification changes
+features, their goal and their derivatives together, and nothing has to converge anew that had converged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.servoing.axis import AxisObserver
+from semcal_ros.core.servoing.detection import TargetView
+from semcal_ros.core.servoing.motion import CommandHistory, DisturbanceObserver
+from semcal_ros.core.servoing.plane_camera import PlaneCamera
+from semcal_ros.core.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
+from semcal_ros.core.servoing.settings import ServoSettings
+from semcal_ros.core.servoing.watch import FollowWatch
+
+__all__ = ["Servo", "ServoStep"]
+
+Array = NDArray[np.float64]
+
+# Part of the error that is taken away per frame, at most. With the latency foretold, up to 2 is stable; without any
+# forecast 0.5 still is for a latency of two frames, whose limit is 0.618.
+_MOST_PER_FRAME = 0.5
+# Without times the latency cannot be foretold; a quarter does not overshoot with one frame of it.
+_MOST_WITHOUT_TIMES = 0.25
+# Frames and commands of one clock are not further apart.
+_LONGEST_LATENCY_S = 30.0
+# By how much later than told a stage may obey (1-sigma), in intervals.
+_LATE = 0.5
+
+
+def _nothing() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class ServoStep:
+    """What one frame led to.
+
+    Attributes
+    ----------
+    twist
+        (3,) commanded velocity in the sem frame: m/s, m/s, rad/s; zero where there is a ``reason``.
+    error
+        (3,) target minus goal at the centre of the frame's acquisition: m, m, rad.
+    error_covariance
+        (3, 3) of it, from the picture.
+    error_px, error_m
+        RMS over the features, px, and distance of the target's origin from the goal, m.
+    sigma_px, sigma_m
+        1-sigma of the origin in the worst direction.
+    fit
+        The pose in the frame; None where none was looked for.
+    drift_m_s
+        (2,) velocity that is commanded away.
+    axis_px, axis_sigma_px
+        (2,) by how much the optical axis was found to lie beside the principal point of the camera, and how well
+        that is known (1-sigma): the place of the goal in the sem frame is no better known.
+    gain_hz
+        Gain in use.
+    limited
+        What limited the speed; empty where nothing did.
+    converged
+        Whether the goal is reached and has been for some frames.
+    reason
+        Why the stage stands still; empty where it is servoed.
+    """
+
+    twist: Array = field(default_factory=_nothing)
+    error: Array = field(default_factory=lambda: np.full(3, np.nan))
+    error_covariance: Array = field(default_factory=lambda: np.full((3, 3), np.inf))
+    error_px: float = float("nan")
+    error_m: float = float("nan")
+    sigma_px: float = float("inf")
+    sigma_m: float = float("inf")
+    fit: PoseFit | None = None
+    drift_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    axis_px: Array = field(default_factory=lambda: np.zeros(2))
+    axis_sigma_px: float = float("inf")
+    gain_hz: float = 0.0
+    limited: str = ""
+    converged: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The latest frame with a pose; the camera is that which came with it."""
+
+    pose: PlanePose
+    covariance: Array
+    camera: PlaneCamera
+    time_s: float
+
+
+class Servo:
+    """Brings a target to a pose in the sem frame; :meth:`update` once per frame.
+
+    Parameters
+    ----------
+    goal
+        Where the target shall lie.
+    settings
+        How.
+    rotation_centre_m
+        Where the axis of the stage's rotation meets the target, in the target's frame: the axis moves with x and y.
+        A wrong one makes the way a curve, and does not keep the target from its goal.
+    """
+
+    def __init__(
+        self,
+        goal: PlanePose,
+        settings: ServoSettings | None = None,
+        rotation_centre_m: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.goal = goal
+        self.settings = settings or ServoSettings()
+        self.rotation_centre_m = np.array(rotation_centre_m, dtype=np.float64)
+        # Of the microscope, and not of this run: it outlives a restart.
+        self._axis_observer = AxisObserver(
+            self.settings.axis_sigma_px, self.settings.axis_change_px
+        )
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was seen and commanded, and a fault; not where the axis is."""
+        self.history = CommandHistory()
+        self.fault = ""
+        self._last: _Seen | None = None
+        self._near = 0
+        self._watch = FollowWatch()
+        self._observer = DisturbanceObserver(
+            self.settings.drift_sigma_m_s, self.settings.drift_change_m_s
+        )
+
+    def sent(self, time_s: float, twist: ArrayLike) -> None:
+        """Tell which velocity (3,) the stage was given and when; stops count, too."""
+        self.history.add(time_s, twist)
+
+    def stopped(self, reason: str, fit: PoseFit | None = None) -> ServoStep:
+        """The step of a frame, or of a time without one, in which the stage has to stand still."""
+        self._near = 0
+        return ServoStep(fit=fit, reason=reason)
+
+    def update(
+        self,
+        view: TargetView,
+        camera: PlaneCamera,
+        time_s: float,
+        *,
+        interval_s: float,
+        now_s: float | None = None,
+        shift_m: ArrayLike = (0.0, 0.0),
+    ) -> ServoStep:
+        """The velocity after a frame.
+
+        Parameters
+        ----------
+        view
+            Markers in ideal pixels.
+        camera
+            Camera of this frame.
+        time_s
+            Centre of its acquisition, on the clock of :meth:`sent`.
+        interval_s
+            Time between frames.
+        now_s
+            When the command will take effect; the way of the stage until then is foretold. None where the clocks do
+            not allow that.
+        shift_m
+            (2,) what was taken out of the picture and has to be added again: the drift of the frame where the goal
+            is a place in the sem frame, nothing where the goal is a place on the specimen.
+
+        Raises
+        ------
+        InvalidValueError
+            If a time is not finite or the interval not positive.
+        """
+        if not (np.all(np.isfinite([time_s, interval_s])) and interval_s > 0.0):
+            raise InvalidValueError(
+                f"a frame at {time_s} s after {interval_s} s", expected="a positive interval"
+            )
+        if self.fault:
+            return self.stopped(self.fault)
+        shift = np.asarray(shift_m, dtype=np.float64)
+        corrected = self._axis_observer.corrected(camera)
+        fit = fit_pose(_shifted(view, corrected, shift), corrected)
+        refusal = self._refusal(fit, corrected)
+        if refusal:
+            return self.stopped(refusal, fit)
+        if self._learnt_axis(fit, camera, time_s):
+            corrected = self._axis_observer.corrected(camera)
+            fit = fit_pose(_shifted(view, corrected, shift), corrected)
+        self._learn(fit, camera, time_s)
+        if self.fault:
+            return self.stopped(self.fault, fit)
+        return self._commanded(fit, corrected, time_s, interval_s, now_s)
+
+    def _refusal(self, fit: PoseFit, camera: PlaneCamera) -> str:
+        limits = self.settings
+        if not fit.accepted:
+            return fit.reason
+        if abs(fit.scale - 1.0) > limits.scale_tolerance + 3.0 * fit.scale_sigma:
+            return f"the target is {fit.scale:.3f} times as large as the camera of the frame says"
+        sigma_px = _origin_sigma(fit, camera)[1]
+        if not sigma_px <= limits.max_sigma_px:
+            return f"the pose of the target is only known to {sigma_px:.2g} px"
+        return ""
+
+    # -- what moves ---------------------------------------------------------------------------------
+
+    def _way(self, first_s: float, last_s: float, pose: PlanePose) -> Array:
+        """(3,) way of the target's origin between two times by the commands alone."""
+        way = self.history.travel(first_s, last_s)
+        arm = -(pose.rotation @ self.rotation_centre_m)
+        # The origin goes around the axis while it turns.
+        c, s = math.cos(float(way[2])), math.sin(float(way[2]))
+        way[:2] += np.array([(c - 1.0) * arm[0] - s * arm[1], s * arm[0] + (c - 1.0) * arm[1]])
+        return way
+
+    def _expected(self, fit: PoseFit, before: _Seen, time_s: float) -> tuple[Array, Array, Array]:
+        """Way (2,) of the target since the frame before as commanded and as seen; variance (2,) of the difference."""
+        way = self._way(before.time_s, time_s, before.pose)
+        seen = fit.pose.minus(before.pose)
+        variance = np.diag(fit.covariance)[:2] + np.diag(before.covariance)[:2]
+        variance = variance + (self.settings.slip * float(np.hypot(way[0], way[1]))) ** 2
+        # A command obeyed late by a part of an interval that nobody knows.
+        change = self.history.at(time_s) - self.history.at(before.time_s)
+        late_m = _LATE * (time_s - before.time_s) * float(np.hypot(change[0], change[1]))
+        return way[:2], seen[:2], variance + late_m**2
+
+    def _learnt_axis(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> bool:
+        """Where the magnification has changed, see by how much that moved the target; whether the axis moved, too."""
+        before = self._last
+        if before is None or camera.is_same(before.camera) or time_s <= before.time_s:
+            return False
+        interval_s = time_s - before.time_s
+        way, seen, variance = self._expected(fit, before, time_s)
+        drift = self._observer.velocity_m_s * interval_s
+        variance = variance + self._observer.variance * interval_s**2
+        return self._axis_observer.update(
+            before.camera, camera, fit.pose.values[:2], seen - way - drift, np.diag(variance)
+        )
+
+    def _learn(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> None:
+        """Compare with the frame before: drift, and whether the stage does what it is told."""
+        before = self._last
+        self._last = _Seen(fit.pose, fit.covariance, camera, time_s)
+        # Two cameras do not agree on a place to the noise of a picture; that is no drift.
+        if before is None or not camera.is_same(before.camera) or time_s <= before.time_s:
+            return
+        way, seen, variance = self._expected(fit, before, time_s)
+        slope = camera.jacobian(fit.pose.values[None, :2])[0]
+        self.fault = self._watch.update(slope @ way, slope @ seen)
+        self._observer.update(time_s - before.time_s, seen - way, variance)
+
+    # -- command ------------------------------------------------------------------------------------
+
+    def _commanded(
+        self,
+        fit: PoseFit,
+        camera: PlaneCamera,
+        time_s: float,
+        interval_s: float,
+        now_s: float | None,
+    ) -> ServoStep:
+        limits = self.settings
+        drift = self._observer.velocity_m_s if limits.feed_forward else np.zeros(2)
+        latency_s = 0.0 if now_s is None else now_s - time_s
+        known = now_s is not None and 0.0 <= latency_s < _LONGEST_LATENCY_S
+        ahead = fit.pose
+        if known:
+            way = self._way(time_s, time_s + latency_s, fit.pose)
+            dx, dy = way[:2] + drift * latency_s
+            ahead = fit.pose.moved(float(dx), float(dy), float(way[2]))
+        most = _MOST_PER_FRAME if known else _MOST_WITHOUT_TIMES
+        gain_hz = min(limits.gain_hz, most / interval_s)
+        twist = -gain_hz * self._correction(fit, camera, ahead)
+        twist[:2] -= drift
+        twist, limited = self._limited(twist, fit, camera, interval_s)
+        sigma_m, sigma_px = _origin_sigma(fit, camera)
+        error = fit.pose.minus(self.goal)
+        own = fit.view.target_xy_m.reshape(-1, 2)
+        away = camera.project(fit.pose.apply(own)) - camera.project(self.goal.apply(own))
+        error_px = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+        is_near = error_px <= limits.tolerance_px and 2.0 * sigma_px <= limits.tolerance_px
+        self._near = self._near + 1 if is_near else 0
+        return ServoStep(
+            twist=twist,
+            error=error,
+            error_covariance=fit.covariance,
+            error_px=error_px,
+            error_m=float(np.hypot(error[0], error[1])),
+            sigma_px=sigma_px,
+            sigma_m=sigma_m,
+            fit=fit,
+            drift_m_s=drift.copy(),
+            axis_px=self._axis_observer.offset_px.copy(),
+            axis_sigma_px=self._axis_observer.sigma_px,
+            gain_hz=gain_hz,
+            limited=limited,
+            converged=self._near >= limits.settle_frames,
+        )
+
+    def _correction(self, fit: PoseFit, camera: PlaneCamera, ahead: PlanePose) -> Array:
+        """(3,) way of the stage that, as far as it is linear, the features are away from their goal."""
+        own = fit.view.target_xy_m.reshape(-1, 2)
+        # Where the features themselves will be: they are servoed, not the pose.
+        seen = fit.view.xy.reshape(-1, 2) - camera.project(fit.pose.apply(own))
+        features = camera.project(ahead.apply(own)) + seen
+        wanted = camera.project(self.goal.apply(own))
+        here = interaction_matrix(camera, features, self._axis(ahead))
+        there = interaction_matrix(camera, wanted, self._axis(self.goal))
+        # The mean of both ends is right to the second order (Chaumette and Hutchinson 2006).
+        slope = 0.5 * (here + there)
+        whitening = np.linalg.inv(np.linalg.cholesky(fit.view.covariance_px2 + 1e-8 * np.eye(8)))
+        design = (whitening @ slope.reshape(-1, 8, 3)).reshape(-1, 3)
+        error = (whitening @ (features - wanted).reshape(-1, 8, 1)).reshape(-1)
+        size = np.linalg.norm(design, axis=0)
+        way: Array = np.linalg.lstsq(design / size, error, rcond=None)[0] / size
+        return way
+
+    def _axis(self, pose: PlanePose) -> Array:
+        axis: Array = pose.apply(self.rotation_centre_m[None])[0]
+        return axis
+
+    def _limited(
+        self, twist: Array, fit: PoseFit, camera: PlaneCamera, interval_s: float
+    ) -> tuple[Array, str]:
+        """The twist, slower but in the same direction where it is too fast."""
+        limits = self.settings
+        pixels = fit.view.xy.reshape(-1, 2)
+        moved = interaction_matrix(camera, pixels, self._axis(fit.pose)) @ twist * interval_s
+        travel_px = float(np.sqrt(np.sum(moved.reshape(-1, 2) ** 2, axis=1)).max())
+        shares = {
+            "speed": limits.speed_limit_m_s / max(float(np.hypot(twist[0], twist[1])), 1e-30),
+            "turn": limits.turn_limit_rad_s / max(abs(float(twist[2])), 1e-30),
+            "blur": limits.travel_limit_px / max(travel_px, 1e-30),
+        }
+        name = min(shares, key=lambda key: shares[key])
+        if shares[name] >= 1.0:
+            return twist, ""
+        return twist * shares[name], name
+
+
+def _shifted(view: TargetView, camera: PlaneCamera, shift_m: Array) -> TargetView:
+    if shift_m.shape != (2,) or not np.all(np.isfinite(shift_m)):
+        raise InvalidValueError(f"a shift {shift_m.tolist()}", expected="two finite numbers")
+    if not view.accepted or not np.any(shift_m):
+        return view
+    moved = camera.project(camera.plane_from_px(view.xy.reshape(-1, 2)) + shift_m)
+    return view.moved(moved.reshape(view.xy.shape))
+
+
+def _origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:
+    """1-sigma of the target's origin in the worst direction, m and px."""
+    block = fit.covariance[:2, :2]
+    slope = camera.jacobian(fit.pose.values[None, :2])[0]
+    worst = [float(np.linalg.eigvalsh(c)[-1]) for c in (block, slope @ block @ slope.T)]
+    return math.sqrt(max(worst[0], 0.0)), math.sqrt(max(worst[1], 0.0))

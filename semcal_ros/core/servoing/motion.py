@@ -1,0 +1,107 @@
+"""What the stage was told, and what moves beside that."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["CommandHistory", "DisturbanceObserver"]
+
+Array = NDArray[np.float64]
+
+_KEPT = 1024
+# Deviations beyond which a surprise is none of a drift, and how many in a row are one after all.
+_GATE, _ODD = 5.0, 4
+# Then so much more drift is expected.
+_WIDER = 10.0
+
+
+class CommandHistory:
+    """Commanded velocities, each valid from its time on; zero before the first."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=_KEPT)
+        self._twists: deque[Array] = deque(maxlen=_KEPT)
+
+    def add(self, time_s: float, twist: ArrayLike) -> None:
+        """A command (3,): x, y in m/s, rotation in rad/s.
+
+        Raises
+        ------
+        InvalidValueError
+            If it is not finite. A time before the last one counts as that.
+        """
+        values = np.array(twist, dtype=np.float64)
+        if values.shape != (3,) or not np.all(np.isfinite([time_s, *values])):
+            raise InvalidValueError(f"a command {values.tolist()}", expected="three finite numbers")
+        self._times.append(max(time_s, self._times[-1]) if self._times else time_s)
+        self._twists.append(values)
+
+    def at(self, time_s: float) -> Array:
+        """Command (3,) that is valid at a time."""
+        valid = np.zeros(3)
+        for begin, twist in zip(self._times, self._twists, strict=True):
+            if begin > time_s:
+                break
+            valid = twist
+        return valid
+
+    def travel(self, first_s: float, last_s: float) -> Array:
+        """(3,) way that was commanded between two times: m, m, rad; negative where the second is the earlier one."""
+        if last_s < first_s:
+            return -self.travel(last_s, first_s)
+        way = np.zeros(3)
+        ends = [*list(self._times)[1:], np.inf]
+        for begin, end, twist in zip(self._times, ends, self._twists, strict=False):
+            way += max(min(end, last_s) - max(begin, first_s), 0.0) * twist
+        return way
+
+
+class DisturbanceObserver:
+    """Velocity of what moves the target beside the commands, such as drift: a Kalman filter for each axis.
+
+    Parameters
+    ----------
+    sigma_m_s
+        1-sigma of the velocity before anything is seen.
+    change_m_s
+        1-sigma of its change within a second.
+    """
+
+    def __init__(self, sigma_m_s: float, change_m_s: float) -> None:
+        self._sigma, self._change = sigma_m_s, change_m_s
+        self._odd = 0
+        self.velocity_m_s: Array = np.zeros(2)
+        self.variance: Array = np.full(2, sigma_m_s**2)
+
+    def update(self, interval_s: float, beside_m: Array, variance_m2: Array) -> None:
+        """Take in by how much the target went beside the commands in an interval.
+
+        What is far from all that is expected is a touch of the stage and no drift, unless it goes on.
+
+        Parameters
+        ----------
+        interval_s
+            Time between two frames.
+        beside_m, variance_m2
+            (2,) way that was seen less the one that was commanded, and its variance.
+        """
+        if interval_s <= 0.0:
+            return
+        self.variance = self.variance + self._change**2 * interval_s
+        surprise = beside_m / interval_s - self.velocity_m_s
+        spread = self.variance + variance_m2 / interval_s**2 + 1e-30
+        if np.any(surprise**2 > _GATE**2 * spread):
+            self._odd += 1
+            if self._odd >= _ODD:
+                self.variance = np.full(2, (_WIDER * self._sigma) ** 2)
+                self._odd = 0
+            return
+        self._odd = 0
+        gain = self.variance / spread
+        self.velocity_m_s = self.velocity_m_s + gain * surprise
+        self.variance = (1.0 - gain) * self.variance

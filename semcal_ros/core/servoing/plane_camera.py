@@ -1,0 +1,137 @@
+"""The camera of a frame as seen from the plane in which the stage moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.camera import ScanCamera, as_points
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["PlaneCamera", "projection_of_frame"]
+
+Array = NDArray[np.float64]
+
+# Two matrices that were computed from the same numbers, one of them divided by rho and multiplied by it again.
+_SAME = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneCamera:
+    """Homography from the plane at one height of the sem frame to ideal pixels.
+
+    Parameters
+    ----------
+    matrix
+        (3, 3), homogeneous ideal pixel of (X, Y, 1) in m.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is not finite or has no inverse.
+    """
+
+    matrix: Array
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.matrix, dtype=np.float64)
+        good = matrix.shape == (3, 3) and bool(np.all(np.isfinite(matrix)))
+        if not good or abs(float(np.linalg.det(matrix))) < 1e-12:
+            raise InvalidValueError(
+                f"a projection of the stage plane {matrix.tolist()}",
+                expected="a finite (3, 3) matrix that can be inverted",
+                do="calibrate, or wait for the camera of the frame",
+            )
+        matrix.setflags(write=False)
+        object.__setattr__(self, "matrix", matrix)
+
+    @classmethod
+    def from_projection(cls, projection: ArrayLike, height_m: float = 0.0) -> PlaneCamera:
+        """From P_g, the (3, 4) projection of homogeneous sem-frame points in m, and the height of the plane."""
+        p = np.asarray(projection, dtype=np.float64)
+        if p.shape != (3, 4):
+            raise InvalidValueError(f"a projection of shape {p.shape}", expected="(3, 4)")
+        return cls(np.column_stack([p[:, 0], p[:, 1], p[:, 2] * height_m + p[:, 3]]))
+
+    @classmethod
+    def of(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
+        """From a camera, in ideal pixels."""
+        return cls.from_projection(camera.P_affine, height_m)
+
+    def project(self, xy_m: ArrayLike) -> Array:
+        """Ideal pixels (n, 2) of points (n, 2) of the plane, m."""
+        points = as_points(xy_m, 2)
+        image = np.column_stack([points, np.ones(len(points))]) @ self.matrix.T
+        pixels: Array = image[:, :2] / image[:, 2:]
+        return pixels
+
+    def plane_from_px(self, xy: ArrayLike) -> Array:
+        """Points (n, 2) of the plane, m, that are seen at ideal pixels (n, 2)."""
+        pixels = as_points(xy, 2)
+        rays = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
+        points: Array = rays[:, :2] / rays[:, 2:]
+        return points
+
+    def jacobian(self, xy_m: ArrayLike) -> Array:
+        """Derivative (n, 2, 2) of :meth:`project`, px per m."""
+        points = as_points(xy_m, 2)
+        image = np.column_stack([points, np.ones(len(points))]) @ self.matrix.T
+        pixels = image[:, :2] / image[:, 2:]
+        linear, last = self.matrix[:2, :2], self.matrix[2, :2]
+        slope: Array = linear[None] - pixels[:, :, None] * last[None, None, :]
+        return slope / image[:, 2][:, None, None]
+
+    def is_same(self, other: PlaneCamera | None) -> bool:
+        """Whether another one is the camera of the same magnification."""
+        return other is not None and bool(
+            np.allclose(self.matrix, other.matrix, rtol=1e-6, atol=1e-12)
+        )
+
+
+def projection_of_frame(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
+    """P_g (3, 4) of a frame, from its own K and those P_g that were published lately.
+
+    K belongs to the frame, by its stamp, but holds f = m / rho only: without the distance 1 / rho of the pivot
+    there are no metres in it. The published P_g has both and no stamp. For one camera its first three columns are
+    rho K: that tells which of them is of the frame.
+
+    A parallel projection (rho = 0) has no K, and neither has a frame without calibration. The latest P_g is then
+    taken if it is parallel itself; that it is of the frame's magnification, the size of the target has to tell
+    (:attr:`~semcal_ros.core.servoing.settings.ServoSettings.scale_tolerance`).
+
+    Parameters
+    ----------
+    k
+        (3, 3) K of the frame's camera_info, zero where there is none.
+    projections
+        (3, 4) matrices with the last row ``[0 0 rho 1]``, the oldest first.
+
+    Raises
+    ------
+    InvalidValueError
+        None of them is of this frame, or the frame has no camera.
+    """
+    own = np.asarray(k, dtype=np.float64).reshape(3, 3)
+    known = [np.asarray(p, dtype=np.float64).reshape(3, 4) for p in projections]
+    if not np.all(np.isfinite(own)):
+        raise InvalidValueError("a K that is not finite", expected="finite numbers")
+    if not np.any(own):
+        if known and known[-1][2, 2] == 0.0 and known[-1][2, 3] != 0.0:
+            return known[-1]
+        raise InvalidValueError(
+            "a frame without a camera",
+            expected="a calibrated frame",
+            do="calibrate the stream",
+        )
+    for matrix in reversed(known):
+        expected = matrix[2, 2] * own
+        if np.allclose(matrix[:, :3], expected, rtol=_SAME, atol=_SAME * abs(matrix[2, 2])):
+            return matrix
+    raise InvalidValueError(
+        f"no projection of the magnification of this frame among the latest {len(known)}",
+        expected="one whose first columns are rho times K of the frame",
+        do="start parameter_server with the same calibration",
+    )

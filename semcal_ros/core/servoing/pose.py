@@ -1,0 +1,243 @@
+"""Where a target lies in the stage plane, and how its image moves with the stage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.camera import as_points
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.servoing.detection import TargetView
+from semcal_ros.core.servoing.plane_camera import PlaneCamera
+
+__all__ = ["PlanePose", "PoseFit", "fit_pose", "interaction_matrix"]
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 12
+_SETTLED_PX = 1e-6
+# A marker that lies further off than this part of its own side is not the one it was read as.
+_MISREAD = 0.25
+
+
+@dataclass(frozen=True)
+class PlanePose:
+    """Pose in the stage plane: a point x of the target lies at ``R(angle) x + (x_m, y_m)`` in the sem frame.
+
+    Parameters
+    ----------
+    x_m, y_m
+        Origin of the target in the sem frame, m.
+    angle_rad
+        From x towards y.
+    """
+
+    x_m: float
+    y_m: float
+    angle_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite(self.values)):
+            raise InvalidValueError(f"a pose {self.values.tolist()}", expected="finite numbers")
+
+    @property
+    def values(self) -> Array:
+        """(3,) x, y in m and the angle in rad."""
+        return np.array([self.x_m, self.y_m, self.angle_rad], dtype=np.float64)
+
+    @property
+    def rotation(self) -> Array:
+        """(2, 2) rotation."""
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        return np.array([[c, -s], [s, c]])
+
+    def apply(self, target_xy_m: ArrayLike) -> Array:
+        """Points (n, 2) of the target in the sem frame, m."""
+        moved: Array = as_points(target_xy_m, 2) @ self.rotation.T + self.values[:2]
+        return moved
+
+    def moved(self, dx_m: float, dy_m: float, turn_rad: float = 0.0) -> PlanePose:
+        """The pose after a displacement and a turn about the target's origin."""
+        return PlanePose(self.x_m + dx_m, self.y_m + dy_m, self.angle_rad + turn_rad)
+
+    def minus(self, other: PlanePose) -> Array:
+        """(3,) difference, the angle between -pi and pi."""
+        difference: Array = self.values - other.values
+        difference[2] = math.remainder(float(difference[2]), 2.0 * math.pi)
+        return difference
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """Pose of a target in one image.
+
+    Attributes
+    ----------
+    pose
+        The pose; NaN-free, meaningless where ``reason`` is given.
+    covariance
+        (3, 3) of x, y in m and the angle in rad, from the scatter of the corners. It does not contain what the
+        camera itself is wrong by.
+    scale, scale_sigma
+        Size at which the target is seen over that which the camera says.
+    rms_px
+        RMS distance of the corners from where the pose puts them.
+    view
+        The markers that were used.
+    reason
+        Why there is no pose; empty where there is one.
+    """
+
+    pose: PlanePose
+    covariance: Array
+    scale: float
+    scale_sigma: float
+    rms_px: float
+    view: TargetView
+    reason: str = ""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a pose."""
+        return not self.reason
+
+
+def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
+    """Most likely pose of a target from its markers.
+
+    Weighted least squares over all corners in pixels, the scale given by the camera; markers that contradict most
+    others are left out.
+
+    Parameters
+    ----------
+    view
+        Markers in ideal pixels.
+    camera
+        Camera of this image.
+    """
+    if not view.accepted:
+        return _refused(view, view.reason)
+    kept, scale = view, 1.0
+    start = PlanePose(0.0, 0.0)
+    while True:
+        start, scale = _similarity(kept, camera)
+        misfit = np.linalg.norm(_residual(kept, camera, start, scale), axis=2).max(axis=1)
+        sides = np.linalg.norm(np.roll(kept.xy, -1, axis=1) - kept.xy, axis=2).mean(axis=1)
+        excess = misfit / (_MISREAD * sides)
+        if float(excess.max()) <= 1.0:
+            break
+        if len(kept.ids) <= 2 or 2 * (len(kept.ids) - 1) < len(view.ids):
+            return _refused(view, "the markers contradict each other")
+        kept = kept.chosen(np.arange(len(kept.ids)) != int(np.argmax(excess)))
+    return _adjusted(kept, camera, start, scale)
+
+
+def _refused(view: TargetView, reason: str) -> PoseFit:
+    spread = np.full((3, 3), np.inf)
+    return PoseFit(
+        PlanePose(0.0, 0.0), spread, float("nan"), float("nan"), float("nan"), view, reason
+    )
+
+
+def _similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float]:
+    """Pose and scale by least squares in the plane, as of complex numbers: b = scale exp(i angle) a + c."""
+    seen = camera.plane_from_px(view.xy.reshape(-1, 2)) @ np.array([1.0, 1.0j])
+    own = view.target_xy_m.reshape(-1, 2) @ np.array([1.0, 1.0j])
+    # Small markers are as well seen in px as large ones, but say less of the whole.
+    spread = own - own.mean()
+    factor = complex(np.sum(np.conj(spread) * (seen - seen.mean())) / np.sum(np.abs(spread) ** 2))
+    origin = complex(seen.mean() - factor * own.mean())
+    return PlanePose(origin.real, origin.imag, float(np.angle(factor))), abs(factor)
+
+
+def _residual(view: TargetView, camera: PlaneCamera, pose: PlanePose, scale: float = 1.0) -> Array:
+    """(n, 4, 2) px."""
+    predicted = camera.project(pose.apply(scale * view.target_xy_m.reshape(-1, 2)))
+    residual: Array = view.xy - predicted.reshape(view.xy.shape)
+    return residual
+
+
+def _adjusted(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: float) -> PoseFit:
+    whitening = _whitening(view)
+    pose, settled = start, False
+    design, residual = np.empty((0, 3)), np.empty(0)
+    own = view.target_xy_m.reshape(-1, 2)
+    for _ in range(_MOST_STEPS):
+        residual = _white(whitening, _residual(view, camera, pose))
+        moved = pose.apply(own)
+        slope = interaction_of_points(camera, moved, pose.values[:2])
+        design = _white(whitening, slope.reshape(len(view.ids), 8, 3))
+        # Columns of m and rad differ by seven orders of magnitude.
+        size = np.linalg.norm(design, axis=0)
+        step = np.linalg.lstsq(design / size, residual, rcond=None)[0] / size
+        pose = pose.moved(*(float(v) for v in step))
+        if float(np.max(np.abs(slope @ step))) < _SETTLED_PX:
+            settled = True
+            break
+    left = _residual(view, camera, pose)
+    residual = _white(whitening, left)
+    size = np.linalg.norm(design, axis=0)
+    normal = (design / size).T @ (design / size)
+    # Where the corners scatter more than they say, the pose does too.
+    factor = max(1.0, float(residual @ residual) / max(len(residual) - 3, 1))
+    covariance = np.linalg.inv(normal) / np.outer(size, size) * factor
+    rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
+    pose = PlanePose(pose.x_m, pose.y_m, math.remainder(pose.angle_rad, 2.0 * math.pi))
+    reason = "" if settled else f"the pose did not settle in {_MOST_STEPS} steps"
+    return PoseFit(pose, covariance, scale, _scale_sigma(view), rms_px, view, reason)
+
+
+def _scale_sigma(view: TargetView) -> float:
+    """1-sigma of the scale, from the scatter of the corners and how far they spread."""
+    flat = view.xy.reshape(-1, 2)
+    reach = float(np.sum((flat - flat.mean(axis=0)) ** 2))
+    variance = float(np.trace(view.covariance_px2, axis1=1, axis2=2).mean()) / 8.0
+    return math.sqrt(variance / max(reach, 1e-9))
+
+
+def _whitening(view: TargetView) -> Array:
+    """(n, 8, 8) inverse Cholesky factors of the markers' covariances."""
+    floor = 1e-8 * np.eye(8)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(view.covariance_px2 + floor)))
+
+
+def _white(whitening: Array, values: Array) -> Array:
+    """Whitened values (8 n, ...) of (n, 4, 2) or (n, 8, k)."""
+    if values.ndim == 3 and values.shape[1:] == (4, 2):
+        return np.asarray(np.einsum("nij,nj->ni", whitening, values.reshape(-1, 8)).reshape(-1))
+    return np.asarray((whitening @ values).reshape(-1, values.shape[-1]))
+
+
+def interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Array) -> Array:
+    """(2n, 3) of points (n, 2) of the plane, m; see :func:`interaction_matrix`."""
+    slope = camera.jacobian(xy_m)
+    arm = xy_m - centre_m
+    turned = np.column_stack([-arm[:, 1], arm[:, 0]])
+    return np.concatenate([slope, slope @ turned[:, :, None]], axis=2).reshape(-1, 3)
+
+
+def interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) -> Array:
+    """Derivative of ideal pixels by the velocity of the stage in the sem frame.
+
+    With P_g of the frame known, and with it the depth 1 / rho of the stage plane, a pixel has one place in the
+    plane: nothing is left to be estimated, as the depth has to be for other cameras (Chaumette and Hutchinson 2006,
+    doi:10.1109/MRA.2006.250573).
+
+    Parameters
+    ----------
+    camera
+        Camera of the frame.
+    xy
+        (n, 2) ideal pixels of points that the stage carries.
+    centre_m
+        (2,) where the axis of rotation meets the plane, m.
+
+    Returns
+    -------
+    (2n, 3): rows u, v of each point; columns px per m for x and y, px per rad for the rotation from x towards y.
+    """
+    centre = np.asarray(centre_m, dtype=np.float64).reshape(2)
+    return interaction_of_points(camera, camera.plane_from_px(xy), centre)

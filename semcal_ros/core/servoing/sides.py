@@ -1,0 +1,187 @@
+"""Corners of markers to a fraction of a pixel, from straight lines fitted to their sides.
+
+Across a side, between white border and black frame, the grey level steps once. Where it does follows from the mean
+over a window that is centred on the side: a step at delta from the middle of a window of half-width h makes the
+mean ``(black (h + delta) + white (h - delta)) / 2h``. Blur does not move it, since it is the same to both sides. A
+line through the steps of a side is known to a few hundredths of a pixel, and so are the corners, where two lines
+meet: the corner of a blurred image itself is rounded, and a corner detector finds it further inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["RefinedQuads", "refine_quads"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# Part of a side that is left out at both of its ends, where the window would meet the next side.
+_ENDS = 0.14
+# Half-width of the window over the side, px at least and at most. Border and frame of a marker are wider.
+_WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
+_ROUNDS = 4
+_SETTLED_PX = 0.02
+_MOST_PLACES = 96
+# Steps further off than this from the line of the others are dust.
+_OUTLIER = 3.5
+# A line through steps that scatter by more than this part of the window is none.
+_RAGGED = 0.5
+# Least contrast of a side, in deviations of its pixels from the two levels.
+_LEAST_CONTRAST = 2.0
+_LEAST_PLACES = 6
+
+
+@dataclass(frozen=True)
+class RefinedQuads:
+    """Corners of n markers.
+
+    Attributes
+    ----------
+    xy
+        (n, 4, 2) px.
+    covariance_px2
+        (n, 8, 8) of the corners ``x0, y0, x1, ...`` of each.
+    good
+        (n,) whether all four sides were found.
+    """
+
+    xy: Array
+    covariance_px2: Array
+    good: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Steps along one side: ``offset + slope * tau`` outward, tau from the middle of the side, px."""
+
+    offset: float
+    slope: float
+    offset_variance: float
+    slope_variance: float
+
+
+def refine_quads(image: Image, corners: Array) -> RefinedQuads:
+    """Refine the corners (n, 4, 2) of dark markers on white, given to about two pixels, in order around them."""
+    count = len(corners)
+    xy, covariance = np.array(corners, dtype=np.float64), np.zeros((count, 8, 8))
+    good = np.zeros(count, dtype=np.bool_)
+    for index in range(count):
+        refined = _refined(image, xy[index])
+        if refined is not None:
+            xy[index], covariance[index] = refined
+            good[index] = True
+    return RefinedQuads(xy, covariance, good)
+
+
+def _refined(image: Image, quad: Array) -> tuple[Array, Array] | None:
+    covariance = np.zeros((8, 8))
+    for _ in range(_ROUNDS):
+        before = quad
+        found = [
+            _line(image, quad[side], quad[(side + 1) % 4], _winding(quad)) for side in range(4)
+        ]
+        lines = [line for line in found if line is not None]
+        if len(lines) < 4:
+            return None
+        quad, covariance = _corners_of(quad, lines)
+        if not np.all(np.isfinite(quad)):
+            return None
+        if float(np.max(np.abs(quad - before))) < _SETTLED_PX:
+            break
+    return quad, covariance
+
+
+def _winding(quad: Array) -> float:
+    x, y = quad[:, 0], quad[:, 1]
+    return float(np.sign(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
+
+
+def _frame_of(first: Array, second: Array, winding: float) -> tuple[float, Array, Array]:
+    """Length of a side, and the unit vectors along it and outward."""
+    along = second - first
+    length = float(np.hypot(along[0], along[1]))
+    along = along / max(length, 1e-9)
+    outward = winding * np.array([along[1], -along[0]])
+    return length, along, outward
+
+
+def _line(image: Image, first: Array, second: Array, winding: float) -> _Line | None:
+    length, along, outward = _frame_of(first, second, winding)
+    places = int(min((1.0 - 2.0 * _ENDS) * length, _MOST_PLACES))
+    if places < _LEAST_PLACES:
+        return None
+    half = float(np.clip(_WINDOW * length, _NARROWEST_PX, _WIDEST_PX))
+    tau = np.linspace(_ENDS - 0.5, 0.5 - _ENDS, places) * length
+    across = np.linspace(-half, half, 2 * int(np.ceil(2.0 * half)) + 1)
+    middle = 0.5 * (first + second)
+    xy = middle + tau[:, None, None] * along + across[None, :, None] * outward
+    height, width = image.shape
+    if xy.min() < 0.0 or xy[..., 0].max() > width - 1 or xy[..., 1].max() > height - 1:
+        return None
+    seen = cv2.remap(
+        image,
+        xy[..., 0].astype(np.float32),
+        xy[..., 1].astype(np.float32),
+        cv2.INTER_LINEAR,
+    ).astype(np.float64)
+    inner, outer = across < -0.5 * half, across > 0.5 * half
+    black, white = float(seen[:, inner].mean()), float(seen[:, outer].mean())
+    rough = 0.5 * float(seen[:, inner].std() + seen[:, outer].std())
+    if white - black < _LEAST_CONTRAST * rough or white <= black:
+        return None
+    # The trapezoidal mean: the two ends of the window count half.
+    mean = (seen.sum(axis=1) - 0.5 * (seen[:, 0] + seen[:, -1])) / (seen.shape[1] - 1)
+    step = half * (black + white - 2.0 * mean) / (white - black)
+    return _fitted(tau, np.clip(step, -half, half), half)
+
+
+def _fitted(tau: Array, step: Array, half: float) -> _Line | None:
+    keep = np.ones(len(tau), dtype=np.bool_)
+    offset = slope = sigma = 0.0
+    for _ in range(2):
+        if int(keep.sum()) < _LEAST_PLACES:
+            return None
+        design = np.column_stack([np.ones(int(keep.sum())), tau[keep]])
+        (offset, slope), *_ = np.linalg.lstsq(design, step[keep], rcond=None)
+        left = step - offset - slope * tau
+        sigma = float(np.sqrt(np.sum(left[keep] ** 2) / max(int(keep.sum()) - 2, 1)))
+        keep = np.abs(left) <= max(_OUTLIER * sigma, 1e-6)
+    count = int(keep.sum())
+    if count < _LEAST_PLACES or sigma > _RAGGED * half:
+        return None
+    centred = tau[keep] - tau[keep].mean()
+    # Neighbouring places share pixels by the interpolation: a step or two px apart they do so half.
+    variance = max(sigma, 1e-3) ** 2 * 1.5
+    return _Line(
+        float(offset), float(slope), variance / count, variance / float(np.sum(centred**2))
+    )
+
+
+def _corners_of(quad: Array, lines: list[_Line]) -> tuple[Array, Array]:
+    """Where neighbouring lines meet, and the (8, 8) covariance of that."""
+    winding = _winding(quad)
+    frames = [_frame_of(quad[k], quad[(k + 1) % 4], winding) for k in range(4)]
+    moved, gradient = np.empty((4, 2)), np.zeros((8, 8))
+    for corner in range(4):
+        # The corner ends the side before it and begins its own.
+        sides = ((corner - 1) % 4, corner)
+        normals = np.stack([frames[side][2] for side in sides])
+        taus = [0.5 * frames[sides[0]][0], -0.5 * frames[sides[1]][0]]
+        shifts = np.array(
+            [lines[s].offset + lines[s].slope * t for s, t in zip(sides, taus, strict=True)]
+        )
+        inverse = (
+            np.linalg.inv(normals) if abs(np.linalg.det(normals)) > 0.1 else np.full((2, 2), np.nan)
+        )
+        moved[corner] = quad[corner] + inverse @ shifts
+        rows = slice(2 * corner, 2 * corner + 2)
+        for place, (side, tau) in enumerate(zip(sides, taus, strict=True)):
+            gradient[rows, 2 * side] = inverse[:, place]
+            gradient[rows, 2 * side + 1] = inverse[:, place] * tau
+    variances = np.array([v for line in lines for v in (line.offset_variance, line.slope_variance)])
+    return moved, (gradient * variances) @ gradient.T

@@ -1,0 +1,104 @@
+"""A planar target that shows some of its markers at every magnification.
+
+Square markers of a coded dictionary lie in the eight outer cells of a 3 x 3 board; the middle cell is the same
+board again, a third of the size, with other markers, and so on. A marker can be read from some 20 px to most of the
+field, a factor of about 20, so that at any magnification two levels at least can be read, and the origin, in the
+middle of all boards, is common to all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["CELLS", "MARKER_BITS", "RATIO", "SIDE", "NestedTarget", "dictionary"]
+
+Array = NDArray[np.float64]
+
+RATIO = 3
+"""How many times smaller the next board is."""
+
+SIDE = 0.7
+"""Side of a marker over that of its cell; the rest is its white border."""
+
+MARKER_BITS = 6
+"""Squares along the side of a marker: four that code, and its black border."""
+
+CELLS: tuple[tuple[int, int], ...] = tuple(
+    (column, row) for row in (-1, 0, 1) for column in (-1, 0, 1) if (column, row) != (0, 0)
+)
+"""(column, row) of the eight outer cells, in the order of their markers."""
+
+_MOST_LEVELS = 6
+
+
+@lru_cache(maxsize=1)
+def dictionary() -> cv2.aruco.Dictionary:
+    """The code of the markers: fifty of 4 x 4 bits, which differ by at least four in any orientation."""
+    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+
+
+@dataclass(frozen=True)
+class NestedTarget:
+    """Markers in nested boards around the origin of the target.
+
+    Parameters
+    ----------
+    largest_cell_m
+        Side of a cell of the largest board, m; that board is three cells wide.
+    levels
+        Number of boards, 1 to 6.
+
+    Raises
+    ------
+    InvalidValueError
+        For a size that is not positive, or a number of levels that the code has no markers for.
+    """
+
+    largest_cell_m: float = 180e-6
+    levels: int = _MOST_LEVELS
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.largest_cell_m) and self.largest_cell_m > 0.0):
+            raise InvalidValueError(
+                f"a target with cells of {self.largest_cell_m} m", expected="a positive size"
+            )
+        if not 1 <= self.levels <= _MOST_LEVELS:
+            raise InvalidValueError(
+                f"a target with {self.levels} levels", expected=f"1 to {_MOST_LEVELS}"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of markers; their numbers are 0 to ``size - 1``, eight a level, the largest first."""
+        return len(CELLS) * self.levels
+
+    def cell_m(self, level: int) -> float:
+        """Side of a cell of a level, m."""
+        return self.largest_cell_m / float(RATIO**level)
+
+    def corners_m(self, ids: NDArray[np.int64]) -> Array:
+        """Corners (n, 4, 2) of markers in the frame of the target, m.
+
+        They go from the one that is top left as coded to the right and around, x to the right and y down.
+        """
+        level, place = np.divmod(np.asarray(ids, dtype=np.int64), len(CELLS))
+        cell = self.largest_cell_m / RATIO ** level.astype(np.float64)
+        half = 0.5 * SIDE
+        around = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+        centre = np.array(CELLS, dtype=np.float64)[place]
+        corners: Array = (centre[:, None, :] + around) * cell[:, None, None]
+        return corners
+
+    def bits(self, marker: int) -> NDArray[np.uint8]:
+        """(6, 6) squares of a marker, row by row: 1 is white."""
+        if not 0 <= marker < self.size:
+            raise InvalidValueError(f"marker {marker}", expected=f"0 to {self.size - 1}")
+        drawn = cv2.aruco.generateImageMarker(dictionary(), int(marker), MARKER_BITS)
+        return np.asarray(np.asarray(drawn) > 127, dtype=np.uint8)

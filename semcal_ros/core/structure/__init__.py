@@ -1,0 +1,42 @@
+"""Shape of a specimen from many calibrated views of it: tracks, factorization, adjustment, surface.
+
+After section 4.4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, with the calibrated camera of every
+view at its own magnification. Nothing in here knows that the specimen is a ball, except :mod:`.sphere`.
+"""
+
+from __future__ import annotations
+
+from semcal_ros.core.structure.adjustment import Adjustment, adjust
+from semcal_ros.core.structure.ball import Ball, measure_ball
+from semcal_ros.core.structure.factorization import AffineStructure, factorize
+from semcal_ros.core.structure.keyframes import Keyframe, SequenceTracker, TrackerSettings
+from semcal_ros.core.structure.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.core.structure.reconstruct import Structure, StructureSettings, reconstruct
+from semcal_ros.core.structure.sphere import SphereFit, fit_sphere
+from semcal_ros.core.structure.types import Observations, StructureError, Tracks
+from semcal_ros.core.structure.upgrade import MetricUpgrade, mirrored, upgrade_to_metric
+
+__all__ = [
+    "Adjustment",
+    "AffineStructure",
+    "Ball",
+    "Keyframe",
+    "MetricUpgrade",
+    "Observations",
+    "SequenceTracker",
+    "SphereFit",
+    "Structure",
+    "StructureError",
+    "StructureSettings",
+    "SurfaceMesh",
+    "TrackerSettings",
+    "Tracks",
+    "adjust",
+    "factorize",
+    "fit_sphere",
+    "measure_ball",
+    "mesh_of_cloud",
+    "mirrored",
+    "reconstruct",
+    "upgrade_to_metric",
+]

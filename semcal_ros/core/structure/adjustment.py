@@ -1,0 +1,376 @@
+"""Bundle adjustment of points and poses with the calibrated camera of every view.
+
+Unknown are the points and, for each view, a rotation and a translation; the cameras are given. Residuals are
+undistorted pixels, whitened by what each observation is worth, under a robust loss. Points are eliminated by the
+Schur complement; derivatives are analytic. Heights hardly show in parallel projection, so those of the views have
+a prior about that of the reference view, and the points have a very weak one about their middle, which keeps them
+from moving along the beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.poses import cross_matrices, rotations_from_vectors
+from semcal_ros.core.structure.types import Observations, camera_table
+
+__all__ = ["Adjustment", "adjust"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
+_LEAST_SCALE = 1e-6  # of observations without errors
+_POINT_SPREAD = 3.0  # 1-sigma of the points' heights about their middle, in their spread
+_FIRST_DAMPING = 1e-3
+_LAST_DAMPING = 1e10
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """Adjusted structure with its uncertainty.
+
+    Attributes
+    ----------
+    rotations, translations_m
+        (views, 3, 3), (views, 3) sem_from_specimen.
+    points_m
+        (points, 3) m.
+    residuals
+        (n, 2) undistorted px, observed less predicted.
+    weights
+        (n,) of the robust loss, 1 for a good observation.
+    sigma
+        Factor by which the observations are worse than their root of information says.
+    cost
+        Sum of the robust loss, in units of the observations' own information.
+    point_covariance_m2
+        (points, 3, 3), about the middle of all points, with the axes of the reference view.
+    pose_covariance
+        (views, 6, 6) of rotation vector (rad, in the sem frame) and translation (m); zero for the
+        reference view.
+    reference
+        View whose pose is the frame of the points' uncertainty.
+    iterations, converged
+        How the adjustment ended.
+    """
+
+    rotations: Array
+    translations_m: Array
+    points_m: Array
+    residuals: Array
+    weights: Array
+    sigma: float
+    cost: float
+    point_covariance_m2: Array
+    pose_covariance: Array
+    reference: int
+    iterations: int
+    converged: bool
+    _inverse_points: Array
+    _coupling: Array
+    _inverse_poses: Array
+
+    def variance_of(self, gradient: Array) -> float:
+        """Variance of a function of the points with the (points, 3) gradient, poses' errors included."""
+        direct = np.einsum("pi,pij,pj->", gradient, self._inverse_points, gradient, optimize=True)
+        moved = np.einsum("pij,pj->pi", self._inverse_points, gradient).ravel()
+        through = self._coupling @ moved
+        return float(direct + through @ self._inverse_poses @ through)
+
+    @property
+    def rms_px(self) -> float:
+        """RMS distance of the observations that the robust loss trusts, px."""
+        good = self.weights > 0.5
+        return float(np.sqrt(np.mean(np.sum(self.residuals[good] ** 2, axis=1))))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    rotations: Array
+    translations: Array
+    points: Array
+
+
+class _Problem:
+    """Residuals, derivatives and normal equations, in units of length in which the specimen is about 1."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        cameras: Sequence[ScanCamera],
+        unit_m: float,
+        height_sigma_m: float,
+        reference: int,
+    ) -> None:
+        self.observed = observations
+        table = camera_table(cameras)
+        table[:, 0] *= unit_m
+        table[:, 5] *= unit_m
+        self.table = table[observations.view]
+        self.height_sigma = height_sigma_m / unit_m
+        self.reference = reference
+        self.views = len(cameras)
+        self.beam = np.array([0.0, 0.0, 1.0])
+
+    def residuals(self, state: _State) -> tuple[Array, Array, Array]:
+        """Errors in px (n, 2), turned points and points in the sem frame (n, 3)."""
+        seen = self.observed
+        turned = np.einsum("nij,nj->ni", state.rotations[seen.view], state.points[seen.point])
+        moved = turned + state.translations[seen.view]
+        m, a, skew, px, py, rho = self.table.T
+        scale = m / (1.0 + rho * moved[:, 2])
+        x = px + scale * (a * moved[:, 0] + skew * moved[:, 1])
+        y = py + scale * moved[:, 1] / a
+        return seen.xy - np.stack([x, y], axis=1), turned, moved
+
+    def whitened(self, error: Array) -> Array:
+        white = np.einsum("nij,nj->ni", self.observed.root, error)
+        return np.asarray(white, dtype=np.float64)
+
+    def heights(self, state: _State) -> Array:
+        z = state.translations[:, 2]
+        return np.asarray((z - z[self.reference]) / self.height_sigma, dtype=np.float64)
+
+    def depths(self, state: _State) -> Array:
+        return np.asarray(state.points @ self.beam / _POINT_SPREAD, dtype=np.float64)
+
+    def cost(self, state: _State, sigma: float) -> float:
+        white = self.whitened(self.residuals(state)[0]) / sigma
+        priors = np.sum(self.heights(state) ** 2) + np.sum(self.depths(state) ** 2)
+        return _loss(white) + 0.5 * float(priors)
+
+    def normal(self, state: _State, sigma: float) -> tuple[Array, Array, Array, Array, Array]:
+        """Blocks of the normal equations: poses (v, 6, 6), points (p, 3, 3), coupling (6v, 3p) and
+        the two right sides.
+        """
+        seen = self.observed
+        error, turned, moved = self.residuals(state)
+        m, a, skew, px, py, rho = self.table.T
+        w = 1.0 + rho * moved[:, 2]
+        by_xyz = np.zeros((len(seen), 2, 3))
+        by_xyz[:, 0, 0] = m * a / w
+        by_xyz[:, 0, 1] = m * skew / w
+        by_xyz[:, 1, 1] = m / (a * w)
+        predicted = seen.xy - error
+        by_xyz[:, :, 2] = -(rho / w)[:, None] * (predicted - np.stack([px, py], axis=1))
+        white = self.whitened(error) / sigma
+        weight = 1.0 / (1.0 + np.sum(white**2, axis=1) / _ROBUST**2)
+        root = seen.root * (np.sqrt(weight) / sigma)[:, None, None]
+        rows = root @ by_xyz
+        error = np.einsum("nij,nj->ni", root, error)
+        by_pose = np.concatenate([-rows @ cross_matrices(turned), rows], axis=2)
+        by_point = rows @ state.rotations[seen.view]
+        pose = _summed(_outer(by_pose, by_pose), seen.view, self.views)
+        point = _summed(_outer(by_point, by_point), seen.point, len(state.points))
+        coupling = np.zeros((self.views, 6, len(state.points), 3))
+        coupling[seen.view, :, seen.point, :] = _outer(by_pose, by_point)
+        right_pose = _summed(np.einsum("nki,nk->ni", by_pose, error), seen.view, self.views)
+        right_point = _summed(
+            np.einsum("nki,nk->ni", by_point, error), seen.point, len(state.points)
+        )
+        heights = self.heights(state)
+        pose[:, 5, 5] += 1.0 / self.height_sigma**2
+        right_pose[:, 5] -= heights / self.height_sigma
+        point += np.outer(self.beam, self.beam) / _POINT_SPREAD**2
+        right_point -= self.depths(state)[:, None] * self.beam / _POINT_SPREAD
+        return pose, point, coupling.reshape(6 * self.views, -1), right_pose, right_point
+
+
+def adjust(
+    observations: Observations,
+    cameras: Sequence[ScanCamera],
+    rotations: Array,
+    translations_m: Array,
+    points_m: Array,
+    *,
+    reference: int = 0,
+    height_sigma_m: float = 5e-6,
+    max_iterations: int = 40,
+    tolerance: float = 1e-7,
+) -> Adjustment:
+    """Adjust points and poses to observations (Levenberg-Marquardt with the Schur complement).
+
+    Parameters
+    ----------
+    observations
+        Each view sees each point at most once; each point is seen at least twice.
+    cameras
+        Camera of every view.
+    rotations, translations_m, points_m
+        Start, (views, 3, 3), (views, 3), (points, 3).
+    reference
+        View whose pose is held.
+    height_sigma_m
+        1-sigma of the heights of the views about that of the reference view, m.
+    max_iterations, tolerance
+        Ends when the cost falls by less than this fraction.
+    """
+    unit_m = float(np.sqrt(np.mean(np.var(points_m, axis=0)))) or 1.0
+    problem = _Problem(observations, cameras, unit_m, height_sigma_m, reference)
+    middle = points_m.mean(axis=0)
+    problem.beam = rotations[reference, 2].copy()
+    state = _State(
+        rotations.copy(),
+        (translations_m + rotations @ middle) / unit_m,
+        (points_m - middle) / unit_m,
+    )
+    held = np.arange(6 * reference, 6 * reference + 6)
+    free = np.setdiff1d(np.arange(6 * len(cameras)), held)
+    iterations, converged, sigma = 0, False, _scale(problem, state)
+    for _ in range(3):
+        # The scale of the residuals belongs to the robust loss: settle both in turns.
+        state, taken, converged = _descend(problem, state, sigma, free, max_iterations, tolerance)
+        iterations += taken
+        better = _scale(problem, state)
+        settled = abs(better - sigma) < 0.02 * sigma
+        sigma = better
+        if settled:
+            break
+    return _finished(problem, state, sigma, free, unit_m, iterations, converged)
+
+
+def _descend(
+    problem: _Problem, state: _State, sigma: float, free: Index, limit: int, tolerance: float
+) -> tuple[_State, int, bool]:
+    damping, cost = _FIRST_DAMPING, problem.cost(state, sigma)
+    for iteration in range(limit):
+        blocks = problem.normal(state, sigma)
+        while True:
+            trial = _stepped(state, blocks, damping, free)
+            new = problem.cost(trial, sigma)
+            if new <= cost:
+                break
+            damping *= 8.0
+            if damping > _LAST_DAMPING:
+                return state, iteration + 1, True
+        gain, state, cost = cost - new, trial, new
+        damping = max(damping * 0.2, 1e-12)
+        if gain <= tolerance * cost:
+            return state, iteration + 1, True
+    return state, limit, False
+
+
+def _stepped(
+    state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Index
+) -> _State:
+    pose, point, coupling, right_pose, right_point = blocks
+    inverse = _inverted(_damped(point, damping))
+    reduced, moved = _reduced(_damped(pose, damping), inverse, coupling, free)
+    right = right_pose.ravel()[free] - moved @ right_point.ravel()
+    step = np.zeros(6 * len(pose))
+    diagonal = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+    step[free] = np.linalg.solve(reduced / np.outer(diagonal, diagonal), right / diagonal)
+    step[free] /= diagonal
+    left = right_point - (coupling.T @ step).reshape(-1, 3)
+    by_view = step.reshape(-1, 6)
+    return _State(
+        rotations_from_vectors(by_view[:, :3]) @ state.rotations,
+        state.translations + by_view[:, 3:],
+        state.points + np.einsum("pij,pj->pi", inverse, left),
+    )
+
+
+def _damped(blocks: Array, damping: float) -> Array:
+    out = blocks.copy()
+    axes = np.arange(blocks.shape[1])
+    diagonal = blocks[:, axes, axes]
+    floor = 1e-9 * np.maximum(diagonal.max(axis=1, keepdims=True), 1e-300)
+    out[:, axes, axes] += damping * np.maximum(diagonal, floor) + 1e-12 * floor
+    return np.asarray(out, dtype=np.float64)
+
+
+def _inverted(blocks: Array) -> Array:
+    return np.asarray(np.linalg.inv(blocks), dtype=np.float64)
+
+
+def _reduced(pose: Array, inverse: Array, coupling: Array, free: Index) -> tuple[Array, Array]:
+    """Schur complement on the free pose parameters, and coupling @ inverse of the points."""
+    part = coupling[free]
+    by_point = np.swapaxes(part.reshape(len(free), -1, 3), 0, 1) @ inverse
+    moved = np.swapaxes(by_point, 0, 1).reshape(part.shape)
+    whole = np.zeros((6 * len(pose), 6 * len(pose)))
+    for view, block in enumerate(pose):
+        whole[6 * view : 6 * view + 6, 6 * view : 6 * view + 6] = block
+    return whole[np.ix_(free, free)] - moved @ part.T, moved
+
+
+def _scale(problem: _Problem, state: _State) -> float:
+    """Robust scale of the whitened residuals, corrected for the parameters that they determine."""
+    white = problem.whitened(problem.residuals(state)[0])
+    size = 2.0 * len(white)
+    spent = 3.0 * len(state.points) + 6.0 * problem.views
+    median = float(np.median(np.sum(white**2, axis=1)))
+    # The median of a chi-square with two degrees of freedom is 2 ln 2.
+    scale = np.sqrt(median / (2.0 * np.log(2.0)) * size / max(size - spent, 0.05 * size))
+    return max(float(scale), _LEAST_SCALE)
+
+
+def _loss(white: Array) -> float:
+    squared = np.sum(white**2, axis=1)
+    return 0.5 * _ROBUST**2 * float(np.sum(np.log1p(squared / _ROBUST**2)))
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return np.asarray(np.swapaxes(a, 1, 2) @ b, dtype=np.float64)
+
+
+def _summed(values: Array, index: Index, count: int) -> Array:
+    """Sums of values (n, ...) over equal indices."""
+    flat = values.reshape(len(values), -1)
+    columns = [np.bincount(index, weights=column, minlength=count) for column in flat.T]
+    summed = np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+    return np.asarray(summed, dtype=np.float64)
+
+
+def _finished(
+    problem: _Problem,
+    state: _State,
+    sigma: float,
+    free: Index,
+    unit_m: float,
+    iterations: int,
+    converged: bool,
+) -> Adjustment:
+    pose, point, coupling, _, _ = problem.normal(state, sigma)
+    inverse = _inverted(_damped(point, 1e-12))
+    reduced, moved = _reduced(pose, inverse, coupling, free)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+    poses = np.linalg.pinv(reduced * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    poses = poses * np.outer(scale, scale)
+    # About the middle of the points: where the whole lies along the beam is not determined.
+    through = moved.reshape(len(free), -1, 3)
+    through = through - through.mean(axis=1, keepdims=True)
+    spread = (poses @ through.reshape(len(free), -1)).reshape(through.shape)
+    count = len(state.points)
+    own = (1.0 - 2.0 / count) * inverse + inverse.sum(axis=0) / count**2
+    covariance = (own + np.einsum("api,apj->pij", through, spread, optimize=True)) * unit_m**2
+    full = np.zeros((6 * problem.views, 6 * problem.views))
+    full[np.ix_(free, free)] = poses
+    by_view = full.reshape(problem.views, 6, problem.views, 6)
+    each = by_view[np.arange(problem.views), :, np.arange(problem.views), :]
+    factor = np.array([1.0, 1.0, 1.0, unit_m, unit_m, unit_m])
+    error = problem.residuals(state)[0]
+    white = problem.whitened(error) / sigma
+    return Adjustment(
+        rotations=state.rotations,
+        translations_m=state.translations * unit_m,
+        points_m=state.points * unit_m,
+        residuals=error,
+        weights=1.0 / (1.0 + np.sum(white**2, axis=1) / _ROBUST**2),
+        sigma=sigma,
+        cost=problem.cost(state, sigma),
+        point_covariance_m2=covariance,
+        pose_covariance=each * np.outer(factor, factor),
+        reference=problem.reference,
+        iterations=iterations,
+        converged=converged,
+        _inverse_points=inverse * unit_m**2,
+        _coupling=coupling[free] / unit_m,
+        _inverse_poses=poses,
+    )

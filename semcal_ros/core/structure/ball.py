@@ -1,0 +1,184 @@
+"""The diameter of a ball with an interval that can be relied on, and its mesh.
+
+Three errors add up. *Noise*: the fit to the adjusted points, with the poses' errors. Neighbouring patches share pixels,
+so the variance is multiplied by how many points share one; it is also measured by leaving out groups of views in turn
+(jackknife), and the larger figure counts. *Shape*: the points' departure from a sphere. *Scale*: nm per pixel of the
+calibration, and the height of the ball above or below the reference plane, which parallel projection does not show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.stats import t as student
+
+from semcal_ros.core.structure.adjustment import adjust
+from semcal_ros.core.structure.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.core.structure.mls import local_surface, typical_spacing_m
+from semcal_ros.core.structure.reconstruct import Structure
+from semcal_ros.core.structure.sphere import SphereFit, fit_sphere
+
+__all__ = ["Ball", "measure_ball"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """A sphere in a structure.
+
+    Attributes
+    ----------
+    sphere
+        The fit to the points.
+    mesh
+        Triangles over its moving-least-squares surface, where it was seen.
+    diameter_m
+        m.
+    noise_sigma_m, shape_sigma_m, scale_sigma_m
+        Parts of the 1-sigma of the diameter, see the module, m.
+    interval_m
+        95 % interval of the diameter, m.
+    groups
+        Groups of views of the jackknife.
+    coverage
+        Part of the sphere that the mesh covers.
+    """
+
+    sphere: SphereFit
+    mesh: SurfaceMesh
+    diameter_m: float
+    noise_sigma_m: float
+    shape_sigma_m: float
+    scale_sigma_m: float
+    interval_m: tuple[float, float]
+    groups: int
+    coverage: float
+
+    @property
+    def sigma_m(self) -> float:
+        """1-sigma of the diameter, m."""
+        parts = (self.noise_sigma_m, self.shape_sigma_m, self.scale_sigma_m)
+        return float(np.sqrt(sum(part**2 for part in parts)))
+
+
+def measure_ball(
+    structure: Structure,
+    *,
+    height_sigma_m: float = 40e-6,
+    groups: int = 8,
+    confidence: float = 0.95,
+) -> Ball:
+    """Fit a sphere to the largest round part of a structure, and mesh it.
+
+    Parameters
+    ----------
+    structure
+        The points; those that are not on the sphere (a tip that holds it) are left out.
+    height_sigma_m
+        1-sigma of the height of the ball about the reference plane of the calibration, m.
+    groups
+        Number of groups of views of the jackknife.
+    confidence
+        Of the interval.
+
+    Raises
+    ------
+    StructureError
+        If there is no sphere in the structure.
+    """
+    sphere = fit_sphere(structure.points_m, structure.normal_sigma_m)
+    variance = structure.adjustment.variance_of(sphere.radius_gradient)
+    noise = 2.0 * np.sqrt(variance * _sharing(structure))
+    groups = min(groups, len(structure.cameras) // 4)
+    freedom = np.inf
+    if groups >= 3:
+        measured = _jackknife(structure, sphere, groups)
+        if measured > noise:
+            noise, freedom = measured, groups - 1.0
+    shape = 2.0 * sphere.radius_sigma_m
+    diameter = 2.0 * sphere.radius_m
+    scale = diameter * _scale_sigma(structure, height_sigma_m)
+    total = float(np.sqrt(noise**2 + shape**2 + scale**2))
+    # Welch and Satterthwaite: only the jackknife has few degrees of freedom.
+    degrees = freedom * (total / noise) ** 4 if np.isfinite(freedom) else 1e6
+    reach = float(student.ppf(0.5 + 0.5 * confidence, min(degrees, 1e6))) * total
+    mesh = _meshed(structure, sphere)
+    return Ball(
+        sphere=sphere,
+        mesh=mesh,
+        diameter_m=diameter,
+        noise_sigma_m=float(noise),
+        shape_sigma_m=shape,
+        scale_sigma_m=scale,
+        interval_m=(diameter - reach, diameter + reach),
+        groups=groups,
+        coverage=_covered(mesh, sphere),
+    )
+
+
+def _sharing(structure: Structure) -> float:
+    """How many points share the noise of a patch: two windows at a distance correlate as Gaussians do."""
+    wide = 2.0 * structure.patch_sigma_m
+    tree = cKDTree(structure.points_m)
+    pairs = tree.sparse_distance_matrix(tree, 3.0 * wide, output_type="ndarray")
+    return float(np.sum(np.exp(-((pairs["v"] / wide) ** 2))) / len(structure.points_m))
+
+
+def _jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
+    """1-sigma of the diameter from leaving out every group of views once."""
+    done, seen = structure.adjustment, structure.observations
+    # Neighbouring views share little but their noise is independent: interleave.
+    group = np.arange(len(structure.cameras)) % groups
+    group[done.reference] = -1
+    diameters = []
+    inliers = np.flatnonzero(sphere.inliers)
+    for left_out in range(groups):
+        part = seen.chosen(group[seen.view] != left_out)
+        fewer = adjust(
+            part,
+            structure.cameras,
+            done.rotations,
+            done.translations_m,
+            done.points_m,
+            reference=done.reference,
+            max_iterations=4,
+            tolerance=1e-5,
+        )
+        still = np.bincount(part.point, minlength=len(done.points_m))[inliers] >= 3
+        use = inliers[still]
+        diameters.append(
+            2.0 * fit_sphere(fewer.points_m[use], structure.normal_sigma_m[use]).radius_m
+        )
+    spread = np.array(diameters) - np.mean(diameters)
+    return float(np.sqrt((groups - 1.0) / groups * np.sum(spread**2)))
+
+
+def _scale_sigma(structure: Structure, height_sigma_m: float) -> float:
+    """Relative 1-sigma of lengths: pixel size and height."""
+    camera = structure.cameras[structure.adjustment.reference]
+    height = camera.rho * height_sigma_m
+    if camera.covariance is None:
+        return abs(height)
+    sizes = zip(camera.pixel_size_sigma_m, camera.pixel_size_m, strict=True)
+    return float(np.hypot(max(sigma / size for sigma, size in sizes), height))
+
+
+def _meshed(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
+    points = structure.points_m[sphere.inliers]
+    radius = max(2.0 * typical_spacing_m(points), 0.12 * sphere.radius_m)
+    surface = local_surface(points, points, radius).facing(points - sphere.centre_m)
+    return mesh_of_cloud(surface.points_m, sphere.centre_m, surface.normals, surface.sigma_m)
+
+
+def _covered(mesh: SurfaceMesh, sphere: SphereFit) -> float:
+    """Part of the full solid angle (van Oosterom and Strackee 1983)."""
+    unit = mesh.vertices_m - sphere.centre_m
+    unit = unit / np.linalg.norm(unit, axis=1)[:, None]
+    a, b, c = (unit[mesh.faces[:, k]] for k in range(3))
+    volume = np.abs(np.einsum("fi,fi->f", a, np.cross(b, c)))
+    dots = (np.sum(p * q, axis=1) for p, q in ((a, b), (b, c), (c, a)))
+    return float(np.sum(2.0 * np.arctan2(volume, 1.0 + sum(dots))) / (4.0 * np.pi))

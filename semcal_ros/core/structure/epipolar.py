@@ -1,0 +1,129 @@
+"""Affine epipolar geometry of two views.
+
+Under parallel projection the fundamental matrix has five entries, ``a x' + b y' + c x + d y + e = 0``, and the maximum
+likelihood estimate is a plane fit in the joint image space (Hartley and Zisserman, Multiple View Geometry, 2nd ed.,
+algorithm 14.1). It needs four points and contains no translation: a drift between the views changes ``e`` only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.structure.types import StructureError
+
+__all__ = ["AffineEpipolar", "epipolar_of", "robust_epipolar"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LEAST_POINTS = 5
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class AffineEpipolar:
+    """Epipolar geometry of two views.
+
+    Attributes
+    ----------
+    normal
+        (4,) unit normal (a, b, c, d) in the joint space (x', y', x, y).
+    offset
+        e, in the unit of the coordinates.
+    inliers
+        (n,) which points agree with it.
+    rms
+        RMS distance of the inliers from the plane, in the unit of the coordinates. With isotropic errors of
+        sigma in both views it is sigma, whatever the geometry.
+    """
+
+    normal: Array
+    offset: float
+    inliers: Mask
+    rms: float
+
+    @property
+    def fundamental(self) -> Array:
+        """(3, 3) matrix F with ``x'^T F x = 0``."""
+        a, b, c, d = self.normal
+        return np.array([[0.0, 0.0, a], [0.0, 0.0, b], [c, d, self.offset]])
+
+    def distances(self, first: Array, second: Array) -> Array:
+        """(n,) signed distances of point pairs (n, 2) from the plane."""
+        joint = np.hstack([second, first])
+        return np.asarray(joint @ self.normal + self.offset, dtype=np.float64)
+
+
+def epipolar_of(first: Array, second: Array) -> AffineEpipolar:
+    """Epipolar geometry from at least four point pairs (n, 2), all of them trusted.
+
+    Raises
+    ------
+    StructureError
+        For fewer than four pairs.
+    """
+    if len(first) < _LEAST_POINTS - 1:
+        raise StructureError(f"{len(first)} points in two views", expected="at least 4")
+    normal, offset = _plane(np.hstack([second, first]))
+    distance = np.hstack([second, first]) @ normal + offset
+    everything = np.ones(len(first), dtype=bool)
+    return AffineEpipolar(normal, offset, everything, _rms(distance))
+
+
+def robust_epipolar(
+    first: Array, second: Array, tolerance: float, *, trials: int = 200, seed: int = 0
+) -> AffineEpipolar:
+    """Epipolar geometry of pairs (n, 2) of which some are wrong (RANSAC, then refitted).
+
+    Parameters
+    ----------
+    first, second
+        (n, 2) points of the two views in one unit.
+    tolerance
+        Largest distance of an inlier, in that unit.
+    trials, seed
+        Number and seed of the random samples.
+
+    Raises
+    ------
+    StructureError
+        For fewer than five pairs.
+    """
+    if len(first) < _LEAST_POINTS:
+        raise StructureError(f"{len(first)} points in two views", expected="at least 5")
+    joint = np.hstack([second, first])
+    rng = np.random.default_rng(seed)
+    samples = np.argsort(rng.random((trials, len(joint))), axis=1)[:, :4]
+    picked = joint[samples]
+    centres = picked.mean(axis=1)
+    # The last right singular vector of four points about their mean: the normal of their plane.
+    normals = np.linalg.svd(picked - centres[:, None], full_matrices=True)[2][:, 3]
+    distances = np.abs(joint @ normals.T - np.sum(centres * normals, axis=1))
+    cost = np.minimum(distances, tolerance).sum(axis=0)
+    inliers = distances[:, np.argmin(cost)] <= tolerance
+    normal, offset = normals[np.argmin(cost)], 0.0
+    for _ in range(10):
+        if np.count_nonzero(inliers) < _LEAST_POINTS:
+            break
+        normal, offset = _plane(joint[inliers])
+        distance = np.abs(joint @ normal + offset)
+        sigma = _MAD_TO_SIGMA * float(np.median(distance[inliers]))
+        better = distance <= min(tolerance, max(4.0 * sigma, 0.1 * tolerance))
+        if np.array_equal(better, inliers):
+            break
+        inliers = better
+    return AffineEpipolar(normal, offset, inliers, _rms((joint @ normal + offset)[inliers]))
+
+
+def _plane(joint: Array) -> tuple[Array, float]:
+    centre = joint.mean(axis=0)
+    _, vectors = np.linalg.eigh((joint - centre).T @ (joint - centre))
+    normal = np.asarray(vectors[:, 0], dtype=np.float64)
+    return normal, -float(normal @ centre)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -1,0 +1,233 @@
+"""Affine structure of tracks with gaps: a rank-3 factorization that grows view by view.
+
+Tomasi and Kanade (1992), doi:10.1007/BF00129684: the centred tracks of points that are seen in all views are the
+product of (2 views, 3) camera rows and (3, points) coordinates. Here the densest well-conditioned block is
+factorized by the SVD, further views and points are added by linear least squares, and all of it is refined by
+alternation on what was observed, robustly. Translations are unknowns of each view, so drift between views costs
+nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.structure.types import StructureError, Tracks
+
+__all__ = ["AffineStructure", "factorize"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+_WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
+_LEAST_COMMON = 12
+_LEAST_IN_VIEW = 8
+_LEAST_VIEWS = 3
+_HUBER = 1.5
+# A new point waits until the squared lever arm of its depth is this part of that across the view.
+_WEAKEST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class AffineStructure:
+    """Cameras and points up to an affine transform of space.
+
+    Attributes
+    ----------
+    cameras
+        (views, 2, 3) rows of the affine cameras.
+    offsets_m
+        (views, 2) translations, m.
+    points
+        (points, 3) coordinates in an affine frame.
+    views_placed, points_placed
+        (views,), (points,) what could be placed; the rest is zero.
+    rms_m
+        Robust RMS of the residuals per coordinate, m.
+    relief
+        RMS extent along the weakest direction of the first block over its residual noise: where it is
+        near 1 there is no depth in the views.
+    """
+
+    cameras: Array
+    offsets_m: Array
+    points: Array
+    views_placed: Mask
+    points_placed: Mask
+    rms_m: float
+    relief: float
+
+
+def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
+    """Affine structure of tracks.
+
+    Raises
+    ------
+    StructureError
+        If no three views share 12 points that move against each other.
+    """
+    start = _first_block(tracks)
+    state = _Growing(tracks, *start)
+    state.grow()
+    for _ in range(sweeps):
+        state.place_points(~np.zeros(tracks.seen.shape[1], dtype=bool))
+        state.place_views(~np.zeros(tracks.seen.shape[0], dtype=bool))
+    state.grow()
+    return state.result()
+
+
+def _first_block(tracks: Tracks) -> tuple[Index, Index, float]:
+    """Views and points of the block with the most relief, and that relief over its noise."""
+    best: tuple[float, Index, Index, float] | None = None
+    n_views = len(tracks.seen)
+    for length in (w for w in _WINDOWS if w <= max(n_views, _LEAST_VIEWS)):
+        for first in range(0, n_views - length + 1, max(1, length // 4)):
+            views = np.arange(first, first + length)
+            points = np.flatnonzero(tracks.seen[views].all(axis=0))
+            if len(points) < _LEAST_COMMON:
+                continue
+            table = _centred(tracks.xy_m[np.ix_(views, points)])
+            values = np.linalg.svd(table, compute_uv=False)
+            if len(values) < 4:
+                continue
+            free = max(len(values) - 3, 1)
+            noise = float(np.sqrt(np.mean(values[3:] ** 2))) if free else 0.0
+            score = float(values[2]) / max(noise, 1e-30) * np.sqrt(len(points))
+            relief = float(values[2]) / max(noise, 1e-30)
+            if best is None or score > best[0]:
+                best = (score, views, points, relief)
+    if best is None:
+        raise StructureError(
+            f"no {_LEAST_VIEWS} of {n_views} views share {_LEAST_COMMON} points",
+            expected="a sequence in which points can be followed from view to view",
+            do="record slower movements or more texture",
+        )
+    return best[1], best[2], best[3]
+
+
+def _centred(block: Array) -> Array:
+    """(2 views, points) tracks about the mean of each row."""
+    table = np.moveaxis(block, 2, 1).reshape(-1, block.shape[1])
+    return np.asarray(table - table.mean(axis=1, keepdims=True), dtype=np.float64)
+
+
+class _Growing:
+    """The structure while views and points are added to it."""
+
+    def __init__(self, tracks: Tracks, views: Index, points: Index, relief: float) -> None:
+        self.xy, self.seen = tracks.xy_m, tracks.seen
+        n_views, n_points = self.seen.shape
+        self.cameras = np.zeros((n_views, 2, 3))
+        self.offsets = np.zeros((n_views, 2))
+        self.points = np.zeros((n_points, 3))
+        self.views_in = np.zeros(n_views, dtype=bool)
+        self.points_in = np.zeros(n_points, dtype=bool)
+        self.relief = relief
+        block = self.xy[np.ix_(views, points)]
+        u, s, vt = np.linalg.svd(_centred(block), full_matrices=False)
+        # Points of unit spread, cameras in metres: both sides of a good size for the alternation.
+        root = np.sqrt(len(points))
+        self.points[points] = vt[:3].T * root
+        self.cameras[views] = (u[:, :3] * s[:3] / root).reshape(-1, 2, 3)
+        self.offsets[views] = block.mean(axis=1)
+        self.views_in[views] = True
+        self.points_in[points] = True
+        self.sigma = self._scale()
+
+    def _residuals(self) -> tuple[Array, Mask]:
+        used = self.seen & self.views_in[:, None] & self.points_in[None, :]
+        predicted = np.einsum("vij,pj->vpi", self.cameras, self.points) + self.offsets[:, None]
+        return np.where(used[..., None], self.xy - predicted, 0.0), used
+
+    def _scale(self) -> float:
+        error, used = self._residuals()
+        sigma = 1.4826 * float(np.median(np.abs(error[used])))
+        # A share of the points is fitted exactly, or nearly; keep the scale away from zero.
+        return max(sigma, 1e-12 * float(np.abs(self.cameras).max()))
+
+    def _weights(self) -> Array:
+        """(views, points) Huber weights of what is used."""
+        error, used = self._residuals()
+        size = np.linalg.norm(error, axis=2) / self.sigma
+        return np.where(used, _HUBER / np.maximum(size, _HUBER), 0.0)
+
+    def place_views(self, wanted: Mask, weights: Array | None = None) -> None:
+        """Least squares for cameras with enough placed points."""
+        able = (self.seen & self.points_in).sum(axis=1) >= _LEAST_IN_VIEW
+        index = np.flatnonzero(wanted & able)
+        if not len(index):
+            return
+        fresh = ~self.views_in[index]
+        weight = (self._weights() if weights is None else weights)[index]
+        weight[fresh] = (self.seen[index] & self.points_in)[fresh]
+        design = np.column_stack([self.points, np.ones(len(self.points))])
+        for step in range(4 if fresh.any() else 1):
+            normal = np.einsum("vp,pi,pj->vij", weight, design, design, optimize=True)
+            seen_m = self._filled(index)
+            right = np.einsum("vp,pi,vpk->vik", weight, design, seen_m, optimize=True)
+            found = np.asarray(np.linalg.solve(normal + 1e-9 * np.eye(4), right), dtype=np.float64)
+            if step < 3 and fresh.any():
+                error = seen_m - np.einsum("pi,vik->vpk", design, found)
+                size = np.linalg.norm(error, axis=2)
+                use = self.seen[index] & self.points_in
+                median = np.array([np.median(s[u]) for s, u in zip(size, use, strict=True)])
+                limit = np.maximum(2.0 * median, self.sigma)[:, None]
+                weight = np.where(use, limit / np.maximum(size, limit), 0.0)
+        self.cameras[index] = np.moveaxis(found[:, :3], 1, 2)
+        self.offsets[index] = found[:, 3]
+        self.views_in[index] = True
+
+    def _filled(self, views: Index) -> Array:
+        return np.where(self.seen[views][..., None], self.xy[views], 0.0)
+
+    def place_points(self, wanted: Mask) -> None:
+        """Least squares for points that enough placed views see from different sides."""
+        index = np.flatnonzero(
+            wanted & ((self.seen & self.views_in[:, None]).sum(axis=0) >= _LEAST_VIEWS)
+        )
+        if not len(index):
+            return
+        weight = self._weights()[:, index]
+        fresh = ~self.points_in[index]
+        weight[:, fresh] = (self.seen[:, index] & self.views_in[:, None])[:, fresh]
+        shift = np.where(
+            self.seen[:, index][..., None], self.xy[:, index] - self.offsets[:, None], 0.0
+        )
+        normal = np.einsum("vp,vki,vkj->pij", weight, self.cameras, self.cameras, optimize=True)
+        right = np.einsum("vp,vki,vpk->pi", weight, self.cameras, shift, optimize=True)
+        values = np.linalg.eigvalsh(normal)
+        good = values[:, 0] > _WEAKEST * values[:, 2]
+        placed = index[good]
+        self.points[placed] = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
+        self.points_in[placed] = True
+
+    def grow(self) -> None:
+        """Add points and views until nothing more can be added."""
+        for _ in range(len(self.seen) + 1):
+            before = (int(self.views_in.sum()), int(self.points_in.sum()))
+            self.place_points(~self.points_in)
+            open_views = ~self.views_in
+            if open_views.any():
+                counts = (self.seen & self.points_in).sum(axis=1) * open_views
+                # The best seen first: they bring points for the others.
+                self.place_views(counts >= max(0.7 * counts.max(), _LEAST_IN_VIEW))
+            self.sigma = self._scale()
+            if before == (int(self.views_in.sum()), int(self.points_in.sum())):
+                return
+            self.place_points(self.points_in.copy())
+            self.place_views(self.views_in.copy())
+
+    def result(self) -> AffineStructure:
+        self.sigma = self._scale()
+        return AffineStructure(
+            self.cameras,
+            self.offsets,
+            self.points,
+            self.views_in,
+            self.points_in,
+            self.sigma,
+            self.relief,
+        )

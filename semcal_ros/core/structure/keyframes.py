@@ -1,0 +1,375 @@
+"""Following features through a recording, and keeping the frames that bring something new.
+
+Every frame is tracked against the last keyframe (Lucas and Kanade in a picture, checked backwards), so errors do
+not add up from frame to frame. A frame becomes a keyframe when the points have moved enough against each other (a
+common shift is drift and tells nothing about depth), when too many are lost, or when the magnification changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.structure.appearance import Appearance, appearance_of, bytes_for_tracking
+from semcal_ros.core.structure.epipolar import robust_epipolar
+
+__all__ = ["Keyframe", "SequenceTracker", "TrackerSettings", "to_plane"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+_FEW = 30
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How features are followed.
+
+    Attributes
+    ----------
+    spacing_px
+        Least distance between features, px.
+    max_features
+        Per frame.
+    window_px, levels
+        Of the pyramid tracker.
+    backwards_px
+        Largest distance between a feature and where it comes back to.
+    parallax_px
+        Median movement against the common shift after which a frame is kept.
+    lost_fraction
+        Loss of features after which a frame is kept.
+    epipolar_px
+        Largest distance from the epipolar geometry of two keyframes.
+    noise_factor
+        How far a feature's contrast is above what noise gives.
+    smoothing_px
+        Sigma of the smoothing before tracking: a fast scan leaves some ten electrons per pixel.
+    border_px
+        Features are this far inside of the frame.
+    room_px
+        Only this far from the features of the last frame is looked at.
+    """
+
+    spacing_px: float = 6.0
+    max_features: int = 1500
+    window_px: int = 21
+    levels: int = 3
+    backwards_px: float = 0.7
+    parallax_px: float = 2.0
+    lost_fraction: float = 0.3
+    epipolar_px: float = 2.0
+    noise_factor: float = 3.0
+    smoothing_px: float = 1.8
+    border_px: int = 14
+    room_px: int = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A frame that takes part in the reconstruction.
+
+    Attributes
+    ----------
+    index
+        Number of the frame in the recording.
+    time_s
+        Start of its acquisition.
+    image
+        (h, w) grey levels.
+    camera
+        Calibrated camera of its magnification and size.
+    ids, xy
+        (n,) numbers of the tracks, (n, 2) where they are seen, raw px.
+    velocity
+        (2, 3) movement of the image of the specimen in the sem frame, ``v = velocity @ (X, Y, 1)`` in m/s
+        with X, Y in m.
+    """
+
+    index: int
+    time_s: float
+    image: NDArray[Any]
+    camera: ScanCamera
+    ids: Index
+    xy: Array
+    velocity: Array
+
+
+def to_plane(camera: ScanCamera, raw: Array) -> Array:
+    """Sem-frame X, Y (n, 2) in m at height 0 of raw pixels (n, 2); NaN where there are none."""
+    return camera.sem_from_ideal(camera.undistort(raw))[:, :2]
+
+
+def _from_plane(camera: ScanCamera, xy_m: Array) -> Array:
+    return camera.project(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+
+
+@dataclass(eq=False)
+class _Reference:
+    """The last keyframe while frames are tracked against it."""
+
+    picture: NDArray[np.uint8]
+    frame: Keyframe
+    latest_m: Array
+    alive: Mask
+    before: Array | None
+    after: Array | None
+
+
+class SequenceTracker:
+    """Takes the frames of a recording one by one.
+
+    Parameters
+    ----------
+    settings
+        How features are followed.
+
+    Attributes
+    ----------
+    keyframes
+        Those so far.
+    frames
+        Number of frames taken.
+    """
+
+    def __init__(self, settings: TrackerSettings | None = None) -> None:
+        self.settings = settings or TrackerSettings()
+        self.keyframes: list[Keyframe] = []
+        self.frames = 0
+        self._next_id = 0
+        self._reference: _Reference | None = None
+        self._last_time_s = -np.inf
+
+    def add(self, image: NDArray[Any], camera: ScanCamera, time_s: float) -> bool:
+        """Track the next frame; True if it became a keyframe.
+
+        Raises
+        ------
+        InvalidValueError
+            If the image is not grey, is of another size than the camera's, or its time is not after the last.
+        """
+        if image.shape != (camera.height, camera.width):
+            raise InvalidValueError(
+                f"an image of shape {image.shape}",
+                expected=f"grey levels of shape {(camera.height, camera.width)}",
+            )
+        if not time_s > self._last_time_s:
+            raise InvalidValueError(
+                f"a frame at {time_s} s after one at {self._last_time_s} s",
+                expected="frames in the order of their times",
+            )
+        seen = self._looked_at(image, camera)
+        picture = bytes_for_tracking(seen)
+        index, self.frames = self.frames, self.frames + 1
+        previous_s, self._last_time_s = self._last_time_s, time_s
+        reference = self._reference
+        if reference is None:
+            ids, xy = self._detected(seen, np.empty((0, 2)))
+            self._keep(index, time_s, image, camera, picture, ids, xy, None)
+            return True
+        start = reference.latest_m
+        raw, found = self._tracked(reference, picture, camera)
+        now_m = to_plane(camera, raw)
+        found &= np.all(np.isfinite(now_m), axis=1)
+        motion = _affine_motion(start[found], now_m[found], time_s - previous_s)
+        if reference.after is None and index == reference.frame.index + 1:
+            reference.after = motion
+        reference.alive = found
+        # What is lost stays where the others would take it, in case that it comes back.
+        common = np.median((now_m - start)[found], axis=0) if found.any() else np.zeros(2)
+        reference.latest_m = np.where(found[:, None], now_m, start + common)
+        if not self._is_new(reference, found, now_m, camera):
+            return False
+        good = self._consistent(reference, found, now_m, camera)
+        kept_ids, kept = reference.frame.ids[good], raw[good]
+        ids, xy = self._detected(seen, kept)
+        self._keep(
+            index,
+            time_s,
+            image,
+            camera,
+            picture,
+            np.concatenate([kept_ids, ids]),
+            np.concatenate([kept, xy]),
+            motion,
+        )
+        return True
+
+    def finish(self) -> list[Keyframe]:
+        """All keyframes, each with the movement during its acquisition."""
+        self._settle()
+        return self.keyframes
+
+    # -- tracking ---------------------------------------------------------------------------------
+
+    def _looked_at(self, image: NDArray[Any], camera: ScanCamera) -> Appearance:
+        """The picture as it is compared; plain grey far from where features are expected, to save time."""
+        box = self._expected(camera)
+        seen = appearance_of(image[box], smoothing_px=self.settings.smoothing_px)
+        if seen.smooth.shape == image.shape:
+            return seen
+        smooth, texture = np.zeros((2, *image.shape), dtype=np.float32)
+        smooth[box], texture[box] = seen.smooth, seen.texture
+        return Appearance(smooth, texture, seen.noise, seen.smoothing_px)
+
+    def _expected(self, camera: ScanCamera) -> tuple[slice, slice]:
+        """Rows and columns of the features of the last frame, with room to move and to find new ones."""
+        reference = self._reference
+        everything = (slice(0, camera.height), slice(0, camera.width))
+        if reference is None or np.count_nonzero(reference.alive) < _FEW:
+            return everything
+        raw = _from_plane(camera, reference.latest_m[reference.alive])
+        return _around(raw, camera, self.settings.room_px)[0]
+
+    def _tracked(
+        self, reference: _Reference, picture: NDArray[np.uint8], camera: ScanCamera
+    ) -> tuple[Array, Mask]:
+        """Raw positions (n, 2) of the reference's features in the new frame, and which were found."""
+        if not len(reference.frame.xy):
+            return np.empty((0, 2)), np.empty(0, dtype=bool)
+        s = self.settings
+        options: dict[str, Any] = {
+            "winSize": (s.window_px, s.window_px),
+            "maxLevel": s.levels,
+            "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
+            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        }
+        at = reference.frame.xy.astype(np.float32)
+        guess = np.nan_to_num(_from_plane(camera, reference.latest_m)).astype(np.float32)
+        # Pyramids of the part where all this happens only.
+        box, corner = _around(np.concatenate([at, guess]), camera, s.room_px)
+        first, second = (
+            np.ascontiguousarray(reference.picture[box]),
+            np.ascontiguousarray(picture[box]),
+        )
+        at, guess = at - corner, guess - corner
+        forward, ok, _ = cv2.calcOpticalFlowPyrLK(first, second, at, guess.copy(), **options)
+        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(second, first, forward, at.copy(), **options)
+        raw = forward.astype(np.float64) + corner
+        found = (ok.ravel() == 1) & (ok_back.ravel() == 1)
+        found &= np.linalg.norm(back - at, axis=1) < s.backwards_px
+        found &= _inside(raw, camera, s.border_px)
+        return raw, found
+
+    def _is_new(self, reference: _Reference, found: Mask, now_m: Array, camera: ScanCamera) -> bool:
+        total, number = len(found), int(np.count_nonzero(found))
+        if camera.magnification != reference.frame.camera.magnification or not number:
+            return True
+        if number < (1.0 - self.settings.lost_fraction) * total:
+            return True
+        moved = (now_m - to_plane(reference.frame.camera, reference.frame.xy))[found] * camera.m
+        against = moved - np.median(moved, axis=0)
+        return float(np.median(np.linalg.norm(against, axis=1))) > self.settings.parallax_px
+
+    def _consistent(
+        self, reference: _Reference, found: Mask, now_m: Array, camera: ScanCamera
+    ) -> Mask:
+        """Found features that agree with the epipolar geometry of the two keyframes."""
+        index = np.flatnonzero(found)
+        if len(index) < 12:
+            return found
+        before_m = to_plane(reference.frame.camera, reference.frame.xy[index])
+        tolerance_m = self.settings.epipolar_px / camera.m
+        geometry = robust_epipolar(before_m, now_m[index], tolerance_m)
+        good = np.zeros_like(found)
+        good[index[geometry.inliers]] = True
+        return good
+
+    # -- features ---------------------------------------------------------------------------------
+
+    def _detected(self, seen: Appearance, taken: Array) -> tuple[Index, Array]:
+        """Numbers and places (raw px) of new features away from those that are there."""
+        s = self.settings
+        response, from_noise = seen.corner_response()
+        mask = np.zeros(response.shape, dtype=np.uint8)
+        # Where the picture was not looked at it is zero; its edge is no feature.
+        unseen = cv2.dilate((seen.smooth == 0.0).astype(np.uint8), np.ones((15, 15), np.uint8))
+        response = np.where(unseen > 0, 0.0, response)
+        mask[s.border_px : -s.border_px, s.border_px : -s.border_px] = 255
+        mask[response < s.noise_factor * from_noise] = 0
+        for x, y in np.rint(taken).astype(int):
+            cv2.circle(mask, (int(x), int(y)), round(s.spacing_px), 0, -1)
+        room = s.max_features - len(taken)
+        if room < 1 or not mask.any():
+            return np.empty(0, dtype=np.intp), np.empty((0, 2))
+        corners = cv2.goodFeaturesToTrack(
+            seen.smooth, room, 1e-6, s.spacing_px, mask=mask, blockSize=7
+        )
+        xy = np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+        ids = np.arange(self._next_id, self._next_id + len(xy), dtype=np.intp)
+        self._next_id += len(xy)
+        return ids, xy
+
+    # -- keyframes --------------------------------------------------------------------------------
+
+    def _keep(
+        self,
+        index: int,
+        time_s: float,
+        image: NDArray[Any],
+        camera: ScanCamera,
+        picture: NDArray[np.uint8],
+        ids: Index,
+        xy: Array,
+        motion: Array | None,
+    ) -> None:
+        self._settle()
+        frame = Keyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
+        self.keyframes.append(frame)
+        latest = to_plane(camera, xy)
+        self._reference = _Reference(
+            picture, frame, latest, np.ones(len(ids), dtype=bool), motion, None
+        )
+
+    def _settle(self) -> None:
+        """Give the last keyframe its velocity: the mean of those before and after it."""
+        reference = self._reference
+        if reference is None:
+            return
+        known = [v for v in (reference.before, reference.after) if v is not None]
+        if known:
+            velocity = np.mean(known, axis=0)
+            self.keyframes[-1] = replace(reference.frame, velocity=velocity)
+
+
+def _around(
+    raw: NDArray[Any], camera: ScanCamera, room: int
+) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
+    """Rows and columns about raw pixels, and their first corner (x, y)."""
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.nanmin(raw, axis=0) - room, 0, size - 1).astype(int)
+    high = np.clip(np.nanmax(raw, axis=0) + room, low + 1, size).astype(int)
+    return (slice(low[1], high[1]), slice(low[0], high[0])), low.astype(np.float32)
+
+
+def _inside(raw: Array, camera: ScanCamera, border: int) -> Mask:
+    size = np.array([camera.width, camera.height]) - 1.0 - border
+    return np.asarray(np.all((raw > border) & (raw < size), axis=1))
+
+
+def _affine_motion(before_m: Array, after_m: Array, seconds: float) -> Array | None:
+    """(2, 3) affine velocity field of points (n, 2), m/s; None for too few of them."""
+    if len(before_m) < 6 or not np.isfinite(seconds):
+        return None
+    middle = 0.5 * (before_m + after_m)
+    velocity = (after_m - before_m) / seconds
+    centre, spread = middle.mean(axis=0), float(middle.std()) or 1.0
+    design = np.column_stack([(middle - centre) / spread, np.ones(len(middle))])
+    weight = np.ones(len(design))
+    found: Array = np.zeros((3, 2))
+    for _ in range(4):
+        rows, right = design * weight[:, None], velocity * weight[:, None]
+        found = np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0], dtype=np.float64)
+        error = np.linalg.norm(velocity - design @ found, axis=1)
+        limit = max(2.0 * float(np.median(error)), 1e-18)
+        weight = np.sqrt(limit / np.maximum(error, limit))
+    slope = found[:2].T / spread
+    return np.column_stack([slope, found[2] - slope @ centre])

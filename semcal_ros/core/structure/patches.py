@@ -1,0 +1,266 @@
+"""Measuring where known surface points are seen, in all views against one template.
+
+Tracks that were handed from keyframe to keyframe have wandered. With poses, points and normals known to a fraction of a
+pixel, the patch of surface about each point is cut out of every view that faces it, with its foreshortening and bend
+undone. The mean over the other views is the template; what remains to be shifted is measured by least squares. So
+every observation of a point refers to the same texture, and points are found again wherever they are in view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.structure.appearance import Appearance
+from semcal_ros.core.structure.keyframes import Keyframe
+from semcal_ros.core.structure.raster_motion import displacement_m, plane_at_centre
+from semcal_ros.core.structure.types import Observations
+
+__all__ = ["WINDOW", "PatchSettings", "Posed", "measure_patches"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
+_GAIN_LEAST = 0.3
+
+
+@dataclass(frozen=True)
+class PatchSettings:
+    """How patches are compared.
+
+    Attributes
+    ----------
+    half_px
+        Half the width of a patch, px.
+    steepest_rad
+        Largest angle between the beam and the normal: beyond, the patch is foreshortened to nothing and
+        touches the bright limb, which does not move with the specimen.
+    least_correlation
+        With the template.
+    largest_shift_px
+        From where the structure expects the point.
+    rounds
+        Resamplings at the shifted place.
+    floor_px
+        Error that no observation is better than.
+    """
+
+    half_px: int = 7
+    steepest_rad: float = float(np.radians(58.0))
+    least_correlation: float = 0.5
+    largest_shift_px: float = 2.5
+    rounds: int = 2
+    floor_px: float = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """What is known about the structure when patches are cut out.
+
+    Attributes
+    ----------
+    rotations, translations_m
+        (views, 3, 3), (views, 3).
+    points_m, normals, curvature_1_m
+        (points, 3), (points, 3) outward, (points,).
+    """
+
+    rotations: Array
+    translations_m: Array
+    points_m: Array
+    normals: Array
+    curvature_1_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Patches of one view."""
+
+    points: NDArray[np.intp]
+    centres: Array  # raw px
+    by_patch: Array  # (n, 2, 2) raw px per patch px
+    bend: Array  # (n, 2) raw px per squared patch px
+    inside: Mask
+
+
+def measure_patches(
+    frames: Sequence[Keyframe],
+    looks: Sequence[Appearance],
+    scan: ScanTiming | None,
+    posed: Posed,
+    settings: PatchSettings,
+) -> Observations:
+    """Observations of every point in every view that faces it and agrees with the template."""
+    size_m = float(np.mean([np.mean(f.camera.pixel_size_m) for f in frames]))
+    grid = _grid(settings.half_px)
+    cuts = [_cut(view, frame, scan, posed, size_m, settings) for view, frame in enumerate(frames)]
+    shape = (len(frames), len(posed.points_m))
+    shift = np.zeros((*shape, 2))
+    seen = np.zeros(shape, dtype=bool)
+    for view, cut in enumerate(cuts):
+        seen[view, cut.points[cut.inside]] = True
+    found: _Matched | None = None
+    for _ in range(settings.rounds):
+        patches = np.zeros((*shape, len(grid)), dtype=np.float32)
+        for view, cut in enumerate(cuts):
+            patches[view, cut.points] = _sampled(
+                looks[view].texture, cut, shift[view, cut.points], grid
+            )
+        found = _matched(patches, seen, settings.half_px)
+        shift += np.where(seen[..., None], np.clip(found.shift, -1.0, 1.0), 0.0)
+    assert found is not None
+    good = seen & (found.correlation >= settings.least_correlation)
+    good &= np.linalg.norm(shift, axis=2) <= settings.largest_shift_px
+    good &= np.linalg.norm(found.shift, axis=2) < 0.7
+    return _observed(frames, scan, cuts, shift, found.covariance, good, settings.floor_px)
+
+
+def _grid(half: int) -> Array:
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
+    return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+
+
+def _tangents(normals: Array) -> tuple[Array, Array]:
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = np.cross(normals, axis)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return first, np.cross(normals, first)
+
+
+def _cut(
+    view: int,
+    frame: Keyframe,
+    scan: ScanTiming | None,
+    posed: Posed,
+    size_m: float,
+    settings: PatchSettings,
+) -> _Cut:
+    rotation, translation = posed.rotations[view], posed.translations_m[view]
+    towards_gun = -(posed.normals @ rotation[2])
+    points = np.flatnonzero(towards_gun > np.cos(settings.steepest_rad))
+    at, normal = posed.points_m[points], posed.normals[points]
+    first, second = _tangents(normal)
+    step = settings.half_px * size_m
+    places = np.concatenate(
+        [at, at + step * first, at - step * first, at + step * second, at - step * second]
+        + [at + step * normal, at - step * normal]
+    )
+    sem = places @ rotation.T + translation
+    raw = frame.camera.project(sem)
+    sem[:, :2] += displacement_m(frame, scan, np.nan_to_num(raw), sem[:, :2])
+    raw = frame.camera.project(sem).reshape(7, -1, 2)
+    span = 2.0 * settings.half_px
+    by_patch = np.stack([(raw[1] - raw[2]) / span, (raw[3] - raw[4]) / span], axis=2)
+    by_normal = (raw[5] - raw[6]) / span
+    bend = -0.5 * by_normal * (posed.curvature_1_m[points] * size_m)[:, None]
+    height, width = frame.image.shape[:2]
+    border = settings.half_px + 3.0
+    inside = np.all(np.isfinite(raw[0]), axis=1)
+    inside &= np.all(raw[0] > border, axis=1)
+    inside &= np.all(raw[0] < np.array([width, height]) - 1.0 - border, axis=1)
+    return _Cut(points, np.nan_to_num(raw[0]), by_patch, bend, inside)
+
+
+def _sampled(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
+    """(n, grid) patches of unit spread about zero."""
+    if not len(cut.points):
+        return np.zeros((0, len(grid)), dtype=np.float32)
+    local = grid[None] + shift[:, None]
+    # The bend belongs to the surface: a shift moves the texture over it.
+    xy = cut.centres[:, None] + local @ np.swapaxes(cut.by_patch, 1, 2)
+    xy = xy + np.sum(grid**2, axis=1)[None, :, None] * cut.bend[:, None]
+    x, y = (np.ascontiguousarray(xy[..., k], dtype=np.float32) for k in (0, 1))
+    drawn = cv2.remap(texture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    drawn = np.asarray(drawn, dtype=np.float32).reshape(len(local), len(grid))
+    drawn -= drawn.mean(axis=1, keepdims=True)
+    return np.asarray(drawn / (drawn.std(axis=1, keepdims=True) + 1e-6), dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    shift: Array
+    covariance: Array
+    correlation: Array
+
+
+def _matched(patches: Image, seen: Mask, half: int) -> _Matched:
+    """Shift of every patch (views, points) against the mean of the others, in patch px."""
+    views, points, size = patches.shape
+    side = 2 * half + 1
+    window = np.exp(-0.5 * np.sum(_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
+    shift = np.zeros((views, points, 2))
+    covariance = np.tile(np.eye(2), (views, points, 1, 1))
+    correlation = np.zeros((views, points))
+    for point in range(points):
+        at = np.flatnonzero(seen[:, point])
+        if len(at) < 3:
+            continue
+        stack = patches[at, point].astype(np.float64)
+        template = _template(stack)
+        others = (template[None] * len(at) - stack) / (len(at) - 1)
+        picture = template.reshape(side, side)
+        slope_v, slope_u = np.gradient(picture)
+        slope = np.stack([slope_u.ravel(), slope_v.ravel()], axis=1)
+        normal = (slope * window[:, None]).T @ slope
+        if np.linalg.cond(normal) > 100.0:
+            continue
+        inverse = np.linalg.inv(normal)
+        power = np.sum(window * others**2, axis=1)
+        both = np.sum(window * others * stack, axis=1)
+        gain = np.maximum(both / power, _GAIN_LEAST)
+        error = stack / gain[:, None] - others
+        shift[at, point] = -(error * window) @ slope @ inverse
+        fitted = error + shift[at, point] @ slope.T
+        variance = np.sum(window * fitted**2, axis=1) / window.sum()
+        covariance[at, point] = variance[:, None, None] * inverse
+        own = np.sum(window * stack**2, axis=1)
+        correlation[at, point] = both / np.sqrt(power * own)
+    return _Matched(shift, covariance, correlation)
+
+
+def _template(stack: Array) -> Array:
+    """Mean of patches (views, size), those that disagree with most others left out."""
+    mean = stack.mean(axis=0)
+    for _ in range(2):
+        like = stack @ mean / (np.linalg.norm(stack, axis=1) * np.linalg.norm(mean) + 1e-12)
+        good = like > 0.6 * np.median(like)
+        mean = stack[good].mean(axis=0)
+    return np.asarray(mean, dtype=np.float64)
+
+
+def _observed(
+    frames: Sequence[Keyframe],
+    scan: ScanTiming | None,
+    cuts: Sequence[_Cut],
+    shift: Array,
+    covariance: Array,
+    good: Mask,
+    floor_px: float,
+) -> Observations:
+    views, points, xy, root = [], [], [], []
+    for view, (frame, cut) in enumerate(zip(frames, cuts, strict=True)):
+        use = good[view, cut.points]
+        index = cut.points[use]
+        raw = cut.centres[use] + np.einsum("nij,nj->ni", cut.by_patch[use], shift[view, index])
+        plane = plane_at_centre(frame, scan, raw)
+        known = np.all(np.isfinite(plane), axis=1)
+        ideal = frame.camera.project_ideal(
+            np.column_stack([plane[known], np.zeros(np.count_nonzero(known))])
+        )
+        turned = cut.by_patch[use][known]
+        spread = turned @ covariance[view, index[known]] @ np.swapaxes(turned, 1, 2)
+        spread = spread + floor_px**2 * np.eye(2)
+        views.append(np.full(len(ideal), view))
+        points.append(index[known])
+        xy.append(ideal)
+        root.append(np.linalg.inv(np.linalg.cholesky(spread)))
+    return Observations(
+        np.concatenate(views), np.concatenate(points), np.concatenate(xy), np.concatenate(root)
+    )

@@ -1,0 +1,370 @@
+"""From keyframes to points, poses and normals with their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.structure.adjustment import Adjustment, adjust
+from semcal_ros.core.structure.appearance import Appearance, appearance_of
+from semcal_ros.core.structure.factorization import factorize
+from semcal_ros.core.structure.keyframes import Keyframe
+from semcal_ros.core.structure.mls import local_surface, typical_spacing_m
+from semcal_ros.core.structure.patches import WINDOW, PatchSettings, Posed, measure_patches
+from semcal_ros.core.structure.raster_motion import plane_at_centre
+from semcal_ros.core.structure.types import Observations, StructureError, Tracks
+from semcal_ros.core.structure.upgrade import mirrored, upgrade_to_metric
+
+__all__ = ["Structure", "StructureSettings", "mirror_of", "reconstruct", "tracks_of"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """How structure is computed.
+
+    Attributes
+    ----------
+    patches
+        Comparison of patches.
+    passes
+        How often patches are measured and adjusted.
+    smoothing_px
+        Sigma of the smoothing of patches.
+    least_track
+        Keyframes in which a feature was followed, at least.
+    least_views
+        Observations of a point in the end, at least.
+    separation_px
+        Points that are closer than this are one.
+    height_sigma_m
+        1-sigma of the heights of the specimen in the views about each other, m.
+    worst_sigma_px
+        Points that are less certain than this in any direction are left out.
+    """
+
+    patches: PatchSettings = field(default_factory=PatchSettings)
+    passes: int = 3
+    smoothing_px: float = 1.3
+    least_track: int = 4
+    least_views: int = 6
+    separation_px: float = 4.0
+    height_sigma_m: float = 5e-6
+    worst_sigma_px: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The specimen in its own frame, whose axes are those of the sem frame in the reference view.
+
+    Attributes
+    ----------
+    points_m, normals, curvature_1_m
+        (points, 3) m, (points, 3) outward unit normals, (points,) mean curvature 1/m.
+    adjustment
+        Poses, uncertainty, residuals.
+    observations
+        What was adjusted.
+    frames
+        (views,) numbers of the frames in the recording.
+    cameras
+        Camera of every view.
+    tracked
+        Number of features that were followed long enough to begin with.
+    unplaced
+        Keyframes that could not be linked to the others.
+    relief_condition
+        Of the metric upgrade, see :class:`~semcal_ros.core.structure.upgrade.MetricUpgrade`.
+    relief_sigma
+        1-sigma of a stretch of the depth of the reference view, relative: what is left of the bas-relief
+        ambiguity.
+    convexity
+        Fraction of the points about which the surface bulges towards the gun. It decides between the two
+        mirror images: an opaque surface is seen from outside.
+    mirror_sigma
+        By how many sigma the perspective of the camera prefers this structure to its mirror image;
+        near 0 it cannot tell, and negative values speak against the choice.
+    patch_sigma_m
+        Sigma of the window in which a point was compared: nearer points share pixels and their noise, m.
+    """
+
+    points_m: Array
+    normals: Array
+    curvature_1_m: Array
+    adjustment: Adjustment
+    observations: Observations
+    frames: Index
+    cameras: tuple[ScanCamera, ...]
+    tracked: int
+    unplaced: int
+    relief_condition: float
+    relief_sigma: float
+    convexity: float
+    mirror_sigma: float
+    patch_sigma_m: float
+
+    @property
+    def normal_sigma_m(self) -> Array:
+        """(points,) 1-sigma along the normal, m."""
+        variance = np.einsum(
+            "pi,pij,pj->p", self.normals, self.adjustment.point_covariance_m2, self.normals
+        )
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
+
+
+def reconstruct(
+    keyframes: Sequence[Keyframe],
+    scan: ScanTiming | None = None,
+    settings: StructureSettings | None = None,
+    *,
+    on_step: Callable[[str], object] = lambda _: None,
+) -> Structure:
+    """Points and poses from the keyframes of a :class:`~semcal_ros.core.structure.keyframes.SequenceTracker`.
+
+    Parameters
+    ----------
+    keyframes
+        At least three, of a specimen that turns.
+    scan
+        Raster timing; without it, movement during a frame is not undone.
+    settings
+        How it is done.
+    on_step
+        Called with the name of every step.
+
+    Raises
+    ------
+    StructureError
+        If the views cannot be linked or show no depth.
+    """
+    chosen = settings or StructureSettings()
+    on_step("factorizing")
+    tracks = tracks_of(keyframes, scan, chosen.least_track)
+    affine = factorize(tracks)
+    metric = upgrade_to_metric(affine)
+    views = np.flatnonzero(affine.views_placed)
+    points = np.flatnonzero(affine.points_placed)
+    placed = Tracks(
+        tracks.xy_m[np.ix_(views, points)].copy(), tracks.seen[np.ix_(views, points)].copy()
+    )
+    cameras = tuple(keyframes[int(v)].camera for v in views)
+    work = _Work(
+        [keyframes[int(v)] for v in views],
+        cameras,
+        scan,
+        chosen,
+        metric.rotations[views],
+        metric.translations_m[views],
+        metric.points_m[points],
+        Observations.of_tracks(placed, cameras, 0.3),
+    )
+    on_step("adjusting")
+    work.first()
+    work.looks = [
+        appearance_of(frame.image, smoothing_px=chosen.smoothing_px) for frame in work.keyframes
+    ]
+    for number in range(chosen.passes):
+        on_step(f"measuring {number + 1} of {chosen.passes}")
+        work.refined()
+    on_step("uncertainty")
+    return work.structure(len(keyframes), tracks.seen.shape[1], metric.condition)
+
+
+def tracks_of(keyframes: Sequence[Keyframe], scan: ScanTiming | None, least: int = 3) -> Tracks:
+    """Tracks through keyframes, in the plane of the specimen, those of at least ``least`` views."""
+    if len(keyframes) < 3:
+        raise StructureError(
+            f"{len(keyframes)} keyframes", expected="at least 3: the specimen hardly turns"
+        )
+    ids = np.concatenate([frame.ids for frame in keyframes])
+    names, counts = np.unique(ids, return_counts=True)
+    names = names[counts >= least]
+    xy = np.zeros((len(keyframes), len(names), 2))
+    seen = np.zeros((len(keyframes), len(names)), dtype=bool)
+    for view, frame in enumerate(keyframes):
+        known = np.isin(frame.ids, names)
+        plane = plane_at_centre(frame, scan, frame.xy[known])
+        finite = np.all(np.isfinite(plane), axis=1)
+        column = np.searchsorted(names, frame.ids[known][finite])
+        xy[view, column], seen[view, column] = plane[finite], True
+    return Tracks(xy, seen)
+
+
+def mirror_of(
+    rotations: Array, translations_m: Array, points_m: Array
+) -> tuple[Array, Array, Array]:
+    """The structure that parallel projection cannot tell from the given one."""
+    turned, points = mirrored(rotations, points_m)
+    return turned, translations_m * np.array([1.0, 1.0, -1.0]), points
+
+
+class _Work:
+    """The structure while it is refined; views and points that fail are dropped on the way."""
+
+    def __init__(
+        self,
+        keyframes: list[Keyframe],
+        cameras: tuple[ScanCamera, ...],
+        scan: ScanTiming | None,
+        settings: StructureSettings,
+        rotations: Array,
+        translations: Array,
+        points: Array,
+        observations: Observations,
+    ) -> None:
+        self.keyframes, self.cameras, self.scan = keyframes, cameras, scan
+        self.settings = settings
+        self.rotations, self.translations, self.points = rotations, translations, points
+        self.seen = observations
+        self.looks: list[Appearance] = []
+        self.adjusted: Adjustment | None = None
+        self.pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in cameras]))
+
+    def first(self) -> None:
+        """Adjust the tracks, drop what does not fit, choose between the mirror images."""
+        self._prune(self.settings.least_track)
+        for _ in range(2):
+            self._adjust()
+            assert self.adjusted is not None
+            self.seen = self.seen.chosen(self.adjusted.weights > 0.3)
+            self._prune(self.settings.least_track, worst_px=4.0 * self.settings.worst_sigma_px)
+        self._merge()
+        normals, curvature = self._surface(wide=True)
+        if np.count_nonzero(curvature > 0.0) < 0.5 * len(curvature):
+            self.rotations, self.translations, self.points = mirror_of(
+                self.rotations, self.translations, self.points
+            )
+
+    def refined(self) -> None:
+        """Measure all patches against their templates, and adjust."""
+        normals, curvature = self._surface()
+        posed = Posed(self.rotations, self.translations, self.points, normals, curvature)
+        self.seen = measure_patches(
+            self.keyframes, self.looks, self.scan, posed, self.settings.patches
+        )
+        self._prune(self.settings.least_views)
+        self._adjust()
+        assert self.adjusted is not None
+        self.seen = self.seen.chosen(self.adjusted.weights > 0.25)
+        self._prune(self.settings.least_views, worst_px=self.settings.worst_sigma_px)
+
+    def _adjust(self, tolerance: float = 1e-4) -> None:
+        self.adjusted = adjust(
+            self.seen,
+            self.cameras,
+            self.rotations,
+            self.translations,
+            self.points,
+            reference=len(self.cameras) // 2,
+            height_sigma_m=self.settings.height_sigma_m,
+            tolerance=tolerance,
+        )
+        done = self.adjusted
+        self.rotations, self.translations = done.rotations, done.translations_m
+        self.points = done.points_m
+
+    def _prune(self, least: int, worst_px: float | None = None) -> None:
+        """Drop points that few views see or that are too uncertain, and views that see few points."""
+        certain = np.ones(len(self.points), dtype=bool)
+        if worst_px is not None and self.adjusted is not None:
+            largest = np.linalg.eigvalsh(self.adjusted.point_covariance_m2)[:, -1]
+            certain = np.sqrt(largest) < worst_px * self.pixel_m
+        views = np.ones(len(self.cameras), dtype=bool)
+        for _ in range(20):
+            use = certain[self.seen.point] & views[self.seen.view]
+            counts = np.bincount(self.seen.point[use], minlength=len(self.points))
+            per_view = np.bincount(
+                self.seen.view[use & (counts >= least)[self.seen.point]],
+                minlength=len(self.cameras),
+            )
+            better = certain & (counts >= least), views & (per_view >= 8)
+            if np.array_equal(better[0], certain) and np.array_equal(better[1], views):
+                break
+            certain, views = better
+        self._keep(certain, views)
+
+    def _keep(self, points: Mask, views: Mask) -> None:
+        if np.count_nonzero(points) < 12 or np.count_nonzero(views) < 3:
+            raise StructureError(
+                f"{np.count_nonzero(points)} points in {np.count_nonzero(views)} views that agree",
+                expected="at least 12 in 3",
+                do="record more texture, slower movements or larger turns",
+            )
+        use = points[self.seen.point] & views[self.seen.view]
+        new_point, new_view = np.cumsum(points) - 1, np.cumsum(views) - 1
+        seen = self.seen.chosen(use)
+        self.seen = replace(seen, view=new_view[seen.view], point=new_point[seen.point])
+        self.points = self.points[points]
+        self.rotations, self.translations = self.rotations[views], self.translations[views]
+        kept = np.flatnonzero(views)
+        self.keyframes = [self.keyframes[int(v)] for v in kept]
+        self.cameras = tuple(self.cameras[int(v)] for v in kept)
+        self.looks = [self.looks[int(v)] for v in kept] if self.looks else []
+
+    def _merge(self) -> None:
+        """Of points that are closer than a patch can tell apart, keep the one seen most."""
+        counts = np.bincount(self.seen.point, minlength=len(self.points))
+        near = cKDTree(self.points).query_ball_point(
+            self.points, self.settings.separation_px * self.pixel_m
+        )
+        keep = np.ones(len(self.points), dtype=bool)
+        for point in np.argsort(-counts, kind="stable"):
+            if keep[point]:
+                others = [p for p in near[point] if p != point]
+                keep[others] = False
+        self._keep(keep, np.ones(len(self.cameras), dtype=bool))
+
+    def _surface(self, *, wide: bool = False) -> tuple[Array, Array]:
+        """Normals towards the gun and the mean curvature about them."""
+        spread = float(np.sqrt(np.mean(np.var(self.points, axis=0))))
+        radius = 0.5 * spread if wide else max(3.0 * typical_spacing_m(self.points), 0.2 * spread)
+        surface = local_surface(self.points, self.points, radius, steps=1)
+        towards = np.zeros((len(self.points), 3))
+        np.add.at(towards, self.seen.point, -self.rotations[self.seen.view, 2])
+        surface = surface.facing(towards)
+        return surface.normals, surface.curvature_1_m
+
+    def structure(self, keyframes: int, tracked: int, condition: float) -> Structure:
+        self._adjust(1e-7)
+        done = self.adjusted
+        assert done is not None
+        normals, curvature = self._surface()
+        depth = done.points_m @ done.rotations[done.reference][2]
+        depth = depth - depth.mean()
+        gradient = np.outer(depth / np.sum(depth**2), done.rotations[done.reference][2])
+        other = adjust(
+            self.seen,
+            self.cameras,
+            *mirror_of(done.rotations, done.translations_m, done.points_m),
+            reference=done.reference,
+            height_sigma_m=self.settings.height_sigma_m,
+            max_iterations=8,
+        )
+        # Costs are half squared sigmas of each one's own scale; compare on one scale.
+        preference = other.cost * other.sigma**2 / done.sigma**2 - done.cost
+        _, bulge = self._surface(wide=True)
+        return Structure(
+            points_m=done.points_m,
+            normals=normals,
+            curvature_1_m=curvature,
+            adjustment=done,
+            observations=self.seen,
+            frames=np.array([frame.index for frame in self.keyframes]),
+            cameras=self.cameras,
+            tracked=tracked,
+            unplaced=keyframes - len(self.cameras),
+            relief_condition=condition,
+            relief_sigma=float(np.sqrt(done.variance_of(gradient))),
+            convexity=float(np.mean(bulge > 0.0)),
+            mirror_sigma=float(np.sign(preference) * np.sqrt(2.0 * abs(preference))),
+            patch_sigma_m=WINDOW * self.settings.patches.half_px * self.pixel_m,
+        )

@@ -1,0 +1,181 @@
+"""A sphere through a cloud of points of which some belong to something else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.structure.types import StructureError
+
+__all__ = ["SphereFit", "fit_sphere"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TRIALS = 500
+_MAD_TO_SIGMA = 1.4826
+_LEAST = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SphereFit:
+    """A sphere and how well the points determine it.
+
+    Attributes
+    ----------
+    centre_m, radius_m
+        (3,) and m.
+    inliers
+        (n,) points that belong to it.
+    residuals_m
+        (n,) distances from it, positive outside, m.
+    rms_m
+        RMS of the inliers' residuals, m.
+    covariance_m2
+        (4, 4) of centre and radius if the residuals were independent, m^2.
+    radius_gradient
+        (n, 3) derivative of the radius by the points.
+    iterations, converged
+        How the fit ended.
+    """
+
+    centre_m: Array
+    radius_m: float
+    inliers: Mask
+    residuals_m: Array
+    rms_m: float
+    covariance_m2: Array
+    radius_gradient: Array
+    iterations: int
+    converged: bool
+
+    @property
+    def radius_sigma_m(self) -> float:
+        """1-sigma of the radius if the residuals were independent, m."""
+        return float(np.sqrt(self.covariance_m2[3, 3]))
+
+
+def fit_sphere(
+    points_m: Array, sigma_m: Array | None = None, *, tolerance: float = 0.05, seed: int = 0
+) -> SphereFit:
+    """Geometric least squares, robust against other surfaces in the cloud.
+
+    Parameters
+    ----------
+    points_m
+        (n, 3) points.
+    sigma_m
+        (n,) 1-sigma of their distances along the normal, m; equal if not given.
+    tolerance
+        Largest distance of an inlier, as a fraction of the median distance of the points from their
+        middle.
+    seed
+        Of the random search.
+
+    Raises
+    ------
+    StructureError
+        If fewer than eight points lie on one sphere.
+    """
+    if len(points_m) < _LEAST:
+        raise StructureError(f"a cloud of {len(points_m)} points", expected=f"at least {_LEAST}")
+    middle = np.median(points_m, axis=0)
+    unit = float(np.median(np.linalg.norm(points_m - middle, axis=1)))
+    points = (points_m - middle) / unit
+    weight = np.ones(len(points)) if sigma_m is None else _weights(sigma_m)
+    centre, radius, inliers = _searched(points, tolerance, seed)
+    converged, iterations = False, 0
+    for _ in range(60):
+        iterations += 1
+        step = _step(points[inliers], weight[inliers], centre, radius)
+        centre, radius = centre + step[:3], radius + float(step[3])
+        distance = np.linalg.norm(points - centre, axis=1) - radius
+        sigma = _MAD_TO_SIGMA * float(np.median(np.abs(distance[inliers])))
+        limit = min(max(4.0 * sigma, 1e-9), tolerance)
+        chosen = np.abs(distance) <= limit
+        if np.count_nonzero(chosen) < _LEAST:
+            raise StructureError(
+                f"{np.count_nonzero(chosen)} points on one sphere", expected=f"at least {_LEAST}"
+            )
+        same = np.array_equal(chosen, inliers)
+        inliers = chosen
+        if same and float(np.abs(step).max()) < 1e-10:
+            converged = True
+            break
+    return _result(points, weight, centre, radius, inliers, middle, unit, iterations, converged)
+
+
+def _weights(sigma: Array) -> Array:
+    """Relative weights, bounded: a few points shall not decide alone."""
+    bounded = np.clip(sigma, 0.5 * np.median(sigma), None)
+    return np.asarray((np.median(bounded) / bounded) ** 2, dtype=np.float64)
+
+
+def _searched(points: Array, tolerance: float, seed: int) -> tuple[Array, float, Mask]:
+    """Centre, radius and inliers of the sphere through four points that most others agree with."""
+    rng = np.random.default_rng(seed)
+    samples = np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :4]
+    four = points[samples]
+    rows = 2.0 * (four[:, 1:] - four[:, :1])
+    right = np.sum(four[:, 1:] ** 2, axis=2) - np.sum(four[:, :1] ** 2, axis=2)
+    solvable = np.abs(np.linalg.det(rows)) > 1e-3
+    if not solvable.any():
+        raise StructureError("a flat cloud of points", expected="points on a sphere")
+    centres = np.linalg.solve(rows[solvable], right[solvable][..., None])[..., 0]
+    radii = np.linalg.norm(centres - four[solvable, 0], axis=1)
+    extent = float(np.linalg.norm(points, axis=1).max())
+    possible = radii < 3.0 * extent
+    if not possible.any():
+        raise StructureError("a nearly flat cloud of points", expected="points on a sphere")
+    centres, radii = centres[possible], radii[possible]
+    distance = np.linalg.norm(points[None] - centres[:, None], axis=2) - radii[:, None]
+    cost = np.minimum((distance / tolerance) ** 2, 1.0).sum(axis=1)
+    best = int(np.argmin(cost))
+    return centres[best], float(radii[best]), np.abs(distance[best]) <= tolerance
+
+
+def _design(points: Array, centre: Array) -> tuple[Array, Array]:
+    offset = points - centre
+    distance = np.linalg.norm(offset, axis=1)
+    outward = offset / distance[:, None]
+    return np.column_stack([outward, np.ones(len(points))]), distance
+
+
+def _step(points: Array, weight: Array, centre: Array, radius: float) -> Array:
+    design, distance = _design(points, centre)
+    weighted = design * weight[:, None]
+    return np.asarray(np.linalg.solve(weighted.T @ design, weighted.T @ (distance - radius)))
+
+
+def _result(
+    points: Array,
+    weight: Array,
+    centre: Array,
+    radius: float,
+    inliers: Mask,
+    middle: Array,
+    unit: float,
+    iterations: int,
+    converged: bool,
+) -> SphereFit:
+    design, distance = _design(points, centre)
+    weight = np.where(inliers, weight, 0.0)
+    inverse = np.linalg.inv((design * weight[:, None]).T @ design)
+    residuals = distance - radius
+    number = int(np.count_nonzero(inliers))
+    variance = float(weight @ residuals**2) / max(number - 4, 1) / float(weight[inliers].mean())
+    covariance = variance * float(weight[inliers].mean()) * inverse
+    hat = inverse[3] @ design.T * weight
+    return SphereFit(
+        centre_m=middle + unit * centre,
+        radius_m=unit * radius,
+        inliers=inliers,
+        residuals_m=unit * residuals,
+        rms_m=unit * float(np.sqrt(np.mean(residuals[inliers] ** 2))),
+        covariance_m2=np.asarray(unit**2 * covariance, dtype=np.float64),
+        radius_gradient=hat[:, None] * design[:, :3],
+        iterations=iterations,
+        converged=converged,
+    )

@@ -1,0 +1,95 @@
+"""What the steps of a reconstruction hand to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+
+__all__ = ["Observations", "StructureError", "Tracks", "camera_table"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
+
+
+class StructureError(SemcalError):
+    """The views do not allow a reconstruction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Where points are seen in views, in the plane of the specimen.
+
+    Parameters
+    ----------
+    xy_m
+        (views, points, 2) sem-frame X and Y at height 0 of the line of sight, m
+        (:meth:`~semcal_ros.core.camera.ScanCamera.sem_from_ideal` of undistorted pixels). The calibrated
+        intrinsics are divided out, so that every view is a parallel projection in true scale, up to
+        ``1 / (1 + rho Z)``. Anything where not seen.
+    seen
+        (views, points) bool.
+    """
+
+    xy_m: Array
+    seen: Mask
+
+    def __post_init__(self) -> None:
+        if self.xy_m.ndim != 3 or self.xy_m.shape != (*self.seen.shape, 2):
+            raise InvalidValueError(
+                f"tracks of shape {self.xy_m.shape} with a mask of shape {self.seen.shape}",
+                expected="(views, points, 2) and (views, points)",
+            )
+        if not np.all(np.isfinite(self.xy_m[self.seen])):
+            raise InvalidValueError("tracks that are not finite", expected="finite metres")
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The same as a list, in undistorted pixels, with what they are worth.
+
+    Parameters
+    ----------
+    view, point
+        (n,) indices.
+    xy
+        (n, 2) undistorted px.
+    root
+        (n, 2, 2) root of the information: ``root @ error`` has unit covariance, 1/px.
+    """
+
+    view: Index
+    point: Index
+    xy: Array
+    root: Array
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def chosen(self, keep: Mask | Index) -> Observations:
+        """Some of them."""
+        return Observations(self.view[keep], self.point[keep], self.xy[keep], self.root[keep])
+
+    @staticmethod
+    def of_tracks(
+        tracks: Tracks, cameras: Sequence[ScanCamera], sigma_px: float = 1.0
+    ) -> Observations:
+        """All that is seen in tracks, with one standard deviation."""
+        view, point = np.nonzero(tracks.seen)
+        table = camera_table(cameras)[view]
+        x, y = tracks.xy_m[view, point].T
+        m, a, skew, px, py = table[:, :5].T
+        xy = np.stack([px + m * (a * x + skew * y), py + m * y / a], axis=1)
+        root = np.broadcast_to(np.eye(2) / sigma_px, (len(view), 2, 2))
+        return Observations(view, point, xy, np.array(root))
+
+
+def camera_table(cameras: Sequence[ScanCamera]) -> Array:
+    """(views, 6) m, aspect, skew, px, py, rho."""
+    return np.array([camera.parameters[:6] for camera in cameras]).reshape(-1, 6)

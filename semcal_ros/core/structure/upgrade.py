@@ -1,0 +1,164 @@
+"""From affine to metric structure with calibrated parallel projections.
+
+The tracks are in true scale (see :class:`~semcal_ros.core.structure.types.Tracks`), so the rows of every camera
+become orthonormal: ``M_i Q M_i^T = I`` for one symmetric Q = A A^T. That is linear in the six entries of Q and
+absolute: scale, aspect and skew are those of the calibration. Two things remain open in parallel projection,
+whatever the number of views:
+
+- the *bas-relief* direction is weak when the views differ by small rotations; :attr:`MetricUpgrade.condition`
+  tells;
+- the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well: :func:`mirrored`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from semcal_ros.core.structure.factorization import AffineStructure
+from semcal_ros.core.structure.types import StructureError
+
+__all__ = ["MetricUpgrade", "mirrored", "upgrade_to_metric"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_MIRROR = np.diag([1.0, 1.0, -1.0])
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class MetricUpgrade:
+    """Metric structure in the frame of the specimen.
+
+    Attributes
+    ----------
+    rotations
+        (views, 3, 3) sem_from_specimen; identity where a view was not placed.
+    translations_m
+        (views, 3), z = 0.
+    points_m
+        (points, 3) m.
+    condition
+        Singular value ratio of the six equations: below some 1e-3 the relief is hardly determined.
+    orthonormality
+        RMS departure of the upgraded camera rows from orthonormal ones, dimensionless.
+    positive
+        Whether the linear solution was a possible one; if not, it was found by descent.
+    """
+
+    rotations: Array
+    translations_m: Array
+    points_m: Array
+    condition: float
+    orthonormality: float
+    positive: bool
+
+
+def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
+    """Metric structure of an affine one.
+
+    Raises
+    ------
+    StructureError
+        If fewer than three views are placed, or all of them look from one direction.
+    """
+    placed = affine.views_placed
+    cameras = affine.cameras[placed]
+    if len(cameras) < 3:
+        raise StructureError(
+            f"{len(cameras)} views", expected="at least 3: two leave the relief open"
+        )
+    # Whiten the points, so that Q is near a multiple of the identity and its condition means something.
+    spread = np.linalg.cholesky(np.cov(affine.points[affine.points_placed].T))
+    scaled = cameras @ spread
+    unit = float(np.sqrt(np.mean(scaled**2)))
+    scaled = scaled / unit
+    rows, right = _equations(scaled, 1.0 / unit**2)
+    solution, _, rank, values = np.linalg.lstsq(rows, right, rcond=None)
+    condition = float(values[-1] / values[0])
+    if rank < 6 or condition < 1e-7:
+        raise StructureError(
+            f"{len(cameras)} views from nearly one direction",
+            expected="views that are turned against each other about an axis across the beam",
+        )
+    q = np.zeros((3, 3))
+    for value, (i, j) in zip(solution, _PAIRS, strict=True):
+        q[i, j] = q[j, i] = value
+    smallest = float(np.linalg.eigvalsh(q)[0])
+    positive = smallest > 0.0
+    root = np.asarray(np.linalg.cholesky(_positive(q)), dtype=np.float64)
+    root = _descended(scaled, root, 1.0 / unit)
+    metric = scaled @ root * unit
+    points = affine.points @ np.linalg.inv(spread @ root).T
+    rotations = np.broadcast_to(np.eye(3), (len(placed), 3, 3)).copy()
+    rotations[placed] = _rotations(metric)
+    error = metric @ np.swapaxes(metric, 1, 2) - np.eye(2)
+    translations = np.zeros((len(placed), 3))
+    translations[:, :2] = affine.offsets_m
+    return MetricUpgrade(
+        *_about_first(rotations, translations, points, placed),
+        condition,
+        float(np.sqrt(np.mean(error**2))),
+        positive,
+    )
+
+
+def mirrored(rotations: Array, points_m: Array) -> tuple[Array, Array]:
+    """The other structure with the same parallel projections: (views, 3, 3) and (points, 3)."""
+    return _MIRROR @ rotations @ _MIRROR, points_m @ _MIRROR
+
+
+def _equations(cameras: Array, size: float) -> tuple[Array, Array]:
+    """Rows and right side of ``M Q M^T = size * I`` in the six entries of Q."""
+    i, j = cameras[:, 0], cameras[:, 1]
+
+    def row(a: Array, b: Array) -> Array:
+        terms = [a[:, p] * b[:, q] + (a[:, q] * b[:, p] if p != q else 0.0) for p, q in _PAIRS]
+        return np.stack(terms, axis=1)
+
+    rows = np.concatenate([row(i, i), row(j, j), row(i, j)])
+    ones = np.ones(len(cameras))
+    return rows, np.concatenate([ones, ones, 0.0 * ones]) * size
+
+
+def _positive(q: Array) -> Array:
+    values, vectors = np.linalg.eigh(q)
+    values = np.maximum(values, 1e-3 * values[-1])
+    return np.asarray((vectors * values) @ vectors.T, dtype=np.float64)
+
+
+def _descended(cameras: Array, root: Array, size: float) -> Array:
+    """The root of Q that makes the rows orthonormal in the sense of least squares."""
+    lower = np.tril_indices(3)
+
+    def error(values: Array) -> Array:
+        a = np.zeros((3, 3))
+        a[lower] = values
+        rows = cameras @ a
+        gram = rows @ np.swapaxes(rows, 1, 2) / size**2 - np.eye(2)
+        return np.concatenate([gram[:, 0, 0], gram[:, 1, 1], np.sqrt(2.0) * gram[:, 0, 1]])
+
+    found = least_squares(error, root[lower], method="lm", max_nfev=400)
+    out = np.zeros((3, 3))
+    out[lower] = found.x
+    return out
+
+
+def _rotations(rows: Array) -> Array:
+    """Nearest rotations (n, 3, 3) of camera rows (n, 2, 3)."""
+    u, _, vt = np.linalg.svd(rows, full_matrices=False)
+    two = u @ vt
+    return np.concatenate([two, np.cross(two[:, 0], two[:, 1])[:, None]], axis=1)
+
+
+def _about_first(
+    rotations: Array, translations: Array, points: Array, placed: Mask
+) -> tuple[Array, Array, Array]:
+    """The same structure with the axes of the middle placed view, so that its depth is the depth."""
+    index = np.flatnonzero(placed)
+    first = rotations[index[len(index) // 2]]
+    return rotations @ first.T, translations, points @ first.T

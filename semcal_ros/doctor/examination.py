@@ -1,0 +1,160 @@
+"""All checks in order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from semcal_ros.bridge.config import MicroscopeConfig, load_config
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.errors import SemcalError
+from semcal_ros.doctor.calibration_checks import (
+    calibration_seen,
+    check_calibration,
+    live_size,
+)
+from semcal_ros.doctor.findings import Finding, Level, note, problem
+from semcal_ros.doctor.graph_checks import (
+    Topic,
+    check_nodes,
+    check_parameters,
+    check_simulated_time,
+    check_topic,
+    suite_topics,
+)
+from semcal_ros.doctor.observations import Session, Surroundings
+from semcal_ros.doctor.stream_checks import (
+    check_diagnostics,
+    check_images,
+    check_large_images,
+    check_magnification,
+    check_output_rate,
+    check_stamps,
+    check_transport_time,
+    magnification_seen,
+)
+from semcal_ros.doctor.surroundings import look_around
+from semcal_ros.doctor.surroundings_checks import SURROUNDINGS_CHECKS, check_domain, check_rclpy
+
+__all__ = ["examine", "judge"]
+
+
+def examine(
+    config_name: str, calibration: Path | None, namespace: str, seconds: float
+) -> list[Finding]:
+    """Look at everything and say what was found.
+
+    Parameters
+    ----------
+    config_name
+        Configuration of the microscope.
+    calibration
+        A calibration file to be checked, or None.
+    namespace
+        Namespace of the suite, such as ``/sem``.
+    seconds
+        How long to listen, s.
+
+    Raises
+    ------
+    ConfigError, CalibrationFileError
+        What was given cannot be used.
+    """
+    config = load_config(config_name)
+    given = None if calibration is None else (str(calibration), Calibration.load(calibration))
+    around = look_around()
+    found = [finding for check in SURROUNDINGS_CHECKS for finding in check(around)]
+    session = None
+    # In a domain that there is none the middleware would end this process.
+    needed = [*check_rclpy(around), *check_domain(around)]
+    if "rclpy" not in around.import_errors and not any(map(_is_problem, needed)):
+        try:
+            session = _observed(config, namespace, seconds)
+        except (SemcalError, RuntimeError) as error:
+            found.append(problem("ROS 2", f"does not start here: {' '.join(str(error).split())}"))
+    if session is None:
+        do = "mend what is said above first"
+        return [*found, note("topics", "not looked at, as ROS 2 does not work here", do=do)]
+    return found + judge(session, around, (config_name, config), given, namespace)
+
+
+def _is_problem(finding: Finding) -> bool:
+    return finding.level is Level.PROBLEM
+
+
+def _observed(config: MicroscopeConfig, namespace: str, seconds: float) -> Session:
+    # Imports ROS, which need not be there.
+    from semcal_ros.doctor.live import observe
+
+    return observe(config, suite_topics(config, namespace), namespace, seconds)
+
+
+def judge(
+    session: Session,
+    around: Surroundings,
+    configured: tuple[str, MicroscopeConfig],
+    given: tuple[str, Calibration] | None,
+    namespace: str,
+) -> list[Finding]:
+    """What there is to say of what was heard.
+
+    Parameters
+    ----------
+    session, around
+        What was seen.
+    configured
+        Name of the configuration, and the configuration.
+    given
+        Name of a calibration file, and the calibration; None to look at that of the topic alone.
+    namespace
+        Namespace of the suite.
+    """
+    name, config = configured
+    topics = suite_topics(config, namespace)
+    images, magnification = topics[:2]
+    graph = session.graph
+    found = check_nodes(graph, namespace)
+    found += [finding for topic in topics for finding in check_topic(topic, graph)]
+    found += check_parameters(graph, name) + check_simulated_time(graph)
+    found += check_images(images, session) + check_stamps(images, session)
+    found += check_transport_time(images, session)
+    found += check_large_images(session, around.environment, around.rmw)
+    for output in topics[2:]:
+        if output.type == "sensor_msgs/msg/Image":
+            found += check_output_rate(images, output, session)
+    found += _judge_calibrations(session, magnification, config, given)
+    return found + check_diagnostics(session, namespace)
+
+
+def _judge_calibrations(
+    session: Session,
+    topic: Topic,
+    config: MicroscopeConfig,
+    given: tuple[str, Calibration] | None,
+) -> list[Finding]:
+    found: list[Finding] = []
+    live = None
+    if session.calibration_text is not None:
+        try:
+            live = "topic calibration", Calibration.loads(session.calibration_text)
+        except SemcalError as error:
+            found.append(problem("calibration", f"on its topic: {error}"))
+    used = given or live
+    effective = config
+    if used is not None:
+        effective = replace(config, display_width_m=used[1].display_width_m)
+    magnification = magnification_seen(session, effective)
+    g = None if magnification is None else magnification.value
+    found += check_magnification(topic, magnification, session)
+    size = live_size(session, config)
+    seen = None if used is None else calibration_seen(*used, g, size)
+    found += check_calibration(seen, size, g, config)
+    if given and live and given[1].dumps() != live[1].dumps():
+        found.append(
+            note(
+                "calibration",
+                f"the nodes have another one than {given[0]}",
+                do="give it to the nodes, or to parameter_server alone and call its ~/reload",
+            )
+        )
+    return found

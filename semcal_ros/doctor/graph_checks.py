@@ -1,0 +1,265 @@
+"""Checks of the ROS graph: nodes, topics, types, quality of service, and who uses which time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.observations import Endpoint, Graph
+
+__all__ = [
+    "Topic",
+    "check_nodes",
+    "check_parameters",
+    "check_simulated_time",
+    "check_topic",
+    "resolved",
+    "suite_topics",
+]
+
+_IMAGE = "sensor_msgs/msg/Image"
+_CLOCK = "/clock"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic that the suite reads or writes.
+
+    Attributes
+    ----------
+    name, type
+        Full name and message type.
+    what
+        What it carries.
+    is_input
+        Whether the microscope has to publish it.
+    single
+        Whether two publishers would contradict each other.
+    keys
+        Where the configuration names it; empty for topics of fixed names.
+    """
+
+    name: str
+    type: str
+    what: str
+    is_input: bool = False
+    single: bool = True
+    keys: str = ""
+
+
+def resolved(topic: str, namespace: str) -> str:
+    """Full name of a topic."""
+    return topic if topic.startswith("/") else f"{namespace}/{topic}"
+
+
+def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
+    """The topics of the suite for one microscope, the inputs first."""
+    images, g = config.image, config.magnification
+    outputs = (
+        ("image_rect", _IMAGE, "rectified images", True),
+        ("image_stabilized", _IMAGE, "images without drift", True),
+        ("camera_info", "sensor_msgs/msg/CameraInfo", "camera", False),
+        ("drift", "geometry_msgs/msg/PoseWithCovarianceStamped", "drift", True),
+        ("drift_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", "drift rate", True),
+        ("projection", "std_msgs/msg/Float64MultiArray", "projection", True),
+        ("calibration", "std_msgs/msg/String", "calibration", False),
+    )
+    return (
+        Topic(resolved(images.topic, namespace), images.type, "images", True, keys="image"),
+        Topic(resolved(g.topic, namespace), g.type, g.quantity, True, keys="magnification"),
+        *(
+            Topic(resolved(name, namespace), kind, what, single=one)
+            for name, kind, what, one in outputs
+        ),
+    )
+
+
+def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
+    """Which nodes of the suite run, and whether two have one name."""
+    found = [
+        # Others may not mind.
+        (problem if name in graph.suite() else note)(
+            "nodes",
+            f"{count} nodes have the name {name}",
+            expected="one",
+            do="end all but one, or give them names or namespaces: `--ros-args -r __ns:=/other`",
+        )
+        for name, count in Counter(graph.nodes).items()
+        if count > 1
+    ]
+    here = graph.suite(namespace)
+    elsewhere = [name for name in graph.suite() if name not in here]
+    if here:
+        found.append(ok("nodes", ", ".join(here)))
+    else:
+        seen = f"no node of the suite runs in {namespace}"
+        seen += f", but {', '.join(elsewhere)}" if elsewhere else ""
+        found.append(
+            note(
+                "nodes",
+                seen,
+                do="start one (doc/nodes.md), give --namespace, or check that ROS_DOMAIN_ID is the same",
+            )
+        )
+    return found
+
+
+def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
+    """Who publishes and who listens, with which type and quality; nothing of an output that nobody touches."""
+    publishers = graph.publishers.get(topic.name, ())
+    subscriptions = graph.subscriptions.get(topic.name, ())
+    if not publishers and not topic.is_input:
+        return []
+    found = [*_types(topic, publishers, "published"), *_types(topic, subscriptions, "expected")]
+    senders = [p for p in publishers if p.type == topic.type]
+    listeners = [s for s in subscriptions if s.type == topic.type]
+    if not publishers:
+        return [*found, _unpublished(topic, graph)]
+    if topic.single and len(senders) > 1:
+        found.append(
+            problem(
+                topic.name,
+                f"{_nodes(senders)} publish on it",
+                expected="one publisher",
+                do="end all but one, or remap the topic of the others",
+            )
+        )
+    found += _qualities(topic, senders, listeners)
+    if not found:
+        heard = f"heard by {_nodes(listeners)}" if listeners else "nobody listens"
+        sent = f"{topic.type} by {_nodes(senders)} ({senders[0].quality})"
+        made = note if topic.is_input and not listeners else ok
+        found.append(made(topic.name, f"{sent}, {heard}"))
+    return found
+
+
+def _nodes(endpoints: list[Endpoint]) -> str:
+    return ", ".join(dict.fromkeys(e.node for e in endpoints))
+
+
+def _types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
+    for end in ends:
+        if end.type != topic.type:
+            change = (
+                f"correct {topic.keys}.type in the configuration, or the node"
+                if topic.keys
+                else "correct the node"
+            )
+            yield problem(
+                topic.name,
+                f"{end.type} is {verb} by {end.node}; types that differ never meet",
+                expected=f"{topic.type} ({topic.what})",
+                do=change,
+            )
+
+
+def _unpublished(topic: Topic, graph: Graph) -> Finding:
+    last = topic.name.rpartition("/")[2]
+    same = [
+        name
+        for name, ends in graph.publishers.items()
+        if any(e.type == topic.type for e in ends) and name.rpartition("/")[2] == last
+    ]
+    seen = "nobody publishes on it" + (f", but on {', '.join(sorted(same))}" if same else "")
+    return problem(
+        topic.name,
+        seen,
+        expected=f"{topic.type} ({topic.what})",
+        do="start the microscope's node in this domain; or name its topic in a configuration"
+        f" ({topic.keys}.topic, --config), remap it, or give --namespace",
+    )
+
+
+def _qualities(
+    topic: Topic, senders: list[Endpoint], listeners: list[Endpoint]
+) -> Iterator[Finding]:
+    for sender in senders:
+        for listener in listeners:
+            refused = [
+                kind
+                for kind, wanted, offered in (
+                    ("reliable", listener.reliable, sender.reliable),
+                    ("transient local", listener.transient_local, sender.transient_local),
+                )
+                if wanted and not offered
+            ]
+            if refused:
+                yield problem(
+                    topic.name,
+                    f"{listener.node} asks for {' and '.join(refused)}, {sender.node} offers {sender.quality}:"
+                    " nothing arrives there",
+                    expected="an offer that is no less than the demand",
+                    do="change the quality of service of either; nodes of the suite give way by themselves",
+                )
+        if not sender.reliable:
+            yield note(
+                topic.name,
+                f"{sender.node} publishes {sender.quality}: what does not get through at once is lost, images that"
+                " exceed the shared memory most often",
+                expected="reliable",
+                do="change the quality of service of the publisher",
+            )
+        if topic.keys == "magnification" and not sender.transient_local:
+            yield note(
+                topic.name,
+                f"{sender.node} publishes {sender.quality}: who starts later learns the {topic.what} only with its"
+                " next message",
+                expected="transient local",
+                do="change the durability of the publisher, or publish again and again",
+            )
+
+
+def check_parameters(graph: Graph, config: str) -> list[Finding]:
+    """Whether the nodes answer the parameter protocol, and use the configuration that was given here."""
+    found = []
+    for name, values in graph.parameters.items():
+        if values is None:
+            found.append(
+                problem(
+                    name,
+                    "does not answer when it is asked for its parameters",
+                    do="it hangs, or is very busy: see its diagnostics; restart it",
+                )
+            )
+        # The virtual microscope is configured by what it simulates.
+        elif values[1] != config and not name.endswith("/virtual_sem"):
+            found.append(
+                note(
+                    name,
+                    f"uses the configuration {values[1]}, this command {config}",
+                    do=f"give --config {values[1]}",
+                )
+            )
+    if graph.parameters and not found:
+        found.append(ok("parameters", "all nodes answer"))
+    return found
+
+
+def check_simulated_time(graph: Graph) -> list[Finding]:
+    """Whether /clock and the parameters `use_sim_time` fit each other."""
+    clocks = [e.node for e in graph.publishers.get(_CLOCK, ())]
+    known = {name: values[0] for name, values in graph.parameters.items() if values is not None}
+    simulated = [name for name, value in known.items() if value]
+    # What replays is the source of the time and keeps to the real one.
+    real = [name for name, value in known.items() if not value and name not in clocks]
+    if simulated and not clocks:
+        return [
+            problem(
+                "time",
+                f"{', '.join(simulated)}: simulated time, but nobody publishes /clock; it stands still",
+                do="set use_sim_time to false, or play with /clock: `semcal play`",
+            )
+        ]
+    if clocks and real:
+        return [
+            note(
+                "time",
+                f"{', '.join(clocks)} publishes /clock, but {', '.join(real)} keep to the real time",
+                expected="use_sim_time:=true for all nodes of a replay",
+                do="without it frames are corrected all the same, but no latency is reported",
+            )
+        ]
+    return [ok("time", "simulated, by /clock" if clocks else "real, no /clock")] if known else []

@@ -1,0 +1,272 @@
+"""Listen to the running system for a while; the one part of this folder that imports ROS."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import GetParameters
+from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from semcal_ros.bridge import (
+    MagnificationReading,
+    MicroscopeConfig,
+    image_from_message,
+    optional_stamp_ns,
+    read_magnification,
+    without_databar,
+)
+from semcal_ros.core.errors import SemcalError
+from semcal_ros.doctor.graph_checks import Topic
+from semcal_ros.doctor.observations import (
+    Arrival,
+    Endpoint,
+    Graph,
+    ImageSeen,
+    Session,
+    Status,
+)
+from semcal_ros.nodes.message_types import message_class
+
+__all__ = ["observe"]
+
+# Before anything is known, nodes need to find each other.
+_DISCOVERY_S = 1.0
+_ANSWER_S = 5.0
+_STEP_S = 0.05
+_DEPTH = 50
+_PARAMETERS = ("use_sim_time", "config")
+
+
+def observe(
+    config: MicroscopeConfig, topics: tuple[Topic, ...], namespace: str, seconds: float
+) -> Session:
+    """What can be heard within some seconds.
+
+    Parameters
+    ----------
+    config
+        The microscope.
+    topics
+        What to look at: image and magnification first; to the images among them, and to `calibration`, it listens.
+    namespace
+        That of the suite.
+    seconds
+        How long to listen, s.
+
+    Raises
+    ------
+    RuntimeError
+        The middleware does not start.
+    SemcalError
+        The configuration names a message type that is not installed.
+    """
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = Node(f"semcal_doctor_{os.getpid()}", context=context, namespace=namespace)
+        try:
+            return _Observer(node, config, topics, namespace).session(seconds)
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+
+
+class _Observer:
+    def __init__(
+        self, node: Node, config: MicroscopeConfig, topics: tuple[Topic, ...], namespace: str
+    ) -> None:
+        self._node = node
+        self._config = config
+        self._topics = topics
+        self._namespace = namespace
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._arrivals: dict[str, list[Arrival]] = {}
+        self._image: Any = None
+        self._magnification: Any = None
+        self._calibration: str | None = None
+        self._statuses: dict[str, Status] = {}
+        images, magnification = topics[:2]
+        # What to do with a message, by topic, beside noting that it came.
+        self._takes: dict[str, Callable[[Any], None]] = {
+            images.name: self._take_image,
+            magnification.name: self._take_magnification,
+            f"{namespace}/calibration": self._take_calibration,
+            f"{namespace}/image_rect": lambda _message: None,
+            f"{namespace}/image_stabilized": lambda _message: None,
+        }
+        self._classes = {t.name: message_class(t.type) for t in topics if t.name in self._takes}
+        self._subscribed: set[str] = set()
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEPTH)
+
+    def session(self, seconds: float) -> Session:
+        """Listen, ask, and sum up."""
+        self._spin(lambda: False, _DISCOVERY_S + seconds, each=self._subscribe)
+        graph = self._graph()
+        answers = self._ask(graph.suite(self._namespace))
+        values = {
+            name: None if answer is None else (answer[0].bool_value, answer[1].string_value)
+            for name, answer in answers.items()
+            # A node that does not know them only has the name of one of the suite.
+            if answer is None or len(answer) == len(_PARAMETERS)
+        }
+        reading, trouble = self._reading()
+        return Session(
+            seconds=seconds,
+            graph=replace(graph, parameters=values),
+            arrivals={name: tuple(heard) for name, heard in self._arrivals.items()},
+            image=self._image_seen(),
+            reading=reading,
+            reading_trouble=trouble,
+            calibration_text=self._calibration,
+            statuses=tuple(self._statuses.values()),
+        )
+
+    def _spin(
+        self, done: Callable[[], bool], seconds: float, each: Callable[[], None] | None = None
+    ) -> None:
+        deadline = time.monotonic() + seconds
+        while not done() and time.monotonic() < deadline:
+            if each is not None:
+                each()
+            self._executor.spin_once(timeout_sec=_STEP_S)
+
+    # -- messages ----------------------------------------------------------------------------------
+
+    def _subscribe(self) -> None:
+        """Listen to what has a publisher by now, with no more demands than all publishers meet."""
+        for topic in self._topics:
+            if topic.name not in self._takes or topic.name in self._subscribed:
+                continue
+            senders = [p for p in self._publishers(topic.name) if p.type == topic.type]
+            if senders:
+                self._subscribed.add(topic.name)
+                quality = _least(senders)
+                taking = self._taking(topic.name)
+                self._node.create_subscription(
+                    self._classes[topic.name],
+                    topic.name,
+                    taking,
+                    quality,
+                    # The checks tell what does not fit; the default would log it as well.
+                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                )
+
+    def _taking(self, name: str) -> Callable[[Any, Any], None]:
+        arrivals = self._arrivals.setdefault(name, [])
+
+        def take(message: Any, info: Any) -> None:
+            arrivals.append(
+                Arrival(
+                    info["received_timestamp"] or time.time_ns(),
+                    info["source_timestamp"] or None,
+                    optional_stamp_ns(message),
+                )
+            )
+            self._takes[name](message)
+
+        return take
+
+    def _take_image(self, message: Any) -> None:
+        self._image = message
+
+    def _take_magnification(self, message: Any) -> None:
+        self._magnification = message
+
+    def _take_calibration(self, message: Any) -> None:
+        self._calibration = message.data
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            name = status.name.removesuffix(": stream")
+            if name != status.name and name.rpartition("/")[0] == self._namespace:
+                level = int.from_bytes(status.level, "little")
+                self._statuses[name] = Status(name, level, status.message)
+
+    def _image_seen(self) -> ImageSeen | None:
+        message, trouble = self._image, ""
+        # Only plain images tell their size without being decoded.
+        if message is None or not hasattr(message, "encoding"):
+            return None
+        try:
+            without_databar(image_from_message(message), self._config.image.databar_rows)
+        except SemcalError as error:
+            trouble = str(error)
+        size = len(message.data)
+        return ImageSeen(message.width, message.height, message.encoding, size, trouble)
+
+    def _reading(self) -> tuple[MagnificationReading | None, str]:
+        if self._magnification is None:
+            return None, ""
+        try:
+            return read_magnification(self._magnification, self._config), ""
+        except SemcalError as error:
+            return None, str(error)
+
+    # -- graph -------------------------------------------------------------------------------------
+
+    def _graph(self) -> Graph:
+        own = self._node.get_fully_qualified_name()
+        names = [
+            f"{namespace.rstrip('/')}/{name}"
+            for name, namespace in self._node.get_node_names_and_namespaces()
+        ]
+        known = [name for name, _ in self._node.get_topic_names_and_types()]
+        return Graph(
+            nodes=tuple(sorted(name for name in names if name != own)),
+            publishers={name: self._publishers(name) for name in known},
+            subscriptions={
+                name: self._endpoints(self._node.get_subscriptions_info_by_topic(name))
+                for name in known
+            },
+        )
+
+    def _publishers(self, topic: str) -> tuple[Endpoint, ...]:
+        return self._endpoints(self._node.get_publishers_info_by_topic(topic))
+
+    def _endpoints(self, infos: Iterable[Any]) -> tuple[Endpoint, ...]:
+        own = self._node.get_fully_qualified_name()
+        found = [
+            Endpoint(
+                f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+                info.topic_type,
+                info.qos_profile.reliability == ReliabilityPolicy.RELIABLE,
+                info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            )
+            for info in infos
+        ]
+        return tuple(end for end in found if end.node != own)
+
+    def _ask(self, nodes: tuple[str, ...]) -> dict[str, Any]:
+        """Values of :data:`_PARAMETERS` by node; None of those that do not answer."""
+        clients = {n: self._node.create_client(GetParameters, f"{n}/get_parameters") for n in nodes}
+        self._spin(lambda: all(c.service_is_ready() for c in clients.values()), _ANSWER_S)
+        request = GetParameters.Request(names=list(_PARAMETERS))
+        futures = {n: c.call_async(request) for n, c in clients.items() if c.service_is_ready()}
+        self._spin(lambda: all(future.done() for future in futures.values()), _ANSWER_S)
+        return {
+            n: futures[n].result().values if n in futures and futures[n].done() else None
+            for n in nodes
+        }
+
+
+def _least(senders: list[Endpoint]) -> QoSProfile:
+    reliable = all(sender.reliable for sender in senders)
+    lasting = all(sender.transient_local for sender in senders)
+    return QoSProfile(
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,261 @@
+"""Checks of what arrives: images, magnification, stamps, clocks, and what the nodes say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from statistics import median
+
+from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.core.errors import SemcalError
+from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.graph_checks import Topic
+from semcal_ros.doctor.observations import Arrival, Session
+from semcal_ros.nodes.transport import transport_advice
+
+__all__ = [
+    "MagnificationSeen",
+    "check_diagnostics",
+    "check_images",
+    "check_large_images",
+    "check_magnification",
+    "check_output_rate",
+    "check_stamps",
+    "check_transport_time",
+    "magnification_seen",
+    "rate_hz",
+]
+
+# Further away than this a stamp is that of another clock, such as a recording's.
+_OTHER_CLOCK_S = 3600.0
+# Clocks that NTP keeps on one network agree much better.
+_SKEW_S = 0.05
+_SLOW_S = 1.0
+_OLD_S = 5.0
+_SYNCHRONISE = "synchronise the clocks of the hosts (chrony or NTP)"
+
+
+def rate_hz(arrivals: tuple[Arrival, ...]) -> float | None:
+    """Messages per second, or None for less than two."""
+    if len(arrivals) < 2:
+        return None
+    span_ns = arrivals[-1].received_ns - arrivals[0].received_ns
+    return (len(arrivals) - 1) * 1e9 / span_ns if span_ns > 0 else None
+
+
+def _rate(arrivals: tuple[Arrival, ...]) -> str:
+    rate = rate_hz(arrivals)
+    return "one" if rate is None else f"{rate:.3g} Hz"
+
+
+def check_images(topic: Topic, session: Session) -> list[Finding]:
+    """Whether images arrive that can be used. Nothing without a publisher, which another check tells."""
+    if not session.graph.publishers.get(topic.name):
+        return []
+    arrivals = session.arrivals.get(topic.name, ())
+    if not arrivals:
+        return [
+            problem(
+                "images",
+                f"{topic.name} has a publisher, but nothing came within {session.seconds:g} s",
+                do="a slow scan: give more --seconds; else see the lines above, and check a firewall (UDP from 7400"
+                " on), or users and containers that do not share /dev/shm",
+            )
+        ]
+    image = session.image
+    if image is None:
+        return [ok("images", f"{_rate(arrivals)} of {topic.type}")]
+    seen = (
+        f"{_rate(arrivals)}, {image.width} x {image.height} {image.encoding}, {image.bytes} bytes"
+    )
+    if image.trouble:
+        return [problem("images", f"{seen}: {image.trouble}")]
+    return [ok("images", seen)]
+
+
+def check_large_images(session: Session, environment: Mapping[str, str], rmw: str) -> list[Finding]:
+    """Whether this shell's environment suits the images; that of the nodes is in their diagnostics."""
+    if session.image is None:
+        return []
+    advice = transport_advice(session.image.bytes, environment, rmw)
+    return [
+        note("large images", f"in this shell, {advice}")
+        if advice
+        else ok("large images", "none too large for this shell's environment")
+    ]
+
+
+@dataclass(frozen=True)
+class MagnificationSeen:
+    """The last magnification as the nodes read it, or None and why not."""
+
+    value: float | None
+    trouble: str = ""
+
+
+def magnification_seen(session: Session, config: MicroscopeConfig) -> MagnificationSeen | None:
+    """The magnification by the display width of ``config``; None where no message came."""
+    if session.reading is None:
+        return MagnificationSeen(None, session.reading_trouble) if session.reading_trouble else None
+    width = None if session.image is None else session.image.width
+    try:
+        return MagnificationSeen(replace(session.reading, config=config).magnification(width))
+    except SemcalError as error:
+        return MagnificationSeen(None, str(error))
+
+
+def check_magnification(
+    topic: Topic, seen: MagnificationSeen | None, session: Session
+) -> list[Finding]:
+    """Whether a magnification is known."""
+    if not session.graph.publishers.get(topic.name):
+        return []
+    if seen is None:
+        return [
+            problem(
+                "magnification",
+                f"{topic.name} has a publisher, but nothing came within {session.seconds:g} s; frames"
+                " are not used before it is known",
+                do="change the magnification once, or let the publisher be transient local",
+            )
+        ]
+    if seen.value is None:
+        return [problem("magnification", seen.trouble)]
+    return [ok("magnification", f"{seen.value:g}")]
+
+
+def check_stamps(topic: Topic, session: Session) -> list[Finding]:
+    """Whether stamps are there, go on, and are of this clock."""
+    arrivals = [a for a in session.arrivals.get(topic.name, ()) if a.stamp_ns is not None]
+    stamps = [a.stamp_ns for a in arrivals if a.stamp_ns is not None]
+    if not stamps:
+        return []
+    if not any(stamps):
+        return [
+            problem(
+                "stamps",
+                "all stamps are zero",
+                expected="the time of the acquisition",
+                do="let the driver set header.stamp: drift rates and the pairing of topics rest on it",
+            )
+        ]
+    found = []
+    back = sum(b <= a for a, b in zip(stamps, stamps[1:], strict=False))
+    if back:
+        found.append(
+            note(
+                "stamps",
+                f"{back} of {len(stamps) - 1} stamps are not later than the one before",
+                expected="a stamp of its own for each frame",
+                do="two publishers, or a recording that loops; otherwise correct the driver",
+            )
+        )
+    age_s = median(
+        (a.received_ns - stamp) * 1e-9 for a, stamp in zip(arrivals, stamps, strict=True)
+    )
+    return [*found, _age(age_s, bool(session.graph.publishers.get("/clock")))]
+
+
+def _age(age_s: float, replay: bool) -> Finding:
+    if abs(age_s) > _OTHER_CLOCK_S:
+        seen = f"stamps are {abs(age_s) / 3600:.3g} h {'old' if age_s > 0 else 'in the future'}: those of another clock"
+        if replay:
+            return ok("stamps", f"{seen}, as in a replay with /clock")
+        return note(
+            "stamps",
+            seen,
+            expected="the time of this host, unless this is a replay",
+            do="a replay: `semcal play` publishes /clock; a driver: let it stamp with the time of the host",
+        )
+    if age_s < -_SKEW_S:
+        return problem(
+            "stamps",
+            f"stamps are {-age_s:.3g} s in the future",
+            expected="the past",
+            do=_SYNCHRONISE,
+        )
+    if age_s > _OLD_S:
+        return note(
+            "stamps",
+            f"frames are {age_s:.3g} s old when they arrive",
+            do=f"expected of a slow scan stamped at its start; else a queue is full, or {_SYNCHRONISE}",
+        )
+    return ok("stamps", f"frames are {1e3 * age_s:.3g} ms old when they arrive")
+
+
+def check_transport_time(topic: Topic, session: Session) -> list[Finding]:
+    """Whether the clock of the publisher's host and this one agree, by the time a message seems to take."""
+    times = [
+        (a.received_ns - a.published_ns) * 1e-9
+        for a in session.arrivals.get(topic.name, ())
+        if a.published_ns
+    ]
+    if not times:
+        return []
+    least = min(times)
+    if least < -_SKEW_S:
+        return [
+            problem(
+                "clocks",
+                f"images arrive {-least:.3g} s before they were published",
+                expected="clocks that agree",
+                do=_SYNCHRONISE,
+            )
+        ]
+    if least > _SLOW_S:
+        return [
+            note(
+                "clocks",
+                f"images seem to take {least:.3g} s from publisher to here",
+                do=f"the transport is too slow for them, or {_SYNCHRONISE}",
+            )
+        ]
+    return [ok("clocks", f"images take {1e3 * median(times):.3g} ms from publisher to here")]
+
+
+def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Finding]:
+    """Whether an output keeps up with the images."""
+    taken, made = session.arrivals.get(source.name, ()), session.arrivals.get(output.name, ())
+    senders = session.graph.publishers.get(output.name, ())
+    if not senders or len(taken) < 2:
+        return []
+    nodes = ", ".join(dict.fromkeys(e.node for e in senders))
+    if not made:
+        return [
+            problem(
+                output.name,
+                f"{nodes} published none of {len(taken)} images",
+                do="its diagnostics below tell why",
+            )
+        ]
+    seen = f"{_rate(made)} for {_rate(taken)} of images"
+    # Either count may miss one at both ends of the time.
+    if len(made) + 2 < 0.8 * len(taken):
+        return [
+            note(
+                output.name,
+                f"{seen}: {nodes} does not keep up",
+                do="lower the rate or the size, choose linear interpolation, or see `large images`",
+            )
+        ]
+    return [ok(output.name, seen)]
+
+
+def check_diagnostics(session: Session, namespace: str) -> list[Finding]:
+    """What the nodes of the suite say of themselves."""
+    found = []
+    for status in session.statuses:
+        if status.level == 0:
+            found.append(ok(status.node, status.message))
+        elif status.level == 1:
+            found.append(
+                note(status.node, f"warns: {status.message}", do="see Diagnostics in doc/nodes.md")
+            )
+        else:
+            found.append(problem(status.node, status.message, do="see Diagnostics in doc/nodes.md"))
+    heard = {status.node for status in session.statuses}
+    silent = [name for name in session.graph.suite(namespace) if name not in heard]
+    return found + [
+        note(name, "no diagnostics came", expected="one a second", do="give more --seconds")
+        for name in silent
+    ]

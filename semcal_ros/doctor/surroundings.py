@@ -1,0 +1,102 @@
+"""Look at this machine and process; works without ROS."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterable
+from importlib import import_module, metadata
+from pathlib import Path
+
+from semcal_ros.doctor.observations import Surroundings
+
+__all__ = ["look_around"]
+
+_MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
+# The middleware is loaded with rclpy and may end the process at once: in one of its own that does no harm.
+_PROBE = "import rclpy; print(rclpy.__file__); print(rclpy.get_rmw_implementation_identifier())"
+_PROBE_S = 60.0
+_LONGEST = 200
+_RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
+_SHM = Path("/dev/shm")
+_INSTALLATIONS = Path("/opt/ros")
+
+
+def look_around() -> Surroundings:
+    """What can be said without a ROS graph; imports what the nodes import."""
+    rclpy_file, rmw, reason = _probe_ros()
+    errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
+    return Surroundings(
+        python=sys.version_info[:2],
+        packages=dict(_packages()),
+        required=tuple(_required()),
+        import_errors=errors,
+        rclpy_file=rclpy_file,
+        prefix=sys.prefix,
+        installations=tuple(sorted(str(p.parent) for p in _INSTALLATIONS.glob("*/setup.sh"))),
+        environment=dict(os.environ),
+        rmw=rmw,
+        shm_free_bytes=shutil.disk_usage(_SHM).free if _SHM.is_dir() else None,
+        receive_buffer_bytes=_number_in(_RECEIVE_BUFFER),
+    )
+
+
+def _probe_ros() -> tuple[str, str, str]:
+    """File of rclpy and name of the middleware, or why there are none."""
+    command = [sys.executable, "-W", "ignore", "-c", _PROBE]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=_PROBE_S
+        )
+    except subprocess.TimeoutExpired:
+        return "", "", f"importing it took over {_PROBE_S:g} s"
+    lines = done.stdout.split("\n")
+    if done.returncode == 0 and len(lines) >= 3:
+        return lines[-3], lines[-2], ""
+    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    return "", "", said[-1][:_LONGEST] if said else f"the process ended with {done.returncode}"
+
+
+def _import_errors(modules: Iterable[str]) -> dict[str, str]:
+    reasons = {name: _import_error(name) for name in modules}
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def _import_error(module: str) -> str:
+    try:
+        with warnings.catch_warnings():
+            # What other people's modules warn of at import is not what is asked here.
+            warnings.simplefilter("ignore")
+            import_module(module)
+    except Exception as error:  # a broken installation fails in any way
+        return _one_line(error)
+    return ""
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text[:_LONGEST]
+
+
+def _packages() -> Iterable[tuple[str, str]]:
+    for distribution in metadata.distributions():
+        name = distribution.metadata["Name"]
+        if name:
+            yield name.lower(), distribution.version
+
+
+def _required() -> list[str]:
+    try:
+        return metadata.requires("semcal_ros") or []
+    except metadata.PackageNotFoundError:
+        return []
+
+
+def _number_in(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,332 @@
+"""Checks of the machine, of Python, and of how ROS 2 is set up here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from semcal_ros.core.errors import ConfigError
+from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.observations import Surroundings
+from semcal_ros.nodes.dds_profile import SharedMemory, local_only, profile_file, shared_memory
+
+__all__ = [
+    "SURROUNDINGS_CHECKS",
+    "check_discovery",
+    "check_domain",
+    "check_one_ros",
+    "check_packages",
+    "check_profile",
+    "check_python",
+    "check_rclpy",
+    "check_rmw",
+    "check_shared_memory",
+    "check_socket_buffers",
+]
+
+_PYTHON = ((3, 10), (3, 14))
+_GET_ROS = (
+    "run `make setup` and use .venv/bin/semcal, or install the wheels that requirements/ names, or source the"
+    " setup script of a ROS 2 installation"
+)
+# Wheels of the two distributions that are supported: major version of rclpy, and major.minor of the messages.
+_WHEELS = {"7": "5.3", "9": "5.5"}
+_DOMAINS = 232
+# Ids above would use ports that Linux hands out to other programs
+# (https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html).
+_SAFE_DOMAINS = 101
+_RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+# What the shipped profile asks of a socket.
+_SOCKET_BYTES = 32 * 1024**2
+_MB = 1024**2
+
+
+def check_python(seen: Surroundings) -> list[Finding]:
+    """Whether this Python is one that is supported."""
+    version = ".".join(map(str, seen.python))
+    if _PYTHON[0] <= seen.python <= _PYTHON[1]:
+        return [ok("Python", version)]
+    return [
+        problem("Python", version, expected="3.10 to 3.14", do="run `make setup PYTHON=python3.12`")
+    ]
+
+
+def check_packages(seen: Surroundings) -> list[Finding]:
+    """Whether what this package asks for is installed and new enough."""
+    found = []
+    for requirement in seen.required:
+        name, _, least = requirement.partition(";")[0].partition(">=")
+        # OpenCV has several names; that it can be imported was needed to get here.
+        if name.startswith("opencv"):
+            continue
+        have = seen.packages.get(name.strip().lower())
+        if least and (have is None or _numbers(have) < _numbers(least)):
+            found.append(
+                problem(
+                    "packages",
+                    f"{name.strip()} {have or 'is not installed'}",
+                    expected=f"{least.strip()} or newer",
+                    do=f'`python -m pip install "{requirement}"`',
+                )
+            )
+    if found:
+        return found
+    shown = ("numpy", "scipy", "opencv-python-headless", "opencv-python", "rosbags")
+    versions = [f"{name} {seen.packages[name]}" for name in shown if name in seen.packages]
+    return [ok("packages", ", ".join(versions) or "as the ROS workspace has them")]
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+def check_rclpy(seen: Surroundings) -> list[Finding]:
+    """Whether ROS 2 can be imported, and how to get it."""
+    reason = seen.import_errors.get("rclpy")
+    if reason is None:
+        missing = [
+            f"{name} ({why})"
+            for name, why in seen.import_errors.items()
+            if name.endswith((".msg", ".srv"))
+        ]
+        if missing:
+            return [problem("ROS 2", f"rclpy works, but not {', '.join(missing)}", do=_GET_ROS)]
+        return [ok("ROS 2", f"rclpy from {seen.rclpy_file}")]
+    if "No module named 'rclpy'" in reason:
+        here = (
+            f"; {', '.join(seen.installations)} is installed, but not sourced or for another Python"
+        )
+        return [
+            problem("ROS 2", f"rclpy is not there{here * bool(seen.installations)}", do=_GET_ROS)
+        ]
+    if _wrong_middleware(seen):
+        return []  # check_rmw tells
+    return [
+        problem(
+            "ROS 2",
+            f"rclpy is there but cannot be imported ({reason})",
+            expected="one ROS 2, made for this Python",
+            do="use a shell in which no other ROS or virtual environment was sourced",
+        )
+    ]
+
+
+def check_one_ros(seen: Surroundings) -> list[Finding]:
+    """Whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
+    rclpy, messages = seen.packages.get("ros-rclpy"), seen.packages.get("ros-sensor-msgs")
+    if rclpy is None:
+        return []
+    expected = _WHEELS.get(rclpy.partition(".")[0])
+    if messages is not None and expected and not messages.startswith(f"{expected}."):
+        return [
+            problem(
+                "ROS 2 wheels",
+                f"ros-rclpy {rclpy} with ros-sensor-msgs {messages}",
+                expected=f"messages {expected}, of the same distribution",
+                do="make the environment anew: `make setup`",
+            )
+        ]
+    others = [
+        prefix
+        for prefix in seen.environment.get("AMENT_PREFIX_PATH", "").split(":")
+        if prefix and Path(prefix) != Path(seen.prefix)
+    ]
+    foreign = bool(seen.rclpy_file) and not Path(seen.rclpy_file).is_relative_to(seen.prefix)
+    if foreign or others:
+        where = seen.rclpy_file if foreign else ", ".join(others)
+        return [
+            (problem if foreign else note)(
+                "ROS 2 wheels",
+                f"this environment has wheels of ROS 2, and {where} is sourced as well",
+                expected="one of the two",
+                do="use a new shell without the setup script, or an environment without the wheels",
+            )
+        ]
+    return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}, ros-sensor-msgs {messages or 'missing'}")]
+
+
+def _wrong_middleware(seen: Surroundings) -> bool:
+    named = seen.environment.get("RMW_IMPLEMENTATION", "")
+    return bool(named) and named in seen.import_errors.get("rclpy", "")
+
+
+def check_rmw(seen: Surroundings) -> list[Finding]:
+    """Which middleware is used."""
+    if _wrong_middleware(seen):
+        return [
+            problem(
+                "middleware",
+                f"RMW_IMPLEMENTATION is {seen.environment['RMW_IMPLEMENTATION']}, which cannot be loaded"
+                f" ({seen.import_errors['rclpy']})",
+                expected="an installed one such as rmw_fastrtps_cpp",
+                do="unset RMW_IMPLEMENTATION, or install that middleware",
+            )
+        ]
+    if not seen.rmw:
+        return []
+    if seen.rmw.startswith("rmw_fastrtps"):
+        return [ok("middleware", seen.rmw)]
+    return [
+        note(
+            "middleware",
+            f"{seen.rmw}, which does not read the shipped profile for large images",
+            do="use the same middleware in all processes, and its own settings for large messages",
+        )
+    ]
+
+
+def check_domain(seen: Surroundings) -> list[Finding]:
+    """Whether the domain id is one."""
+    given = seen.environment.get("ROS_DOMAIN_ID", "")
+    if not given:
+        return [ok("domain", "ROS_DOMAIN_ID is not set: 0")]
+    if not given.isdecimal() or int(given) > _DOMAINS:
+        return [
+            problem(
+                "domain",
+                f"ROS_DOMAIN_ID is {given!r}",
+                expected=f"0 to {_SAFE_DOMAINS}",
+                do="set the same number in all shells",
+            )
+        ]
+    if int(given) > _SAFE_DOMAINS:
+        return [
+            note(
+                "domain",
+                f"ROS_DOMAIN_ID is {given}, whose ports Linux gives to other programs too",
+                expected=f"0 to {_SAFE_DOMAINS}",
+            )
+        ]
+    return [ok("domain", f"ROS_DOMAIN_ID is {given}; nodes with another number are not seen")]
+
+
+def check_discovery(seen: Surroundings) -> list[Finding]:
+    """Which hosts and processes can be found."""
+    reach = seen.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    peers = seen.environment.get("ROS_STATIC_PEERS", "")
+    if reach and reach not in _RANGES:
+        return [
+            problem(
+                "discovery",
+                f"ROS_AUTOMATIC_DISCOVERY_RANGE is {reach!r}",
+                expected="one of " + ", ".join(_RANGES),
+            )
+        ]
+    if reach == "OFF" and not peers:
+        return [
+            problem(
+                "discovery",
+                "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF and no ROS_STATIC_PEERS are set",
+                expected="LOCALHOST or SUBNET",
+                do="set it in all shells alike; no node finds another like this",
+            )
+        ]
+    found = []
+    if seen.environment.get("ROS_LOCALHOST_ONLY") == "1":
+        found.append(
+            note(
+                "discovery",
+                "ROS_LOCALHOST_ONLY=1: nodes on other hosts are not found",
+                do="use ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, which replaces it, or unset it",
+            )
+        )
+    if seen.environment.get("ROS_DISCOVERY_SERVER"):
+        found.append(
+            note(
+                "discovery",
+                "ROS_DISCOVERY_SERVER is set: only what is subscribed to is listed below",
+                do="set it in all shells alike",
+            )
+        )
+    reached = f"{reach or 'not set: SUBNET'}" + (f", and hosts {peers}" if peers else "")
+    return found or [ok("discovery", f"ROS_AUTOMATIC_DISCOVERY_RANGE is {reached}")]
+
+
+def _memory(seen: Surroundings) -> SharedMemory | None:
+    try:
+        return shared_memory(seen.environment)
+    except ConfigError:
+        return None  # check_profile tells
+
+
+def check_profile(seen: Surroundings) -> list[Finding]:
+    """Whether a profile is set and can be used. Whether it is needed depends on the images: `large images`."""
+    if seen.rmw and not seen.rmw.startswith("rmw_fastrtps"):
+        return []
+    try:
+        memory = shared_memory(seen.environment)
+    except ConfigError as error:
+        return [
+            problem(
+                "DDS profile",
+                f"{error.seen}; Fast DDS goes on without it",
+                expected=error.expected,
+                do="use the shipped dds/fastdds_large_images.xml, or unset the variable",
+            )
+        ]
+    named = profile_file(seen.environment)
+    where = "" if named is None else f" ({named[0]})"
+    if memory.segment_bytes is None:
+        return [note("DDS profile", f"{memory.source}{where}: no shared memory between processes")]
+    size = f"{memory.segment_bytes / _MB:.1f} MiB of shared memory"
+    if named is None and memory.source != "no profile is set":
+        return [
+            problem(
+                "DDS profile",
+                memory.source,
+                expected="the variable of the installed version",
+                do="set FASTRTPS_DEFAULT_PROFILES_FILE and FASTDDS_DEFAULT_PROFILES_FILE both",
+            )
+        ]
+    return [ok("DDS profile", f"{memory.source}{where}: {size}")]
+
+
+def check_shared_memory(seen: Surroundings) -> list[Finding]:
+    """Whether /dev/shm has room for the segment of one more process."""
+    memory = _memory(seen)
+    if memory is None or memory.segment_bytes is None or not seen.rmw.startswith("rmw_fastrtps"):
+        return []
+    free = seen.shm_free_bytes
+    if free is None:
+        return [note("/dev/shm", "there is none: processes talk through the network stack")]
+    if free < memory.segment_bytes:
+        return [
+            problem(
+                "/dev/shm",
+                f"{free / _MB:.0f} MiB are free",
+                expected=f"{memory.segment_bytes / _MB:.1f} MiB for each process of the DDS profile",
+                do="enlarge it (a container: --shm-size=2g), or remove /dev/shm/fast* that killed processes left,"
+                " while no ROS process runs; a process without goes over UDP",
+            )
+        ]
+    return [ok("/dev/shm", f"{free / _MB:.0f} MiB are free")]
+
+
+def check_socket_buffers(seen: Surroundings) -> list[Finding]:
+    """Whether images can come from other hosts without loss."""
+    have = seen.receive_buffer_bytes
+    if have is None or local_only(seen.environment) or have >= _SOCKET_BYTES:
+        return []
+    return [
+        note(
+            "socket buffers",
+            f"net.core.rmem_max is {have / _MB:.1f} MiB",
+            expected=f"{_SOCKET_BYTES / _MB:.0f} MiB where large images come from other hosts",
+            do=f"`sysctl -w net.core.rmem_max={_SOCKET_BYTES}` on the receiving host",
+        )
+    ]
+
+
+SURROUNDINGS_CHECKS: tuple[Callable[[Surroundings], list[Finding]], ...] = (
+    check_python,
+    check_packages,
+    check_rclpy,
+    check_one_ros,
+    check_rmw,
+    check_domain,
+    check_discovery,
+    check_profile,
+    check_shared_memory,
+    check_socket_buffers,
+)

@@ -1,0 +1,120 @@
+"""Point clouds and triangle meshes as PLY and STL files.
+
+Lengths in these files are in a unit of the reader's choice, by default nm: mesh viewers take what is 1e-7 wide for
+nothing. A PLY says its unit in a comment; an STL cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.structure import SurfaceMesh
+from semcal_ros.files.atomic import atomic_write_bytes
+
+__all__ = ["MESH_SUFFIXES", "UNITS_PER_M", "mesh_bytes", "save_cloud", "save_mesh"]
+
+MESH_SUFFIXES = (".ply", ".stl")
+UNITS_PER_M: Mapping[str, float] = {"m": 1.0, "um": 1e6, "nm": 1e9}
+
+
+def save_mesh(path: str | Path, mesh: SurfaceMesh, *, unit: str = "nm") -> None:
+    """Write a mesh completely or not at all.
+
+    Parameters
+    ----------
+    path
+        ``.ply`` (binary, with normals and the 1-sigma of every vertex) or ``.stl`` (binary).
+    mesh
+        The triangles.
+    unit
+        ``m``, ``um`` or ``nm``.
+
+    Raises
+    ------
+    InvalidValueError
+        Another suffix or unit.
+    OSError
+        As :func:`~semcal_ros.files.atomic.atomic_write_bytes`.
+    """
+    target = Path(path)
+    atomic_write_bytes(target, mesh_bytes(mesh, target.suffix, unit=unit))
+
+
+def mesh_bytes(mesh: SurfaceMesh, suffix: str, *, unit: str = "nm") -> bytes:
+    """The contents of the file of :func:`save_mesh`."""
+    scale = _scale(unit)
+    if suffix.lower() not in MESH_SUFFIXES:
+        raise InvalidValueError(f"a mesh as '{suffix}'", expected=" or ".join(MESH_SUFFIXES))
+    made = trimesh.Trimesh(
+        vertices=mesh.vertices_m * scale,
+        faces=mesh.faces,
+        vertex_normals=mesh.normals,
+        process=False,
+    )
+    if suffix.lower() == ".stl":
+        return bytes(trimesh.exchange.stl.export_stl(made))
+    made.vertex_attributes["sigma"] = (mesh.sigma_m * scale).astype(np.float32)
+    return _with_unit(trimesh.exchange.ply.export_ply(made, vertex_normal=True), unit)
+
+
+def save_cloud(
+    path: str | Path,
+    points_m: ArrayLike,
+    columns: Mapping[str, ArrayLike] | None = None,
+    *,
+    unit: str = "nm",
+) -> None:
+    """Write points as a binary PLY, completely or not at all.
+
+    Parameters
+    ----------
+    path
+        ``.ply``.
+    points_m
+        (n, 3) m.
+    columns
+        (n,) further properties of the points by name, written as they are.
+    unit
+        ``m``, ``um`` or ``nm``, of the points.
+
+    Raises
+    ------
+    InvalidValueError
+        Another suffix or unit, or columns of another length.
+    """
+    target, scale = Path(path), _scale(unit)
+    if target.suffix.lower() != ".ply":
+        raise InvalidValueError(f"a cloud of points as '{target.suffix}'", expected=".ply")
+    points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3) * scale
+    table: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate("xyz")}
+    for name, values in (columns or {}).items():
+        table[name] = np.asarray(values, dtype=np.float64)
+        if table[name].shape != (len(points),):
+            raise InvalidValueError(
+                f"{name} of shape {table[name].shape}", expected=f"({len(points)},)"
+            )
+    rows = np.zeros(len(points), dtype=[(name, "<f4") for name in table])
+    for name, column in table.items():
+        rows[name] = column
+    header = ["ply", "format binary_little_endian 1.0", f"comment unit {unit}"]
+    header += [f"element vertex {len(points)}", *(f"property float {name}" for name in table)]
+    text = "\n".join([*header, "end_header", ""])
+    atomic_write_bytes(target, text.encode("ascii") + rows.tobytes())
+
+
+def _with_unit(data: bytes, unit: str) -> bytes:
+    first, _, rest = data.partition(b"\nelement ")
+    return first + f"\ncomment unit {unit}\nelement ".encode("ascii") + rest
+
+
+def _scale(unit: str) -> float:
+    if unit not in UNITS_PER_M:
+        raise InvalidValueError(f"unit '{unit}'", expected=", ".join(UNITS_PER_M))
+    return UNITS_PER_M[unit]

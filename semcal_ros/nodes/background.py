@@ -1,0 +1,70 @@
+"""Work beside the callbacks of a node, whose results come back between them."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from rclpy.node import Node
+
+__all__ = ["NewestWork"]
+
+Item = TypeVar("Item", bound=Any)
+Result = TypeVar("Result")
+
+
+class NewestWork(Generic[Item, Result]):
+    """Works on the newest of what was submitted; older ones that have not begun are left out.
+
+    Items are compared: the newer one is the greater one.
+
+    Parameters
+    ----------
+    node
+        The node whose executor runs ``on_result``.
+    work
+        Runs in a thread of its own; must not raise.
+    on_result
+        Called with each result, like any callback of the node.
+    """
+
+    def __init__(
+        self, node: Node, work: Callable[[Item], Result], on_result: Callable[[Result], None]
+    ) -> None:
+        self._work = work
+        self._on_result = on_result
+        self._lock = threading.Lock()
+        self._waiting: Item | None = None
+        self._results: deque[Result] = deque()
+        self._busy = False
+        self._guard = node.create_guard_condition(self._hand_over)
+
+    def submit(self, item: Item) -> None:
+        """Have it worked on unless something newer is waiting or comes before that begins."""
+        with self._lock:
+            self._waiting = item if self._waiting is None else max(self._waiting, item)
+            if self._busy:
+                return
+            self._busy = True
+        # Nobody waits for it at the end: it holds nothing that must be finished.
+        threading.Thread(target=self._run, name="background", daemon=True).start()
+
+    def _next(self) -> Item | None:
+        with self._lock:
+            item, self._waiting = self._waiting, None
+            self._busy = item is not None
+            return item
+
+    def _run(self) -> None:
+        while (item := self._next()) is not None:
+            self._results.append(self._work(item))
+            # The node may have ended meanwhile.
+            with contextlib.suppress(RuntimeError):
+                self._guard.trigger()
+
+    def _hand_over(self) -> None:
+        while self._results:
+            self._on_result(self._results.popleft())

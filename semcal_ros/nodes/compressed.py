@@ -1,0 +1,130 @@
+"""The same images once more, compressed, on the topic and with the parameters of image_transport's `compressed`.
+
+Names: https://github.com/ros-perception/image_transport_plugins, compressed_publisher.cpp. There, a node in a namespace
+gets them with a dot in front (`.image_rect.compressed.format`), which newer releases correct (pull request 188); here
+they have none.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+from sensor_msgs.msg import CompressedImage
+
+from semcal_ros.bridge.compressed import CODECS, fill_compressed
+from semcal_ros.nodes.background import NewestWork
+from semcal_ros.nodes.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.settings import Setting
+from semcal_ros.nodes.stream import Frame
+
+__all__ = ["CompressedOutput", "compressed_settings"]
+
+
+def compressed_settings(topic: str) -> tuple[Setting, ...]:
+    """Parameters of the compressed images of ``topic``, for a node to declare."""
+    return (
+        Setting(
+            f"{topic}.compressed.format",
+            "png",
+            "How to compress. png is exact; jpeg is smaller and faster, and for 8 bit only.",
+            choices=tuple(CODECS),
+        ),
+        Setting(f"{topic}.compressed.jpeg_quality", 95, "Quality of jpeg.", low=1, high=100),
+        Setting(
+            f"{topic}.compressed.png_level",
+            3,
+            "0 stores the pixels, which is fast; 1 to 9 compress, all alike for noisy frames.",
+            low=0,
+            high=9,
+        ),
+    )
+
+
+@dataclass(frozen=True, order=True)
+class _Job:
+    """An image of its own, and how to compress it; jobs are compared by their numbers."""
+
+    number: int
+    image: NDArray[Any] = field(compare=False)
+    encoding: str = field(compare=False)
+    header: Any = field(compare=False)
+    codec: str = field(compare=False)
+    options: dict[str, int] = field(compare=False)
+
+
+class _Done(NamedTuple):
+    number: int
+    error: Exception | None = None
+
+
+class CompressedOutput:
+    """Publishes ``<topic>/compressed`` while somebody subscribes to it.
+
+    A thread of its own compresses, so that the images themselves do not wait; it takes the newest image and skips those
+    that came in between. Of the node, the thread touches nothing but the publisher, which may be used from any thread;
+    what there is to count or to complain about comes back to the executor.
+
+    Parameters
+    ----------
+    node
+        A node that declares :func:`compressed_settings` of the topic, and calls :meth:`close` before it is destroyed.
+    topic
+        Topic of the images as they are.
+    """
+
+    def __init__(self, node: SemNode, topic: str) -> None:
+        self._node = node
+        self._topic = f"{topic}/compressed"
+        self._prefix = f"{topic}.compressed"
+        self._publisher = node.stream_publisher(CompressedImage, self._topic)
+        self._in_hand = threading.Lock()
+        self._ended = False
+        self._submitted = 0
+        self._done = 0
+        self._work = NewestWork[_Job, _Done](node, self._compress, self._report)
+
+    def publish(self, image: NDArray[Any], frame: Frame) -> None:
+        """Have an image compressed that was made from ``frame``; its memory may be used again afterwards."""
+        if self._publisher.get_subscription_count() == 0:
+            return
+        self._submitted += 1
+        codec = self._setting("format")
+        options = {name: self._setting(name) for name in ("jpeg_quality", "png_level")}
+        self._work.submit(
+            _Job(self._submitted, image.copy(), frame.encoding, frame.header, codec, options)
+        )
+
+    def _setting(self, name: str) -> Any:
+        return self._node.settings[f"{self._prefix}.{name}"]
+
+    def close(self) -> None:
+        """Wait for the image in hand; no further one goes out."""
+        with self._in_hand:
+            self._ended = True
+
+    def _compress(self, job: _Job) -> _Done:
+        with self._in_hand:
+            if self._ended:
+                return _Done(job.number)
+            try:
+                message = CompressedImage()
+                fill_compressed(
+                    message, job.image, job.encoding, job.header, job.codec, **job.options
+                )
+                self._publisher.publish(message)
+            except Exception as error:
+                return _Done(job.number, error)
+        return _Done(job.number)
+
+    def _report(self, done: _Done) -> None:
+        self._done += 1
+        self._node.statistics.note(f"compressed.{self._topic}", self._done)
+        self._node.statistics.note(f"skipped.{self._topic}", done.number - self._done)
+        if done.error is None:
+            return
+        if not isinstance(done.error, NODE_ERRORS):
+            raise done.error
+        self._node.reject(done.error)

@@ -1,0 +1,163 @@
+"""Rectified frames with their camera and drift, as visual servoing takes them in."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64MultiArray
+
+from semcal_ros.bridge import (
+    image_from_message,
+    projection_from_message,
+    stamp_ns_from_msg,
+    to_gray,
+)
+from semcal_ros.nodes.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.qos import image_input, stream_output, value_input
+from semcal_ros.nodes.subscription import MessageInfo
+
+__all__ = ["ServoFrame", "ServoInput"]
+
+# Frames that wait for what belongs to them; projections of so many magnifications.
+_WAITING, _PROJECTIONS = 16, 16
+
+
+@dataclass(frozen=True)
+class ServoFrame:
+    """One rectified frame.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels.
+    k
+        (3, 3) K of its camera_info; zero without a camera.
+    drift_m
+        (2,) what was taken out of it.
+    projections
+        (3, 4) latest P_g, the oldest first.
+    header, stamp_ns
+        Its header.
+    """
+
+    image: NDArray[Any]
+    k: NDArray[np.float64]
+    drift_m: NDArray[np.float64]
+    projections: tuple[NDArray[np.float64], ...]
+    header: Any
+    stamp_ns: int
+
+
+class ServoInput:
+    """Subscribes to ``image_rect``, ``camera_info``, ``drift`` and ``projection``; pairs the first three by stamp.
+
+    The newest complete frame counts; older ones are dropped.
+
+    Parameters
+    ----------
+    node
+        The node.
+    on_frame
+        Called with each frame; what it raises of :data:`NODE_ERRORS` is counted, and then ``on_error`` called.
+    on_error
+        Called with the reason why a frame cannot be used.
+    with_drift
+        Whether a frame needs a drift; without, nothing was taken out of it.
+    """
+
+    def __init__(
+        self,
+        node: SemNode,
+        on_frame: Callable[[ServoFrame], None],
+        on_error: Callable[[str], None],
+        *,
+        with_drift: bool,
+    ) -> None:
+        self._node = node
+        self._on_frame = on_frame
+        self._on_error = on_error
+        self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
+        self._projections: deque[NDArray[np.float64]] = deque(maxlen=_PROJECTIONS)
+        self._draining = False
+        node.listen(Float64MultiArray, "projection", self._on_projection, value_input())
+        self._inputs = [
+            node.listen(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
+            node.listen(Image, "image_rect", self._keeps("image"), image_input()),
+        ]
+        if with_drift:
+            self._parts["drift"] = {}
+            drift = self._keeps("drift")
+            kind = PoseWithCovarianceStamped
+            self._inputs.append(node.listen(kind, "drift", drift, stream_output()))
+
+    def _on_projection(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            self._projections.append(projection_from_message(message))
+        except NODE_ERRORS as error:
+            self._node.reject(error)
+
+    def _keeps(self, part: str) -> Callable[[Any, MessageInfo], None]:
+        def keep(message: Any, _info: MessageInfo) -> None:
+            if part == "image":
+                self._node.statistics.receive(time.monotonic())
+            try:
+                self._insert(part, stamp_ns_from_msg(message), message)
+            except NODE_ERRORS as error:
+                self._node.reject(error)
+                self._on_error(" ".join(str(error).split()))
+            if not self._draining:
+                self._drain()
+
+        return keep
+
+    def _insert(self, part: str, stamp_ns: int, message: Any) -> None:
+        waiting = self._parts[part]
+        waiting[stamp_ns] = message
+        # In the order of arrival: stamps go back where a clock does.
+        while len(waiting) > _WAITING:
+            del waiting[next(iter(waiting))]
+
+    def _drain(self) -> None:
+        """Take in all that has come, then work on the newest frame that has all its parts."""
+        self._draining = True
+        try:
+            for subscription in self._inputs:
+                subscription.take_waiting()
+        finally:
+            self._draining = False
+        complete = set.intersection(*(set(part) for part in self._parts.values()))
+        if not complete:
+            return
+        newest = [stamp for stamp in self._parts["image"] if stamp in complete][-1]
+        parts = {name: waiting[newest] for name, waiting in self._parts.items()}
+        self._node.statistics.drop(list(self._parts["image"]).index(newest))
+        for waiting in self._parts.values():
+            for stamp in list(waiting)[: list(waiting).index(newest) + 1]:
+                del waiting[stamp]
+        self._work(newest, parts)
+
+    def _work(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        started_s = time.monotonic()
+        try:
+            image = parts["image"]
+            grey = to_gray(image_from_message(image), image.encoding)
+            drift_m = np.zeros(2)
+            if "drift" in parts:
+                place = parts["drift"].pose.pose.position
+                drift_m = np.array([place.x, place.y])
+            k = np.array(parts["info"].k, dtype=np.float64).reshape(3, 3)
+            self._on_frame(
+                ServoFrame(grey, k, drift_m, tuple(self._projections), image.header, stamp_ns)
+            )
+        except NODE_ERRORS as error:
+            self._node.reject(error)
+            self._on_error(" ".join(str(error).split()))
+        self._node.statistics.note("processing_ms", 1e3 * (time.monotonic() - started_s))

@@ -1,0 +1,74 @@
+"""What visual servoing publishes: the velocity of the stage, and how far the target is from its goal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from numpy.typing import NDArray
+from rclpy.duration import Duration
+
+from semcal_ros.bridge import copy_header
+from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
+from semcal_ros.core.servoing import ServoStep
+from semcal_ros.nodes.base import SemNode
+
+__all__ = ["ErrorOutput", "StageOutput"]
+
+_LAST_WORD_S = 1.0
+
+
+class StageOutput:
+    """Publishes velocities of the stage, and sees to it that the last one is zero.
+
+    Parameters
+    ----------
+    node, topic
+        Where.
+    """
+
+    def __init__(self, node: SemNode, topic: str) -> None:
+        self._publisher = node.stream_publisher(Twist, topic)
+        self.twist = np.zeros(3)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the last velocity was not zero."""
+        return bool(np.any(self.twist))
+
+    def send(self, twist: NDArray[np.float64]) -> None:
+        """Publish (3,): x, y in m/s, rotation in rad/s."""
+        message = Twist()
+        message.linear.x, message.linear.y, message.angular.z = (float(v) for v in twist)
+        self._publisher.publish(message)
+        self.twist = np.array(twist)
+
+    def close(self) -> None:
+        """Stop the stage and wait until it has been told."""
+        self.send(np.zeros(3))
+        self._publisher.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
+
+
+class ErrorOutput:
+    """Publishes ``~/error``: target minus goal, in the sem frame, at the centre of a frame."""
+
+    def __init__(self, node: SemNode) -> None:
+        self._publisher = node.stream_publisher(PoseWithCovarianceStamped, "~/error")
+
+    def publish(self, step: ServoStep, header: Any) -> None:
+        """Publish what was measured; nothing where nothing was."""
+        if not np.all(np.isfinite(step.error_covariance)):
+            return
+        message = PoseWithCovarianceStamped()
+        copy_header(message.header, header)
+        pose = message.pose.pose
+        x, y, turn = (float(v) for v in step.error)
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = math.sin(0.5 * turn), math.cos(0.5 * turn)
+        full = np.diag(np.full(6, UNKNOWN_VARIANCE))
+        known = np.ix_((0, 1, 5), (0, 1, 5))
+        full[known] = step.error_covariance
+        message.pose.covariance = full.reshape(-1).tolist()
+        self._publisher.publish(message)

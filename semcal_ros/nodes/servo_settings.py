@@ -1,0 +1,122 @@
+"""Parameters of ``visual_servo``."""
+
+from __future__ import annotations
+
+import math
+
+from semcal_ros.core.servoing import PlanePose, ServoSettings
+from semcal_ros.nodes.settings import Setting, Settings
+
+__all__ = ["SERVO_SETTINGS", "goal_of", "servo_settings_of"]
+
+_GOAL = (
+    Setting("goal_x_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3),
+    Setting("goal_y_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3),
+    Setting("goal_rotation_deg", 0.0, "And how it shall be turned.", "degrees", -180.0, 180.0),
+)
+_LAW = (
+    Setting("gain", 1.0, "Part of the error that is taken away per second.", "1/s", 0.001, 100.0),
+    Setting("speed_limit_um_s", 50.0, "Largest speed of the stage.", "um/s", 1e-3, 1e4),
+    Setting("turn_limit_deg_s", 5.0, "Largest speed of its rotation.", "degrees/s", 1e-3, 360.0),
+    Setting(
+        "travel_limit_px",
+        12.0,
+        "How far a marker may move from one frame to the next: that blurs it.",
+        "px",
+        0.1,
+        1e4,
+    ),
+    Setting("tolerance_px", 0.5, "Converged is what is nearer to the goal.", "px", 0.01, 100.0),
+    Setting(
+        "scale_tolerance",
+        0.05,
+        "The target must be as large as the camera of the frame says, to this fraction.",
+        low=0.001,
+        high=0.5,
+    ),
+    Setting(
+        "axis_sigma_px",
+        15.0,
+        "How well the calibration knows where the optical axis is seen (1-sigma); what changes of the magnification"
+        " tell of that corrects it. 0: it is not corrected.",
+        "px",
+        0.0,
+        1e4,
+        fixed=True,
+    ),
+    Setting("feed_forward", True, "Command away the drift that remains beside the commands."),
+)
+_STAGE = (
+    Setting("start", False, "Begin at once, without ~/start.", fixed=True),
+    Setting("stage", "virtual_sem/stage", "Topic of the stage's velocity.", fixed=True),
+    Setting(
+        "goal_frame",
+        "instrument",
+        "instrument: the goal is a place under the beam; what was removed from the picture as drift is added again."
+        " specimen: the goal is a place in the drift-free picture, for an actuator that moves the target over it.",
+        choices=("instrument", "specimen"),
+        fixed=True,
+    ),
+    Setting(
+        "with_drift",
+        True,
+        "Whether a drift comes with each image, as from stream_corrector; false for images of rectifier.",
+        fixed=True,
+    ),
+    Setting(
+        "reset_service",
+        "stream_corrector/reset",
+        "Called when the corrected picture has moved too far from what is in view; empty: never.",
+        fixed=True,
+    ),
+    Setting(
+        "reset_beyond",
+        0.15,
+        "That is, when the drift is more than this fraction of the width.",
+        low=0.01,
+        high=1.0,
+    ),
+    Setting(
+        "target_cell_m", 180e-6, "Side of a cell of the largest board.", "m", 1e-9, 1.0, fixed=True
+    ),
+    Setting("height_m", 0.0, "Height of the target along the beam.", "m", -1e-3, 1e-3),
+    Setting(
+        "rotation_centre_x_m",
+        0.0,
+        "Where the axis of the stage's rotation meets the target, in its own frame.",
+        "m",
+        -1.0,
+        1.0,
+        fixed=True,
+    ),
+    Setting(
+        "rotation_centre_y_m",
+        0.0,
+        "Where the axis of the stage's rotation meets the target, in its own frame.",
+        "m",
+        -1.0,
+        1.0,
+        fixed=True,
+    ),
+)
+SERVO_SETTINGS = (*_GOAL, *_LAW, *_STAGE)
+
+
+def goal_of(settings: Settings) -> PlanePose:
+    """The goal as the parameters have it."""
+    angle_rad = math.radians(settings["goal_rotation_deg"])
+    return PlanePose(settings["goal_x_m"], settings["goal_y_m"], angle_rad)
+
+
+def servo_settings_of(settings: Settings) -> ServoSettings:
+    """The control law as the parameters have it."""
+    return ServoSettings(
+        gain_hz=settings["gain"],
+        speed_limit_m_s=1e-6 * settings["speed_limit_um_s"],
+        turn_limit_rad_s=math.radians(settings["turn_limit_deg_s"]),
+        travel_limit_px=settings["travel_limit_px"],
+        tolerance_px=settings["tolerance_px"],
+        scale_tolerance=settings["scale_tolerance"],
+        axis_sigma_px=settings["axis_sigma_px"],
+        feed_forward=settings["feed_forward"],
+    )

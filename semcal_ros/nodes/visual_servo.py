@@ -1,0 +1,241 @@
+"""Executable ``visual_servo``: brings a target on the stage to a pose in the sem frame, at whatever magnification."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from std_srvs.srv import Trigger
+
+from semcal_ros.bridge import MagnificationReading
+from semcal_ros.core.servoing import (
+    NestedTarget,
+    PlaneCamera,
+    Servo,
+    ServoStep,
+    find_target,
+    projection_of_frame,
+)
+from semcal_ros.nodes.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.magnification import MagnificationInput
+from semcal_ros.nodes.orderly_end import OrderlyEnd
+from semcal_ros.nodes.run import run_node
+from semcal_ros.nodes.services import trigger_service
+from semcal_ros.nodes.servo_input import ServoFrame, ServoInput
+from semcal_ros.nodes.servo_output import ErrorOutput, StageOutput
+from semcal_ros.nodes.servo_settings import SERVO_SETTINGS, goal_of, servo_settings_of
+
+__all__ = ["VisualServo", "main"]
+
+_TICK_S = 0.1
+# Without a frame for so many intervals, and at least so long, the stage stops.
+_SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
+# Stamps that are further away than this are of another clock.
+_OTHER_CLOCK_S = 30.0
+# A target that is not found may lie outside of the picture for a drift of this part of its width.
+_HIDDEN = 0.03
+_RESET_AGAIN_S = 2.0
+
+
+class VisualServo(SemNode):
+    """Takes rectified images with their camera and drift, and publishes velocities of the stage.
+
+    The stage stands still unless every one of these holds: ``~/start`` was called; frames come; the frame has a
+    camera; the target is found in it and has the size which that camera says; the magnification has not changed
+    since; the picture follows the stage.
+    """
+
+    def __init__(self) -> None:
+        # The middleware may end a node that is still being made.
+        self._stage: StageOutput | None = None
+        super().__init__("visual_servo", SERVO_SETTINGS)
+        self._end = OrderlyEnd()
+        values = self.settings
+        self._target = NestedTarget(values["target_cell_m"])
+        centre = values["rotation_centre_x_m"], values["rotation_centre_y_m"]
+        self._servo = Servo(goal_of(values), servo_settings_of(values), centre)
+        for setting in SERVO_SETTINGS:
+            if not setting.fixed:
+                values.on_change(setting.name, self._apply)
+        self._active = bool(values["start"])
+        self._state = "" if self._active else "waiting for ~/start"
+        self._last: tuple[int, float] | None = None
+        self._interval_s = 0.0
+        self._magnification_value: float | None = None
+        self._resets = 0
+        self._reset_s = -_RESET_AGAIN_S
+        self._stage = StageOutput(self, values["stage"])
+        self._errors = ErrorOutput(self)
+        self._reset = None
+        if values["reset_service"] and values["goal_frame"] == "instrument":
+            self._reset = self.create_client(Trigger, values["reset_service"])
+        self._magnification = MagnificationInput(self, self._on_magnification)
+        self._input = ServoInput(
+            self, self._on_frame, self._halt, with_drift=bool(values["with_drift"])
+        )
+        self._triggers = [
+            trigger_service(self, "~/start", self._on_start),
+            trigger_service(self, "~/stop", self._on_stop),
+        ]
+        # A simulated clock may stand still; the stage must not go on for that.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._watchdog = self.create_timer(_TICK_S, self._watch, clock=steady)
+
+    def destroy_node(self) -> None:
+        """As in the base class, after the stage was told to stop."""
+        if self._stage is not None and self.context.ok():
+            self._stage.close()
+        super().destroy_node()
+
+    # -- control -----------------------------------------------------------------------------------
+
+    def _apply(self, _value: Any) -> None:
+        self._servo.goal = goal_of(self.settings)
+        self._servo.settings = servo_settings_of(self.settings)
+
+    def _on_start(self) -> str:
+        self._servo.restart()
+        self._last = None
+        self._active, self._state = True, "waiting for frames"
+        return "the stage is servoed"
+
+    def _on_stop(self) -> str:
+        self._active = False
+        self._halt("waiting for ~/start")
+        return "the stage stands still"
+
+    def _on_magnification(self, reading: MagnificationReading) -> None:
+        """The frame that is being scanned shows two magnifications and will not come."""
+        before, self._magnification_value = self._magnification_value, reading.value
+        if before is not None and before != reading.value:
+            self._halt("the magnification has changed")
+
+    def _watch(self) -> None:
+        self._end.follow()
+        if self._last is None or self._stage is None or not self._stage.is_moving:
+            return
+        silent_s = time.monotonic() - self._last[1]
+        if silent_s > max(_SILENCE * self._interval_s, _SHORTEST_SILENCE_S):
+            self._halt("no frames")
+            self._last = None
+
+    def _halt(self, reason: str) -> None:
+        """Stop the stage."""
+        self._send(np.zeros(3))
+        self._servo.stopped(reason)
+        self._tell(reason)
+
+    def _send(self, twist: np.ndarray[Any, Any]) -> None:
+        if self._stage is None:
+            return
+        self._stage.send(twist)
+        self._servo.sent(self._now_s(), twist)
+        self.statistics.note("servo_speed_m_s", float(np.hypot(twist[0], twist[1])))
+
+    def _tell(self, state: str) -> None:
+        self._state = state
+        self.statistics.note("servo_state", state)
+
+    # -- frames ------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _times(self, stamp_ns: int) -> tuple[float, float | None]:
+        """Centre of a frame's acquisition, and now; None where the stamp is of another clock."""
+        scan = self.config.scan
+        centre_offset_s = 0.0 if scan is None else scan.centre_offset_s
+        now_s = self._now_s()
+        time_s = stamp_ns * 1e-9 + self.config.start_offset_s + centre_offset_s
+        if 0.0 <= now_s - time_s < _OTHER_CLOCK_S:
+            return time_s, now_s
+        # As if the frame had arrived as soon as it was complete.
+        return now_s - centre_offset_s, None
+
+    def _on_frame(self, frame: ServoFrame) -> None:
+        before, self._last = self._last, (frame.stamp_ns, time.monotonic())
+        step = self._step_of(frame, before)
+        self._keep_in_view(frame, step)
+        moves = self._active and not step.reason
+        self._send(step.twist if moves else np.zeros(3))
+        self._errors.publish(step, frame.header)
+        self._note(step)
+        if self._active:
+            self._tell(step.reason or ("converged" if step.converged else "servoing"))
+        self.count_published(frame.stamp_ns)
+
+    def _step_of(self, frame: ServoFrame, before: tuple[int, float] | None) -> ServoStep:
+        if before is None or frame.stamp_ns <= before[0]:
+            return self._servo.stopped("waiting for a second frame")
+        self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
+        try:
+            projection = projection_of_frame(frame.k, frame.projections)
+            camera = PlaneCamera.from_projection(projection, self.settings["height_m"])
+        except NODE_ERRORS as error:
+            self.warn_seldom(str(error))
+            return self._servo.stopped(" ".join(str(error).split()))
+        view = find_target(frame.image, self._target)
+        time_s, now_s = self._times(frame.stamp_ns)
+        in_instrument = self.settings["goal_frame"] == "instrument"
+        return self._servo.update(
+            view,
+            camera,
+            time_s,
+            interval_s=self._interval_s,
+            now_s=now_s,
+            shift_m=frame.drift_m if in_instrument else np.zeros(2),
+        )
+
+    def _keep_in_view(self, frame: ServoFrame, step: ServoStep) -> None:
+        """Let the corrector begin anew where its picture, which it holds in place, has left the field."""
+        if self._reset is None or not frame.projections or not self._reset.service_is_ready():
+            return
+        px_per_m = float(np.linalg.norm(frame.projections[-1][:2, :2], 2))
+        moved = px_per_m * float(np.hypot(*frame.drift_m)) / frame.image.shape[1]
+        lost = step.fit is None or not step.fit.view.accepted
+        now_s = time.monotonic()
+        if moved <= (_HIDDEN if lost else self.settings["reset_beyond"]):
+            return
+        if now_s - self._reset_s < _RESET_AGAIN_S * (not lost) + 2.0 * self._interval_s:
+            return
+        self._reset_s = now_s
+        self._resets += 1
+        self._reset.call_async(Trigger.Request())
+
+    # -- diagnostics -------------------------------------------------------------------------------
+
+    def _note(self, step: ServoStep) -> None:
+        note = self.statistics.note
+        note("servo_error_px", step.error_px)
+        note("servo_error_m", step.error_m)
+        note("servo_sigma_px", step.sigma_px)
+        note("servo_sigma_m", step.sigma_m)
+        note("servo_markers", 0 if step.fit is None else len(step.fit.view.ids))
+        note("servo_gain", step.gain_hz)
+        note("servo_limited", step.limited or "no")
+        note("servo_axis_px", "{:.2f}, {:.2f}".format(*step.axis_px))
+        note("servo_axis_sigma_px", step.axis_sigma_px)
+        note("servo_drift_m_s", float(np.hypot(*step.drift_m_s)))
+        note("servo_resets", self._resets)
+
+    def conditions(self) -> list[str]:
+        """As in the base class; also why the stage stands still."""
+        standing = self._active and self._state not in ("servoing", "converged")
+        return super().conditions() + [self._state] * standing
+
+    def idle(self) -> bool:
+        """It has no stream of its own before it is started."""
+        return not self._active
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(VisualServo, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,99 @@
+"""Picture of a reconstructed ball: cloud, mesh, distances from the sphere."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LightSource
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+from PIL import Image  # matplotlib writes its PNG files with it
+
+from semcal_ros.core.structure import Ball, Structure
+from semcal_ros.report.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
+
+__all__ = ["ball_figure", "ball_picture", "small_png"]
+
+Array = NDArray[np.float64]
+
+_NM = 1e9
+_COLORS = 96
+
+
+def ball_picture(structure: Structure, ball: Ball) -> bytes:
+    """The figure as a PNG file."""
+    return small_png(ball_figure(structure, ball))
+
+
+def small_png(figure: Figure, dpi: float = 110.0) -> bytes:
+    """A figure as PNG with few colours, which line drawings do not need."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=dpi)
+    with Image.open(drawn) as image:
+        few = image.convert("RGB").quantize(
+            _COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+        )
+    small = io.BytesIO()
+    few.save(small, format="png", optimize=True)
+    return small.getvalue()
+
+
+def ball_figure(structure: Structure, ball: Ball) -> Figure:
+    """Cloud and mesh as seen obliquely from the gun, and the points' distances from the sphere."""
+    figure = new_figure(9.6, 3.4)
+    on_ball = ball.sphere.inliers
+    centre = ball.sphere.centre_m
+    points = _upright(structure.points_m - centre)
+    near = np.linalg.norm(points, axis=1) < 2.0 * _NM * ball.sphere.radius_m
+    cloud = figure.add_subplot(1, 3, 1, projection="3d")
+    cloud.scatter(*points[on_ball].T, s=3, c=OURS, label="on the ball")
+    other = near & ~on_ball
+    if other.any():
+        cloud.scatter(*points[other].T, s=3, c=SECOND, label="not on it")
+    cloud.set_title(f"{np.count_nonzero(on_ball)} points", fontsize=9, color=INK)
+    legend(cloud, loc="lower left")
+    surface = figure.add_subplot(1, 3, 2, projection="3d")
+    vertices = _upright(ball.mesh.vertices_m - centre)
+    triangles = Poly3DCollection(
+        vertices[ball.mesh.faces],
+        facecolors="#9cc4e4",
+        edgecolors=MUTED,
+        linewidths=0.25,
+        shade=True,
+        lightsource=LightSource(azdeg=225, altdeg=50),
+    )
+    surface.add_collection3d(triangles)
+    surface.set_title(
+        f"mesh: {len(vertices)} vertices, {len(ball.mesh.faces)} faces", fontsize=9, color=INK
+    )
+    reach = 1.05 * _NM * ball.sphere.radius_m
+    for axes in (cloud, surface):
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
+        axes.set_box_aspect((1, 1, 1))
+        axes.view_init(elev=48, azim=-70)
+        axes.tick_params(labelsize=6, colors=MUTED)
+        axes.set_xlabel("X (nm)", fontsize=7)
+        axes.set_ylabel("-Y (nm)", fontsize=7)
+        axes.set_zlabel("-Z, to the gun (nm)", fontsize=7)
+    _distances(figure.add_subplot(1, 3, 3), ball)
+    return figure
+
+
+def _upright(points_m: Array) -> Array:
+    """nm, with y and z turned so that the gun is above."""
+    return np.asarray(points_m * np.array([1.0, -1.0, -1.0]) * _NM, dtype=np.float64)
+
+
+def _distances(axes: Axes, ball: Ball) -> None:
+    distance = _NM * ball.sphere.residuals_m[ball.sphere.inliers]
+    axes.hist(distance, bins=31, color=OURS)
+    tidy(axes, xlabel="distance from the sphere (nm)", ylabel="points")
+    low, high = (_NM * value for value in ball.interval_m)
+    axes.set_title(
+        f"diameter {_NM * ball.diameter_m:.1f} nm (95 %: {low:.1f} to {high:.1f})",
+        fontsize=9,
+        color=INK,
+    )

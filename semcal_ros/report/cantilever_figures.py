@@ -1,0 +1,156 @@
+"""Figures of a bending experiment: deflections by pose and magnification, and annotated frames."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from PIL import Image  # matplotlib writes its PNG files with it
+
+from semcal_ros.core.cantilever import Repeatability, Series
+from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.report.style import (
+    ACCENT,
+    INK,
+    MUTED,
+    OURS,
+    REFERENCE,
+    SECOND,
+    legend,
+    new_figure,
+    tidy,
+)
+
+__all__ = ["poses_figure", "strip_figure", "write_poses_figure", "write_strip_figure"]
+
+_DPI = 90.0
+_COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
+_MARKS = "osD^vX"
+_SHOWN_POSES = 3
+_COLOURS = 128
+# Frames are shown smaller than they are: noise averages out, and the file is smaller.
+_SHOWN_PX = 128
+
+
+def write_poses_figure(agreed: Repeatability, file: Path) -> None:
+    """Write :func:`poses_figure` completely or not at all; OSError if that fails."""
+    _write(poses_figure(agreed), file)
+
+
+def write_strip_figure(
+    images: Sequence[Sequence[NDArray[Any]]],
+    series: Sequence[Series],
+    firsts: Sequence[int],
+    file: Path,
+) -> None:
+    """Write :func:`strip_figure` completely or not at all; OSError if that fails."""
+    _write(strip_figure(images, series, firsts), file)
+
+
+def _write(figure: Figure, file: Path) -> None:
+    kind = file.suffix.lower().removeprefix(".")
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=kind, dpi=_DPI)
+    if kind == "png":
+        # Fewer colours make a file with noisy frames several times smaller.
+        with Image.open(drawn) as image:
+            # The few pixels of a line must keep their colour among many grey ones.
+            widest = Image.Quantize.MAXCOVERAGE
+            few = image.convert("RGB").quantize(_COLOURS, widest, dither=Image.Dither.NONE)
+        drawn = io.BytesIO()
+        few.save(drawn, format="png", optimize=True)
+    atomic_write_bytes(file, drawn.getvalue())
+
+
+def poses_figure(agreed: Repeatability) -> Figure:
+    """Deflection of each pose at each magnification with 95 % bars; deviations from their mean."""
+    figure = new_figure(7.2, 5.6)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
+    pose = np.arange(1, agreed.deflection_m.shape[1] + 1)
+    tidy(upper, xlabel="", ylabel="deflection of the end (nm)")
+    tidy(lower, xlabel="pose", ylabel="from the mean (nm)")
+    mean = np.nanmean(agreed.deflection_m, axis=0)
+    count = len(agreed.magnifications)
+    for row, g in enumerate(agreed.magnifications):
+        color, mark = _COLORS[row % len(_COLORS)], _MARKS[row % len(_MARKS)]
+        beside = pose + 0.12 * (row - 0.5 * (count - 1))
+        for axes, values in (
+            (upper, agreed.deflection_m[row]),
+            (lower, agreed.deflection_m[row] - mean),
+        ):
+            axes.errorbar(
+                beside,
+                1e9 * values,
+                yerr=1.96e9 * agreed.sigma_m[row],
+                fmt=mark,
+                color=color,
+                markersize=4,
+                linewidth=1.0,
+                capsize=2,
+                label=f"{g:g}×",
+            )
+    if count > 1:
+        text = f"spread {1e9 * agreed.rms_spread_m:.2f} nm (RMS over poses 2 to {len(pose)})"
+        lower.set_title(text, fontsize=9, color=INK, loc="left")
+    lower.xaxis.set_major_locator(MaxNLocator(integer=True))
+    lower.axhline(0.0, color=MUTED, linewidth=0.7)
+    legend(upper, loc="upper left")
+    return figure
+
+
+def strip_figure(
+    images: Sequence[Sequence[NDArray[Any]]], series: Sequence[Series], firsts: Sequence[int]
+) -> Figure:
+    """The first, the most bent and the last pose at each magnification, with the centre line.
+
+    Parameters
+    ----------
+    images
+        Frames of each series.
+    series
+        What was measured.
+    firsts
+        First frame of each pose.
+    """
+    bent = [abs(series[0].frames[k].deflection_m) for k in firsts]
+    most = int(np.nanargmax(bent)) if np.isfinite(bent).any() else 0
+    poses = sorted({0, most, len(firsts) - 1})[:_SHOWN_POSES]
+    figure = new_figure(2.1 * len(poses), 2.2 * len(series))
+    grid = figure.subplots(len(series), len(poses), squeeze=False)
+    for row, (pictures, one) in enumerate(zip(images, series, strict=True)):
+        for column, pose in enumerate(poses):
+            _frame(grid[row, column], pictures[firsts[pose]], one, firsts[pose], pose)
+    return figure
+
+
+def _frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) -> None:
+    found = one.frames[frame]
+    step = max(1, round(image.shape[1] / _SHOWN_PX))
+    rows, cols = (n // step * step for n in image.shape)
+    cut = image[:rows, :cols].reshape(rows // step, step, cols // step, step)
+    low, high = np.quantile(image[::4, ::4], (0.005, 0.995))
+    axes.imshow(
+        cut.mean(axis=(1, 3)),
+        cmap="gray",
+        vmin=low,
+        vmax=max(high, low + 1),
+        extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
+    )
+    axes.plot(*found.line_px.T, color="#ff9000", linewidth=1.2)
+    inside = (0 <= found.tip_px[0] < cols) and (0 <= found.tip_px[1] < rows)
+    if inside:
+        axes.plot(*found.tip_px, "o", markersize=6, markerfacecolor="none", color="#ff3010")
+    axes.set_xlim(-0.5, cols - 0.5)
+    axes.set_ylim(rows - 0.5, -0.5)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    nm, sigma = 1e9 * found.deflection_m, 1e9 * found.sigma_m
+    title = f"{one.magnification:g}×, pose {pose + 1}: {nm:.1f} ± {sigma:.1f} nm"
+    axes.set_title(title, fontsize=7, color=INK)

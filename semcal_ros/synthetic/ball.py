@@ -1,0 +1,314 @@
+"""A textured ball on a tip that turns while it is recorded, with its truth.
+
+Every sample of a frame is a ray of the true camera, distortion included, that meets the ball or the tip where they are
+when its line is scanned. The yield grows with the slope as that of secondary electrons does, so the limb is bright and
+the shading stays while the texture turns with the ball.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.poses import rotations_from_vectors
+from semcal_ros.core.raster import ScanTiming
+from semcal_ros.synthetic.ball_body import BallOnTip
+from semcal_ros.synthetic.detector import Detector
+from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
+from semcal_ros.synthetic.microscope import VirtualMicroscope
+from semcal_ros.synthetic.presets import preset
+from semcal_ros.synthetic.raylattice import RayLattice, ray_lattice
+from semcal_ros.synthetic.truth import parameters_of
+
+__all__ = [
+    "BALL_TRUTH_SCHEMA",
+    "BallFrame",
+    "BallOnTip",
+    "BallPlan",
+    "Turning",
+    "ball_microscope",
+    "ball_plan",
+]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
+
+_SAMPLES = 2
+_MARGIN_M = 20e-9  # by which perspective moves the outline at the end of the tip, and more
+_STEEPEST = 0.08  # cosine below which the yield grows no more: the exit depth is not zero
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How the manipulator moves the ball.
+
+    Parameters
+    ----------
+    duration_s
+        Of one round of the whole movement.
+    roll_rad, yaw_rad
+        Amplitudes of the turn about the tip's axis and about y.
+    rolls, yaws
+        Periods of them in one round; of different number, so that directions fill an area.
+    travel_m
+        Amplitude of the remaining shift, x, y and z.
+    centre_m
+        (3,) mean place of the ball in the sem frame.
+    """
+
+    duration_s: float
+    roll_rad: float = math.radians(35.0)
+    yaw_rad: float = math.radians(15.0)
+    rolls: float = 2.0
+    yaws: float = 3.0
+    travel_m: tuple[float, float, float] = (0.25e-6, 0.12e-6, 0.4e-6)
+    centre_m: tuple[float, float, float] = (3.4e-6, 0.0, 8e-6)
+
+    def pose_at(self, time_s: Array) -> tuple[Array, Array]:
+        """(n, 3, 3) sem_from_body and (n, 3) places in m at times (n,)."""
+        turn = 2.0 * np.pi * np.asarray(time_s, dtype=np.float64) / self.duration_s
+        zero = np.zeros_like(turn)
+        roll = self.roll_rad * np.sin(self.rolls * turn)
+        yaw = self.yaw_rad * np.sin(self.yaws * turn + 0.7)
+        about_x = rotations_from_vectors(np.stack([roll, zero, zero], axis=1))
+        about_y = rotations_from_vectors(np.stack([zero, yaw, zero], axis=1))
+        phases = np.stack([np.sin(turn + 0.3), np.sin(2.0 * turn + 1.1), np.cos(turn)], axis=1)
+        return about_y @ about_x, np.array(self.centre_m) + phases * np.array(self.travel_m)
+
+
+@dataclass(frozen=True)
+class BallFrame:
+    """One frame: when it begins, s, and its magnification."""
+
+    start_time_s: float
+    magnification: float
+
+
+@dataclass(frozen=True, eq=False)
+class BallPlan:
+    """A recording of the ball; frames are rendered one at a time and do not depend on each other.
+
+    Attributes
+    ----------
+    microscope, specimen, motion, drift, detector, seed
+        What is recorded.
+    frames
+        When, and how much magnified.
+    """
+
+    microscope: VirtualMicroscope
+    specimen: BallOnTip
+    motion: Callable[[Array], tuple[Array, Array]]
+    frames: tuple[BallFrame, ...]
+    drift: DriftFunction
+    detector: Detector
+    seed: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def pose_at(self, time_s: Array) -> tuple[Array, Array]:
+        """(n, 3, 3) sem_from_body and (n, 3) m, drift included."""
+        rotation, place = self.motion(time_s)
+        place = place.copy()
+        place[:, :2] += np.asarray(self.drift(time_s), dtype=np.float64).reshape(-1, 2)
+        return rotation, place
+
+    def render(self, index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """(height + databar_rows, width) image of a frame, every line at its own time."""
+        frame = self.frames[index]
+        pad = self.detector.pad_px
+        rays = ray_lattice(self.microscope, float(frame.magnification), _SAMPLES, pad)
+        seen = self._reflectivity(rays, frame.start_time_s)
+        return self.detector.expose(seen, np.random.default_rng((self.seed, index)))
+
+    def _reflectivity(self, rays: RayLattice, start_time_s: float) -> Image:
+        camera, pad = rays.camera, rays.pad
+        shape = (camera.height + 2 * pad, camera.width + 2 * pad)
+        total = np.full(shape, self.specimen.background, dtype=np.float32)
+        box = self._box(rays, start_time_s)
+        if box is None:
+            return total
+        (top, bottom), (left, right) = box
+        lines = slice(top * _SAMPLES, bottom * _SAMPLES)
+        basis = rays.basis[:, left * _SAMPLES : right * _SAMPLES]
+        x, y = rays.x_m[lines] @ basis, rays.y_m[lines] @ basis
+        left_s, right_s = _line_times(rays, self.microscope.timing)
+        rotation, place = self.pose_at(start_time_s + 0.5 * (left_s + right_s)[lines])
+        yields = _yield(self.specimen, x, y, camera.rho, rotation, place)
+        fine = yields.reshape(bottom - top, _SAMPLES, right - left, _SAMPLES)
+        total[top:bottom, left:right] = fine.mean(axis=(1, 3))
+        return total
+
+    def _box(
+        self, rays: RayLattice, start_time_s: float
+    ) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """Rows and columns (padded) outside of which there is background only."""
+        timing, body = self.microscope.timing, self.specimen
+        times = start_time_s + np.linspace(0.0, timing.acquisition_time_s, 3)
+        corners = []
+        for reach in np.linspace(0.0, body.tip_length_m, 9):
+            wide = body.tip_radius_m + body.tip_slope * reach
+            wide = 0.5 * body.diameter_m if reach == 0.0 else wide
+            corners.append(np.array([reach, 0.0, 0.0]) + wide * _CUBE)
+        rotation, place = self.pose_at(times)
+        sem = np.einsum("tij,nj->tni", rotation, np.concatenate(corners)) + place[:, None]
+        camera = rays.camera
+        xy = camera.project_ideal(sem.reshape(-1, 3))
+        # Distortion moves the field by per cents; the middle of it hardly.
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        size = np.array([camera.width, camera.height])
+        margin = 4.0 + 0.03 * size[0]
+        first = np.clip(np.floor(low - margin), -rays.pad, size + rays.pad).astype(int)
+        last = np.clip(np.ceil(high + margin), -rays.pad, size + rays.pad).astype(int)
+        if np.any(last <= first):
+            return None
+        first, last = first + rays.pad, last + rays.pad
+        return (int(first[1]), int(last[1])), (int(first[0]), int(last[0]))
+
+    def truth(self) -> dict[str, Any]:
+        """What the recording shows, as plain values for a file beside it; SI units.
+
+        Rotations and places are those at the centre of the acquisition: ``X = rotation x +
+        translation_m``, drift included.
+        """
+        timing, microscope = self.microscope.timing, self.microscope
+        times = np.array([f.start_time_s for f in self.frames]) + timing.centre_offset_s
+        rotation, place = self.pose_at(times)
+        return {
+            "schema": BALL_TRUTH_SCHEMA,
+            "microscope": microscope.name,
+            "image_width_px": microscope.width,
+            "image_height_px": microscope.height,
+            "display_width_m": microscope.display_width_m,
+            "scan": {
+                "frame_time_s": timing.frame_time_s,
+                "averages": timing.averages,
+                "flyback_fraction": timing.flyback_fraction,
+            },
+            "ball_diameter_m": self.specimen.diameter_m,
+            "tip_radius_m": self.specimen.tip_radius_m,
+            "tip_slope": self.specimen.tip_slope,
+            "frames": [
+                {
+                    "start_time_s": frame.start_time_s,
+                    "magnification": frame.magnification,
+                    "rotation": turned.tolist(),
+                    "translation_m": moved.tolist(),
+                }
+                for frame, turned, moved in zip(self.frames, rotation, place, strict=True)
+            ],
+            "parameters": [
+                parameters_of(microscope, g) for g in sorted({f.magnification for f in self.frames})
+            ],
+        }
+
+
+_CUBE = np.array([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
+
+
+def _line_times(rays: RayLattice, timing: ScanTiming) -> tuple[Array, Array]:
+    """Mean times over the passes, after the stamp, at both ends of every line of samples."""
+    rows = np.rint(rays.lines)
+    size = (rays.camera.height, rays.camera.width)
+    return (
+        timing.pixel_offset_s(rows, 0.0, *size),
+        timing.pixel_offset_s(rows, rays.camera.width - 1.0, *size),
+    )
+
+
+def _yield(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array) -> Array:
+    """Reflectivity (lines, columns) of rays through (x, y) at height 0, one pose per line."""
+    out = np.full(x.shape, body.background)
+    line, column = np.nonzero(_near(body, x, y, rho, rotation, place))
+    x, y = x[line, column], y[line, column]
+    origin = np.stack([x, y, np.zeros_like(x)], axis=1) - place[line]
+    direction = np.stack([rho * x, rho * y, np.ones_like(x)], axis=1)
+    turn = rotation[line]
+    # Transposed: body_from_sem.
+    origin = np.einsum("nji,nj->ni", turn, origin)
+    direction = np.einsum("nji,nj->ni", turn, direction)
+    along, normal = body.meet(origin, direction)
+    hit = np.isfinite(along)
+    unit = direction[hit] / np.linalg.norm(direction[hit], axis=1)[:, None]
+    cosine = np.maximum(-np.sum(unit * normal[hit], axis=1), _STEEPEST)
+    at = origin[hit] + along[hit, None] * direction[hit]
+    bright = body.reflectivity * body.texture(at) / cosine**body.slope_power
+    # What is bright at the limb levels off below the full yield.
+    out[line[hit], column[hit]] = np.minimum(bright, 1.0)
+    return out
+
+
+def _near(
+    body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
+) -> NDArray[np.bool_]:
+    """Which rays can meet the body at all: by the distance from its outline in parallel projection."""
+    w = (1.0 + rho * place[:, 2])[:, None]
+    dx, dy = x - place[:, :1] / w, y - place[:, 1:2] / w
+    axis = rotation[:, :2, 0]
+    length = np.maximum(np.linalg.norm(axis, axis=1), 1e-6)[:, None]
+    along = (dx * axis[:, :1] + dy * axis[:, 1:]) / length
+    across = np.abs(dx * axis[:, 1:] - dy * axis[:, :1]) / length
+    radius = body.tip_radius_m + body.tip_slope * np.maximum(along, 0.0) / length
+    tip = (across < radius + _MARGIN_M) & (along > -radius)
+    ball = dx * dx + dy * dy < (0.5 * body.diameter_m + _MARGIN_M) ** 2
+    return np.asarray(ball | (tip & (along < body.tip_length_m * length + radius)))
+
+
+def ball_microscope(
+    name: str = "jsm820", width: int = 2048, height: int = 320
+) -> VirtualMicroscope:
+    """A preset that scans a strip of its field, ten frames per second.
+
+    At 9000x the field of the JSM-820 is 13.3 um wide: 512 px would show the ball 35 px across, which is too
+    few for some hundred points. 2048 px show it at 138 px (6.5 nm per px). A reduced raster of 320 lines
+    leaves a pixel 140 ns at 10 frames/s; a square one would leave 22 ns.
+    """
+    timing = ScanTiming(0.1, 1, 0.1)
+    return preset(name).with_image_size(width, height).with_timing(timing)
+
+
+def ball_plan(
+    microscope: VirtualMicroscope | None = None,
+    *,
+    frames: int = 2000,
+    interval_s: float | None = None,
+    magnifications: tuple[float, ...] = tuple(9000.0 + 100.0 * k for k in range(11)),
+    specimen: BallOnTip | None = None,
+    motion: Turning | None = None,
+    drift: DriftFunction = NO_DRIFT,
+    detector: Detector | None = None,
+    seed: int = 0,
+) -> BallPlan:
+    """The recording of section 4.4 of Malti et al. (2012): a 900 nm ball from 9000x to 10 000x.
+
+    The magnification rises in equal parts of the recording; the movement fills its duration once. Without
+    ``interval_s`` there is no pause between frames.
+
+    Raises
+    ------
+    InvalidValueError
+        For fewer frames than magnifications.
+    """
+    if frames < max(len(magnifications), 1):
+        raise InvalidValueError(f"{frames} frames", expected=f"at least {len(magnifications)}")
+    used = microscope or ball_microscope()
+    period_s = used.timing.acquisition_time_s if interval_s is None else interval_s
+    planned = tuple(
+        BallFrame(period_s * k, float(magnifications[k * len(magnifications) // frames]))
+        for k in range(frames)
+    )
+    path = motion or Turning(frames * period_s)
+    # 100 pA for 140 ns are some 90 electrons.
+    exposed = detector or Detector(electrons=90.0)
+    return BallPlan(
+        used, specimen or BallOnTip(seed=seed), path.pose_at, planned, drift, exposed, seed
+    )

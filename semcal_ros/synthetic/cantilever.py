@@ -1,0 +1,343 @@
+"""A cantilever that is pushed sideways, after section 4.3 of Malti et al. (2012).
+
+A bright beam leaves a holder and ends over a textured background. A plane comes from one side,
+pushes its end and is drawn back, while the specimen as a whole drifts. Coordinates of the scene:
+the base is the origin, the beam at rest lies along +x, and the pusher moves it towards +y.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.synthetic.detector import Detector
+from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
+from semcal_ros.synthetic.gold import GoldOnCarbon
+from semcal_ros.synthetic.microscope import VirtualMicroscope
+from semcal_ros.synthetic.pose import Pose
+from semcal_ros.synthetic.render import render_frame
+
+__all__ = [
+    "CANTILEVER_MAGNIFICATIONS",
+    "CANTILEVER_PUSHES",
+    "CantileverFrame",
+    "CantileverPlan",
+    "CantileverScene",
+    "cantilever_plan",
+]
+
+Array = NDArray[np.float64]
+
+CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
+"""Those of Malti et al. (2012), section 4.3."""
+
+CANTILEVER_PUSHES: tuple[float, ...] = (
+    0.0,
+    0.08,
+    0.24,
+    0.44,
+    0.64,
+    0.84,
+    1.0,
+    0.72,
+    0.4,
+    0.12,
+    0.0,
+)
+"""Fractions of the largest deflection in 11 poses: free, pushed up to the seventh, back to free."""
+
+# Far enough that the pusher never shades what it does not touch.
+_FREE_GAP_M = 600e-9
+
+
+@dataclass(frozen=True)
+class CantileverScene:
+    """The beam, its holder, the pusher and the background at one moment.
+
+    Parameters
+    ----------
+    length_m, width_m
+        Of the beam as it is seen.
+    deflection_m
+        Of the end of the beam, towards +y.
+    shape
+        ``"beam"``: a clamped beam that is loaded where the pusher begins, or at its end if that is
+        farther out (Euler and Bernoulli: ``3 a u^2 - u^3`` up to the load at a, straight beyond);
+        ``"parabola"``: ``u^2``. u is the arc length over the length.
+    gap_m
+        Distance of the pusher from the beam; None takes the pusher away.
+    pusher_m
+        First and last arc length under the pusher.
+    beam, holder, pusher, background
+        Reflectivities; that of the background is the largest of its texture.
+    rim, rim_m
+        By how much the edges are brighter than the rest, and how far that reaches.
+    seed
+        Of the texture.
+    """
+
+    length_m: float = 35e-6
+    width_m: float = 3.5e-6
+    deflection_m: float = 0.0
+    shape: Literal["beam", "parabola"] = "beam"
+    gap_m: float | None = None
+    pusher_m: tuple[float, float] = (33.2e-6, 38e-6)
+    beam: float = 0.72
+    holder: float = 0.6
+    pusher: float = 0.5
+    background: float = 0.3
+    rim: float = 0.12
+    rim_m: float = 150e-9
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        sizes = (self.length_m, self.width_m, self.rim_m)
+        if not (
+            all(math.isfinite(s) and s > 0 for s in sizes) and math.isfinite(self.deflection_m)
+        ):
+            raise InvalidValueError(
+                f"a cantilever of {self.length_m} x {self.width_m} m", expected="positive sizes"
+            )
+        if abs(self.deflection_m) > 0.1 * self.length_m:
+            raise InvalidValueError(
+                f"a deflection of {self.deflection_m} m", expected="at most a tenth of the length"
+            )
+
+    @property
+    def supersampling(self) -> int:
+        """One: edges and texture are filtered to the size of a pixel."""
+        return 1
+
+    @property
+    def load(self) -> float:
+        """Where the pusher touches, as a fraction of the length."""
+        return min(max(self.pusher_m[0] / self.length_m, 0.1), 1.0)
+
+    def bending(self, u: Array) -> Array:
+        """Deflection at fractions of the length relative to that of the end; straight beyond it."""
+        inside = np.clip(u, 0.0, 1.0)
+        beyond = np.maximum(u - 1.0, 0.0)
+        if self.shape == "parabola":
+            return np.asarray(inside**2 + 2.0 * beyond)
+        a = self.load
+        # The slope does not change any more beyond the load.
+        whole = 3.0 * a - 1.0 + (1.0 - a) ** 3
+        bent = 3.0 * a * inside**2 - inside**3 + np.maximum(inside - a, 0.0) ** 3
+        return np.asarray((bent + 3.0 * a**2 * beyond) / whole)
+
+    @property
+    def end_x_m(self) -> float:
+        """Where the end is along the axis at rest: the arc length is conserved."""
+        u = np.linspace(0.0, 1.0, 401)
+        slope = np.gradient(self.bending(u), u)
+        share = 0.5 * float(np.mean(slope[:-1] ** 2 + slope[1:] ** 2)) / 2.0
+        return self.length_m - share * self.deflection_m**2 / self.length_m
+
+    def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> NDArray[np.floating]:
+        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        ground = GoldOnCarbon(self.seed, largest_m=6e-6, octaves=4)
+        seen = self.background * np.asarray(ground.reflectivity(x_m, y_m, footprint_m), dtype=float)
+        x_width, y_width = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
+        line = self.deflection_m * self.bending(x_m / self.end_x_m)
+        across = np.abs(y_m - line) - 0.5 * self.width_m
+        parts = [_edge(across, y_width), _edge(x_m - self.end_x_m, x_width)]
+        inside = np.minimum(-across, self.end_x_m - x_m)
+        self._lay(seen, self.beam, parts, inside)
+        # The beam goes on inside of the holder, so that no seam is seen.
+        self._lay(seen, self.holder, [_edge(x_m, x_width)], -x_m)
+        if self.gap_m is not None:
+            self._lay_pusher(seen, x_m, y_m, x_width, y_width)
+        return seen
+
+    def _lay_pusher(self, seen: Array, x: Array, y: Array, x_width: float, y_width: float) -> None:
+        assert self.gap_m is not None
+        first, last = self.pusher_m
+        touched = self.deflection_m * float(self.bending(np.array([self.load]))[0])
+        front = touched - 0.5 * self.width_m - self.gap_m
+        parts = [_edge(y - front, y_width), _edge(first - x, x_width), _edge(x - last, x_width)]
+        self._lay(seen, self.pusher, parts, np.minimum(front - y, np.minimum(x - first, last - x)))
+
+    def _lay(self, seen: Array, level: float, parts: Sequence[Array], inside: Array) -> None:
+        """Lay something bright over the picture; ``inside`` is the distance from its edges."""
+        cover = parts[0]
+        for part in parts[1:]:
+            cover = cover * part
+        light = level + self.rim * np.exp(-np.maximum(inside, 0.0) / self.rim_m)
+        seen *= 1.0 - cover
+        seen += cover * light
+
+
+def _edge(distance: Array, width: float) -> Array:
+    """1 where the distance is negative, averaged over a box of that width."""
+    return np.asarray(np.clip(0.5 - distance / max(width, 1e-15), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class CantileverFrame:
+    """One frame of a bending experiment.
+
+    Attributes
+    ----------
+    start_time_s
+        Start of the first pass.
+    magnification
+        Magnification g.
+    pose
+        Number of the pose, from 0.
+    scene
+        The specimen.
+    """
+
+    start_time_s: float
+    magnification: float
+    pose: int
+    scene: CantileverScene
+
+
+@dataclass(frozen=True, eq=False)
+class CantileverPlan:
+    """A bending experiment to be recorded.
+
+    Attributes
+    ----------
+    microscope, frames, drift, detector, seed
+        What is recorded.
+    placed
+        The scene in the sem frame without drift, for each magnification.
+    """
+
+    microscope: VirtualMicroscope
+    frames: tuple[CantileverFrame, ...]
+    placed: dict[float, Pose]
+    drift: DriftFunction
+    detector: Detector = field(default_factory=Detector)
+    seed: int = 0
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def render(self, index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Image of a frame; raises as :func:`~semcal_ros.synthetic.render.render_frame`."""
+        frame = self.frames[index]
+        return render_frame(
+            self.microscope,
+            frame.scene,
+            self.placed[frame.magnification],
+            frame.magnification,
+            start_time_s=frame.start_time_s,
+            drift=self.drift,
+            seed=(self.seed, index),
+            detector=self.detector,
+        )
+
+    def pixel_of(self, index: int, x_m: float, y_m: float = 0.0) -> Array:
+        """(2,) raw pixel of a point of the scene in a frame, drift left out."""
+        frame = self.frames[index]
+        xyz = self.placed[frame.magnification].sem_from_specimen(np.array([[x_m, y_m]]))
+        return self.microscope.project(frame.magnification, xyz)[0]
+
+    def drift_at_centre_m(self, index: int) -> Array:
+        """(2,) drift in m at the centre of a frame's acquisition."""
+        centre = self.frames[index].start_time_s + self.microscope.timing.centre_offset_s
+        return np.asarray(self.drift(np.array([centre])), dtype=np.float64).reshape(2)
+
+    def truth(self) -> dict[str, Any]:
+        """What the recording shows, as plain values in SI units."""
+        return {
+            "schema": "semcal_ros/cantilever_truth/1",
+            "microscope": self.microscope.name,
+            "display_width_m": self.microscope.display_width_m,
+            "frames": [
+                {
+                    "start_time_s": frame.start_time_s,
+                    "magnification": frame.magnification,
+                    "pose": frame.pose,
+                    "deflection_m": frame.scene.deflection_m,
+                    "length_m": frame.scene.length_m,
+                    "shape": frame.scene.shape,
+                    "drift_m": self.drift_at_centre_m(index).tolist(),
+                    "base_px": self.pixel_of(index, 0.0).tolist(),
+                    "end_px": self.pixel_of(index, frame.scene.length_m).tolist(),
+                }
+                for index, frame in enumerate(self.frames)
+            ],
+        }
+
+
+def cantilever_plan(
+    microscope: VirtualMicroscope,
+    *,
+    scene: CantileverScene | None = None,
+    magnifications: Sequence[float] = CANTILEVER_MAGNIFICATIONS,
+    pushes: Sequence[float] = CANTILEVER_PUSHES,
+    largest_deflection_m: float = 250e-9,
+    frames_per_pose: int = 1,
+    view: Literal["whole", "end", "base"] = "whole",
+    rotation_rad: float = math.radians(-9.0),
+    interval_s: float = 1.5,
+    drift: DriftFunction = NO_DRIFT,
+    detector: Detector | None = None,
+    seed: int = 0,
+) -> CantileverPlan:
+    """The experiment of the paper: in each pose, frames at all magnifications one after the other.
+
+    Parameters
+    ----------
+    microscope
+        What records it.
+    scene
+        The beam; its deflection and the gap of the pusher are set in each pose.
+    magnifications, pushes, largest_deflection_m, frames_per_pose
+        The poses: fractions of the largest deflection, and frames of each at each magnification.
+        Where a fraction is 0 the pusher does not touch.
+    view
+        What lies in the middle of the field: the middle of the beam, its last two thirds of a field
+        with the end, or the first with the base.
+    rotation_rad
+        Of the beam in the image.
+    interval_s
+        From frame to frame; at least an acquisition is taken.
+    drift, detector, seed
+        As for other recordings.
+
+    Raises
+    ------
+    InvalidValueError
+        If there are no frames.
+    """
+    if frames_per_pose < 1 or not pushes or not magnifications:
+        raise InvalidValueError("a bending experiment without frames", expected="at least one")
+    base = scene or CantileverScene()
+    step_s = max(interval_s, microscope.timing.acquisition_time_s)
+    planned: list[CantileverFrame] = []
+    for number, push in enumerate(pushes):
+        gap = 0.0 if push > 0.0 else _FREE_GAP_M
+        values = {**base.__dict__, "deflection_m": push * largest_deflection_m, "gap_m": gap}
+        bent = CantileverScene(**values)
+        for g in magnifications:
+            for _ in range(frames_per_pose):
+                planned.append(CantileverFrame(step_s * len(planned), float(g), number, bent))
+    placed = {
+        float(g): _placed(microscope, float(g), base, view, rotation_rad) for g in magnifications
+    }
+    return CantileverPlan(microscope, tuple(planned), placed, drift, detector or Detector(), seed)
+
+
+def _placed(
+    microscope: VirtualMicroscope, g: float, scene: CantileverScene, view: str, turn: float
+) -> Pose:
+    field_m = microscope.nominal_pixel_size_m(g) * microscope.width
+    along = {"whole": 0.5 * scene.length_m, "end": scene.length_m - 0.27 * field_m}
+    middle = along.get(view, 0.3 * field_m)
+    camera = microscope.camera_at(g)
+    centre = 0.5 * np.array([[microscope.width - 1.0, microscope.height - 1.0]])
+    seen = camera.sem_from_ideal(centre)[0, :2]
+    c, s = math.cos(turn), math.sin(turn)
+    at = seen - middle * np.array([c, s])
+    return Pose.flat((float(at[0]), float(at[1]), 0.0), turn)

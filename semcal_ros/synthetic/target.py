@@ -1,0 +1,121 @@
+"""The target of visual servoing as a specimen: nested boards of markers, sharp at any magnification."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
+
+__all__ = ["TargetSpecimen"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# Texels per cell: seven for each square of a marker, and nine for the white on either side.
+_TEXELS_PER_BIT = 7
+_CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
+
+
+@dataclass(frozen=True)
+class TargetSpecimen:
+    """A :class:`~semcal_ros.core.servoing.target.NestedTarget` with its origin at that of the specimen.
+
+    Parameters
+    ----------
+    target
+        The target.
+    white, black
+        Reflectivity of border and surroundings, and of the markers.
+    """
+
+    target: NestedTarget = field(default_factory=NestedTarget)
+    white: float = 0.85
+    black: float = 0.15
+
+    @property
+    def supersampling(self) -> int:
+        """Two: edges along the markers are averaged exactly over a sample, others by its second moment."""
+        return 2
+
+    def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
+        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        # As for the chess grid: a box with the second moment of the sample's parallelogram on each axis of the
+        # target.
+        box_m = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
+        seen = np.ones(x_m.shape, dtype=np.float32)
+        for level in range(self.target.levels):
+            cell_m = self.target.cell_m(level)
+            # Where a texel of the board around it is no larger than a sample, that one shows this one as well.
+            if level > 0 and RATIO * cell_m <= _CELL * float(box_m.min()):
+                break
+            _paint(seen, self.target, level, x_m / cell_m, y_m / cell_m, box_m / cell_m)
+        seen *= np.float32(self.white - self.black)
+        seen += np.float32(self.black)
+        return seen
+
+
+def _paint(seen: Image, target: NestedTarget, level: int, x: Array, y: Array, box: Array) -> None:
+    """Draw one board, in cells of its own, over what is there."""
+    half = 0.5 * RATIO
+    inside = (np.abs(x) < half) & (np.abs(y) < half)
+    if not np.any(inside):
+        return
+    pyramid = _pyramid(target, level)
+    texels = max(float(np.max(box)) * _CELL, 1.0)
+    step = min(math.ceil(math.log2(texels)), len(pyramid) - 1)
+    board = pyramid[step]
+    per_cell = len(board) / RATIO
+    u = _sharpened((x[inside] + half) * per_cell - 0.5, float(box[0]) * per_cell)
+    v = _sharpened((y[inside] + half) * per_cell - 0.5, float(box[1]) * per_cell)
+    seen[inside] = _in_rows(board, u, v)
+
+
+def _in_rows(board: Image, u: Image, v: Image) -> Image:
+    """cv2.remap takes no rows beyond 32766 px."""
+    width = 16384
+    rows = -(-u.size // width)
+    padded = [np.resize(c, rows * width).reshape(rows, width) for c in (u, v)]
+    drawn = cv2.remap(board, *padded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(drawn, dtype=np.float32).reshape(-1)[: u.size]
+
+
+def _sharpened(u: Array, width: float) -> Image:
+    """Where linear interpolation gives the mean of sharp texels over a box of that width, at most one texel."""
+    edge = np.floor(u) + 0.5
+    return (edge + np.clip((u - edge) / max(width, 1e-9), -0.5, 0.5)).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def _pyramid(target: NestedTarget, level: int) -> tuple[Image, ...]:
+    """One board with all that lie within, 1 white and 0 black, and the same at half the resolution, and so on."""
+    levels = [_board(target, level)]
+    while len(levels[-1]) % 2 == 0 and len(levels[-1]) > 8:
+        n = len(levels[-1]) // 2
+        levels.append(levels[-1].reshape(n, 2, n, 2).mean(axis=(1, 3), dtype=np.float32))
+    for board in levels:
+        board.setflags(write=False)
+    return tuple(levels)
+
+
+@lru_cache(maxsize=64)
+def _board(target: NestedTarget, level: int) -> Image:
+    """(3 cells, 3 cells) texels."""
+    board = np.ones((RATIO * _CELL, RATIO * _CELL), dtype=np.float32)
+    border = (_CELL - MARKER_BITS * _TEXELS_PER_BIT) // 2
+    for place, (column, row) in enumerate(CELLS):
+        bits = target.bits(len(CELLS) * level + place).astype(np.float32)
+        marker = np.kron(bits, np.ones((_TEXELS_PER_BIT, _TEXELS_PER_BIT), dtype=np.float32))
+        top, left = ((c + 1) * _CELL + border for c in (row, column))
+        board[top : top + len(marker), left : left + len(marker)] = marker
+    if level + 1 < target.levels:
+        inner = _board(target, level + 1)
+        shrunk = inner.reshape(_CELL, RATIO, _CELL, RATIO).mean(axis=(1, 3), dtype=np.float32)
+        board[_CELL : 2 * _CELL, _CELL : 2 * _CELL] = shrunk
+    board.setflags(write=False)
+    return board

@@ -1,0 +1,297 @@
+"""Bending of a cantilever against the truth of simulated frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.cantilever import (
+    SeriesSettings,
+    find_strip,
+    frames_of_poses,
+    measure_series,
+    repeatability,
+)
+from semcal_ros.core.cantilever.bending import end_along_axis, fit_bending, shape_of
+from semcal_ros.core.cantilever.edges import EdgeModel, fit_edges
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.synthetic import Detector, Drift, preset
+from semcal_ros.synthetic.cantilever import CantileverScene, cantilever_plan
+
+LENGTH = 35e-6
+DRIFT = Drift(velocity_m_s=(6e-9, -4e-9), settling_m=(60e-9, 90e-9), wander_m=10e-9, seed=4)
+
+
+def scope(size=256, width=0.12, name="jsm820"):
+    return replace(preset(name), display_width_m=width).with_image_size(size, size)
+
+
+def measured(plan, *, shape="free", magnification=None, reference=(0,), **options):
+    """The frames of one magnification, with the true camera, and their true deflections."""
+    g = magnification or plan.frames[0].magnification
+    chosen = [k for k, f in enumerate(plan.frames) if f.magnification == g]
+    images = [plan.render(k) for k in chosen]
+    times = [plan.frames[k].start_time_s for k in chosen]
+    truth = np.array([plan.frames[k].scene.deflection_m for k in chosen])
+    camera = plan.microscope.camera_at(g)
+    settings = SeriesSettings(LENGTH, shape, **options)
+    timing = plan.microscope.timing
+    found = measure_series(images, times, camera, timing, settings, reference=reference)
+    return found, truth
+
+
+# -- edges ----------------------------------------------------------------------------------------
+
+
+def edge_pixels(rng, rows, shift, noise, width=1.0):
+    """Pixels around both edges of a straight beam, in px."""
+    along, across = np.meshgrid(np.arange(120.0), np.arange(-rows, rows + 1.0))
+    from scipy.special import ndtr
+
+    line = 0.02 * along + shift
+    beam = ndtr((across - line + 10.0) / width) - ndtr((across - line - 10.0) / width)
+    grey = 40.0 + 90.0 * beam + rng.normal(0.0, noise, along.shape)
+    return along.ravel(), across.ravel(), grey.ravel()
+
+
+def test_edges_are_where_they_are_and_as_good_as_they_say():
+    rng = np.random.default_rng(1)
+    model = EdgeModel(1.0, 6.0, 6.0, 12.0, 9, 10.0)
+    base = np.array([-10.0, 10.0]) + 0.02 * model.centres_m[:, None]
+    deviations, errors = [], []
+    for _ in range(30):
+        shift = rng.uniform(-2.0, 2.0)
+        fit = fit_edges(*edge_pixels(rng, 20, shift, 9.0), model, base)
+        errors.append(fit.across_m - base - shift)
+        deviations.append(errors[-1] / fit.sigma_m)
+    deviations = np.array(deviations)
+    # 540 edges: the RMS of unit deviates is good to 3 %.
+    assert np.sqrt(np.mean(deviations**2)) == pytest.approx(1.0, abs=0.12)
+    assert abs(deviations.mean()) < 4.0 / np.sqrt(deviations.size)
+    # Cramer-Rao: noise / step / sqrt(rows * sum of squared derivative) = 0.1 / sqrt(12 * 0.28).
+    assert np.std(errors) < 1.35 * 0.1 / np.sqrt(12 * 0.28)
+
+
+def test_an_edge_that_is_not_there_has_no_sigma():
+    rng = np.random.default_rng(2)
+    along, across, grey = edge_pixels(rng, 20, 0.0, 5.0)
+    model = EdgeModel(1.0, 6.0, 6.0, 12.0, 9, 10.0)
+    base = np.array([-10.0, 10.0]) + 0.02 * model.centres_m[:, None]
+    hidden = (along > 60) & (across < 0)
+    fit = fit_edges(along[~hidden], across[~hidden], grey[~hidden], model, base)
+    assert np.all(np.isinf(fit.sigma_m[6:, 0]))
+    assert np.all(np.isfinite(fit.sigma_m[:, 1]))
+
+
+# -- bending --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["free", "beam", "parabola"])
+def test_each_shape_finds_its_own(shape):
+    u = np.linspace(0.05, 0.98, 30)
+    curve = {"beam": 0.5 * (3 * u**2 - u**3), "parabola": u**2}.get(shape, 1.3 * u**2 - 0.3 * u**3)
+    moved = 2e-7 * np.stack([curve, curve], axis=1)
+    found = fit_bending(u, moved, np.full(moved.shape, 1e-9), LENGTH, 1e-9, shape_of(shape))
+    # The prior of no rotation costs nothing where there is none.
+    assert found.deflection_m == pytest.approx(2e-7, abs=1e-13)
+    assert found.used.all()
+
+
+def test_sigma_of_the_deflection_is_honest():
+    rng = np.random.default_rng(3)
+    u = np.linspace(0.45, 0.98, 30)
+    curve = np.stack([0.5 * (3 * u**2 - u**3)] * 2, axis=1)
+    deviations = []
+    for _ in range(300):
+        offset = rng.normal(0.0, 0.8e-9)
+        moved = 2e-7 * curve + offset + rng.normal(0.0, 3e-9, curve.shape)
+        moved[-3:, 0] += 40e-9  # something lies on the last blocks of one edge
+        found = fit_bending(u, moved, np.full(curve.shape, 3e-9), LENGTH, 0.8e-9)
+        deviations.append((found.deflection_m - 2e-7) / found.sigma_m)
+    # 300 deviates: the RMS is good to 4 %.
+    assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_second_order_differs_from_a_beam_by_what_theory_says():
+    """A clamped parabola fitted to a beam that is loaded at its end is 1 / 12 too high there."""
+    u = (np.arange(2000) + 0.5) / 2000
+    moved = np.stack([0.5 * (3 * u**2 - u**3)] * 2, axis=1) * 1e-7
+    # So little is known of each block that the base does not turn, as it may by 10 microradian.
+    found = fit_bending(u, moved, np.full(moved.shape, 1e-6), LENGTH, 1e-13, shape_of("parabola"))
+    assert found.deflection_m == pytest.approx(1e-7 * 13 / 12, rel=2e-3)
+
+
+def test_the_end_recedes_as_the_beam_bends():
+    # Euler and Bernoulli: 3/5 of the deflection squared over the length.
+    receded = LENGTH - end_along_axis(np.array([1.5e-6, -0.5e-6]), LENGTH)
+    assert receded == pytest.approx(0.6 * (1e-6) ** 2 / LENGTH, rel=3e-3)
+
+
+def test_settings_are_checked():
+    with pytest.raises(InvalidValueError, match="positive length"):
+        SeriesSettings(0.0)
+    with pytest.raises(InvalidValueError, match="one of free, beam, parabola"):
+        SeriesSettings(LENGTH, "cubic")
+
+
+# -- finding --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rotation", [-9.0, 35.0, 100.0, 171.0, -60.0])
+def test_the_cantilever_is_found_at_any_rotation(rotation):
+    plan = cantilever_plan(
+        scope(256, 0.45),
+        pushes=(0.0,),
+        magnifications=(6450.0,),
+        rotation_rad=np.deg2rad(rotation),
+    )
+    strip = find_strip(plan.render(0))
+    truth = plan.truth()["frames"][0]
+    assert strip.base_seen and strip.tip_seen
+    # To be refined later, over 14 px.
+    assert np.hypot(*(strip.base_px - truth["base_px"])) < 7.0
+    assert np.hypot(*(strip.tip_px - truth["end_px"])) < 7.0
+    assert strip.half_width_px == pytest.approx(0.5 * 3.5e-6 / (0.45 / 6450 / 256), abs=2.5)
+
+
+def test_a_view_of_the_end_only():
+    plan = cantilever_plan(scope(), pushes=(0.0,), magnifications=(7760.0,), view="end")
+    strip = find_strip(plan.render(0))
+    assert strip.tip_seen and not strip.base_seen
+    assert np.hypot(*(strip.tip_px - plan.truth()["frames"][0]["end_px"])) < 7.0
+
+
+def test_clicks_say_where_it_is():
+    plan = cantilever_plan(scope(), pushes=(0.0,), magnifications=(7760.0,), view="end")
+    truth = plan.truth()["frames"][0]
+    base, tip = (np.array(truth[k]) + 4.0 for k in ("base_px", "end_px"))
+    strip = find_strip(plan.render(0), base_px=base, tip_px=tip)
+    assert strip.tip_seen and not strip.base_seen
+    dx, dy = np.subtract(truth["end_px"], truth["base_px"])
+    x, y = strip.tip_px - truth["end_px"]
+    assert (
+        abs(dx * y - dy * x) / np.hypot(dx, dy) < 2.5
+    )  # across the beam it is found, not taken from the click
+
+
+def test_pictures_without_a_cantilever_are_refused():
+    with pytest.raises(InvalidValueError, match="no strip"):
+        find_strip(np.full((128, 128), 80, dtype=np.uint8))
+    with pytest.raises(InvalidValueError, match="both or none"):
+        find_strip(np.zeros((64, 64), np.uint8), base_px=(1.0, 2.0))
+
+
+# -- the whole ------------------------------------------------------------------------------------
+
+
+def test_the_end_in_view():
+    plan = cantilever_plan(
+        scope(256),
+        pushes=(0.0, 0.3, 1.0, 0.5),
+        magnifications=(7760.0,),
+        view="end",
+        drift=DRIFT,
+        seed=1,
+    )
+    found, truth = measured(plan)
+    errors = np.array([f.deflection_m for f in found.frames]) - truth
+    sigma = np.array([f.sigma_m for f in found.frames])
+    assert found.drift.accepted.all()
+    # A pixel is 60 nm.
+    assert np.all(sigma[1:] < 4e-9)
+    assert np.all(np.abs(errors[1:]) < 4.0 * sigma[1:])
+    assert abs(errors[0]) < 0.5e-9
+    assert np.isnan(found.frames[2].by_length_m)
+    # The drift is that of the specimen, not of what moves in it.
+    true = np.array([plan.drift_at_centre_m(k) for k in range(len(plan))])
+    away = found.drift.drift_m - (true - true[0])
+    assert np.all(np.abs(away) < 3e-9)
+    tip = np.array(plan.truth()["frames"][2]["end_px"])
+    moved = plan.microscope.camera_at(7760.0).m * (plan.drift_at_centre_m(2) + [0.0, 250e-9])
+    assert np.hypot(*(found.frames[2].tip_px - tip - moved)) < 2.0
+
+
+def test_both_ends_in_view_give_two_scales():
+    plan = cantilever_plan(
+        scope(384, 0.4),
+        pushes=(0.0, 1.0),
+        magnifications=(8890.0,),
+        frames_per_pose=2,
+        drift=DRIFT,
+        seed=2,
+    )
+    found, truth = measured(plan, reference=(0, 1))
+    # The true camera: both scales are the same but for where the ends are, a pixel being 117 nm.
+    assert abs(found.rest.length_m - LENGTH) < 4.0 * found.rest.length_sigma_m + 10e-9
+    assert found.rest.length_sigma_m < 20e-9
+    for frame, true in zip(found.frames[2:], truth[2:], strict=True):
+        for value, sigma in (
+            (frame.deflection_m, frame.sigma_m),
+            (frame.by_length_m, frame.by_length_sigma_m),
+        ):
+            assert abs(value - true) < 4.0 * sigma
+            assert sigma < 12e-9
+
+
+def test_a_beam_seen_edge_on():
+    """300 nm thick: the beam is 4 px wide."""
+    scene = CantileverScene(width_m=300e-9)
+    plan = cantilever_plan(
+        scope(256), scene=scene, pushes=(0.0, 1.0), magnifications=(6450.0,), view="end", seed=3
+    )
+    found, truth = measured(plan)
+    frame = found.frames[1]
+    assert abs(frame.deflection_m - truth[1]) < 4.0 * frame.sigma_m
+    assert frame.sigma_m < 8e-9
+
+
+def test_a_blurred_and_noisy_recording_knows_less():
+    plan = cantilever_plan(
+        scope(256), pushes=(0.0, 1.0), magnifications=(7760.0,), view="end", seed=4
+    )
+    noisy = replace(plan, detector=Detector(electrons=40.0, blur_px=1.6))
+    good, truth = measured(plan)
+    bad, _ = measured(noisy)
+    assert bad.frames[1].sigma_m > 1.5 * good.frames[1].sigma_m
+    assert abs(bad.frames[1].deflection_m - truth[1]) < 4.0 * bad.frames[1].sigma_m
+
+
+def test_frames_of_other_sizes_and_references_are_refused():
+    camera = preset("jsm820").camera_at(7760.0)
+    images = [np.zeros((64, 64), np.uint8), np.zeros((64, 96), np.uint8)]
+    with pytest.raises(InvalidValueError, match="one size"):
+        measure_series(images, [0.0, 1.0], camera, None, SeriesSettings(LENGTH))
+    with pytest.raises(InvalidValueError, match="reference frames"):
+        measure_series(images[:1], [0.0], camera, None, SeriesSettings(LENGTH), reference=(1,))
+
+
+# -- repeatability --------------------------------------------------------------------------------
+
+
+def test_frames_are_cut_into_poses():
+    assert frames_of_poses(6, 3) == [[0, 1], [2, 3], [4, 5]]
+    assert frames_of_poses(2, None) == [[0], [1]]
+    with pytest.raises(InvalidValueError, match="7 frames for 3 poses"):
+        frames_of_poses(7, 3)
+
+
+def test_the_spread_is_that_of_the_poses():
+    plan = cantilever_plan(
+        scope(256),
+        pushes=(0.0, 1.0),
+        magnifications=(6450.0, 8890.0),
+        view="end",
+        drift=DRIFT,
+        seed=5,
+    )
+    series = [measured(plan, magnification=g)[0] for g in (6450.0, 8890.0)]
+    table = repeatability(series)
+    values = [s.frames[1].deflection_m for s in series]
+    assert table.spread_m[1] == pytest.approx(np.std(values, ddof=1))
+    assert table.rms_spread_m == pytest.approx(table.spread_m[1])
+    assert table.spread_m[0] < 0.5e-9
+    assert table.expected_spread_m == pytest.approx(np.sqrt(np.mean(table.sigma_m[:, 1] ** 2)))
+    with pytest.raises(InvalidValueError, match="different numbers of frames"):
+        repeatability([series[0], replace(series[1], frames=series[1].frames[:1])])

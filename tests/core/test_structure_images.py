@@ -1,0 +1,121 @@
+"""From rendered images to points: tracking, patches, both mirror images, movement during a frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.structure import (
+    SequenceTracker,
+    StructureError,
+    TrackerSettings,
+    measure_ball,
+    reconstruct,
+)
+from semcal_ros.synthetic import Detector
+from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
+
+# The same pixel size as 2048 px at 9000x, in a smaller picture.
+SMALL = replace(ball_microscope(width=512, height=192), name="small")
+CENTRE_M = (-2e-7, 0.0, 0.0)
+
+
+def followed(plan, settings=None):
+    tracker = SequenceTracker(settings)
+    for index, frame in enumerate(plan.frames):
+        camera = plan.microscope.camera_at(frame.magnification)
+        tracker.add(plan.render(index), camera, frame.start_time_s)
+    return tracker.finish()
+
+
+@pytest.fixture(scope="module")
+def plan():
+    motion = Turning(
+        60.0, rolls=1.0, yaws=1.0, roll_rad=0.5, travel_m=(1e-7, 5e-8, 0.0), centre_m=CENTRE_M
+    )
+    magnifications = (36000.0, 36400.0, 36800.0)
+    return ball_plan(
+        SMALL,
+        frames=24,
+        interval_s=2.5,
+        magnifications=magnifications,
+        motion=motion,
+        detector=Detector(electrons=400.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def structure(plan):
+    keyframes = followed(plan, TrackerSettings(spacing_px=8.0))
+    return reconstruct(keyframes, plan.microscope.timing)
+
+
+def test_points_lie_on_the_true_surface(plan, structure):
+    ball = measure_ball(structure)
+    assert np.count_nonzero(ball.sphere.inliers) > 60
+    # A pixel is 6.5 nm.
+    assert ball.sphere.rms_m < 4e-9
+    assert ball.diameter_m == pytest.approx(900e-9, rel=0.02)
+    low, high = ball.interval_m
+    assert low < 900e-9 < high
+    assert high - low < 60e-9
+
+
+def test_the_ball_bulges_towards_the_gun(structure):
+    ball = measure_ball(structure, groups=0)
+    reference = structure.adjustment.reference
+    depth = (structure.points_m - ball.sphere.centre_m) @ structure.adjustment.rotations[reference][
+        2
+    ]
+    on = ball.sphere.inliers
+    assert structure.convexity > 0.8
+    assert np.median(depth[on]) < -0.5 * ball.sphere.radius_m
+    outward = np.sum((structure.points_m - ball.sphere.centre_m) * structure.normals, axis=1)
+    assert np.mean(outward[on] > 0.0) > 0.95
+
+
+def test_views_are_turned_as_the_truth_says(plan, structure):
+    times = np.array([plan.frames[k].start_time_s for k in structure.frames])
+    turned, _ = plan.pose_at(times + plan.microscope.timing.centre_offset_s)
+    found, r = structure.adjustment.rotations, structure.adjustment.reference
+    error = (found @ found[r].T) @ np.swapaxes(turned @ turned[r].T, 1, 2)
+    angle = np.arccos(np.clip((np.trace(error, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0))
+    # Turns of up to 60 degrees between views; a mirror image would be wrong by twice as much.
+    assert np.degrees(np.median(angle)) < 3.0
+
+
+def test_a_still_specimen_gives_one_keyframe_and_is_refused():
+    still = Turning(10.0, roll_rad=0.0, yaw_rad=0.0, travel_m=(0, 0, 0), centre_m=CENTRE_M)
+    made = ball_plan(SMALL, frames=4, magnifications=(36000.0,), motion=still)
+    keyframes = followed(made)
+    assert len(keyframes) == 1
+    with pytest.raises(StructureError, match="hardly turns"):
+        reconstruct(keyframes)
+
+
+def test_a_shift_is_not_parallax():
+    """Drift moves everything alike; it brings nothing new."""
+    moved = Turning(40.0, roll_rad=0.0, yaw_rad=0.0, travel_m=(2e-7, 5e-8, 0.0), centre_m=CENTRE_M)
+    made = ball_plan(SMALL, frames=5, magnifications=(36000.0,), motion=moved, interval_s=1.0)
+    keyframes = followed(made)
+    assert len(keyframes) == 1
+    # The image moves as the specimen does: within 10 % of a speed of some 30 nm/s.
+    _, place = made.pose_at(np.array([0.05, 1.05]))
+    true = (place[1] - place[0])[:2]
+    frame = keyframes[0]
+    seen = frame.velocity @ np.append(CENTRE_M[:2], 1.0)
+    assert np.linalg.norm(seen - true) < 0.1 * np.linalg.norm(true)
+
+
+def test_frames_out_of_order_or_of_another_size_are_refused(plan):
+    tracker = SequenceTracker()
+    camera = plan.microscope.camera_at(36000.0)
+    image = plan.render(0)
+    tracker.add(image, camera, 1.0)
+    with pytest.raises(InvalidValueError, match="order"):
+        tracker.add(image, camera, 1.0)
+    with pytest.raises(InvalidValueError, match="shape"):
+        tracker.add(image[:100], camera, 2.0)

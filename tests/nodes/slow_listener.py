@@ -1,0 +1,42 @@
+"""Run as a process: a reliable subscriber of an image topic that takes nothing until it is told to.
+
+It writes ``ready`` when the publisher has been found, then waits for a line on stdin, and then writes the stamps (s) of
+what it gets in three seconds.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+DEPTH = 2
+TAKING_S = 3.0
+
+
+def main(topic: str) -> None:
+    rclpy.init()
+    node = Node("slow_listener", namespace="sem")
+    stamps: list[int] = []
+    profile = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+    node.create_subscription(
+        Image, topic, lambda message: stamps.append(message.header.stamp.sec), profile
+    )
+    while node.count_publishers(topic) == 0:
+        time.sleep(0.05)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    deadline = time.monotonic() + TAKING_S
+    while time.monotonic() < deadline:
+        rclpy.spin_once(node, timeout_sec=0.05)
+    print(*stamps, flush=True)
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

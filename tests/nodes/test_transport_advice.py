@@ -1,0 +1,228 @@
+"""Which shared memory a process has, by its environment, beside what Fast DDS really makes; and what is advised."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from semcal_ros.core.errors import ConfigError
+from semcal_ros.nodes.dds_profile import (
+    DEFAULT_SEGMENT_BYTES,
+    PROFILE_VARIABLES,
+    profile_file,
+    shared_memory,
+)
+from semcal_ros.nodes.transport import MALLOC_VARIABLES, transport_advice
+
+ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = ROOT / "dds" / "fastdds_large_images.xml"
+MIB = 1024**2
+FAST = "rmw_fastrtps_cpp"
+MALLOC = dict.fromkeys(MALLOC_VARIABLES, str(256 * MIB))
+CLEAN = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in {*PROFILE_VARIABLES, *MALLOC_VARIABLES, "FASTDDS_BUILTIN_TRANSPORTS"}
+}
+# The segment that a participant makes is a file in /dev/shm, which its process has mapped.
+PROBE = """
+import os, re, rclpy
+rclpy.init()
+node = rclpy.create_node("probe")
+names = set(re.findall(r"/dev/shm/fast(?:rtps|dds)_[0-9a-f]{16}$", open("/proc/self/maps").read(), re.M))
+print("segments", *(os.stat(name).st_size for name in names))
+rclpy.shutdown()
+"""
+
+
+def profile(transports: str = "", rtps: str = "", default: str = "true") -> str:
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        '<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">'
+        f"<transport_descriptors>{transports}</transport_descriptors>"
+        f'<participant profile_name="p" is_default_profile="{default}"><rtps>{rtps}</rtps>'
+        "</participant></profiles>"
+    )
+
+
+def shm(segment: int | None = None, message: int | None = None) -> str:
+    size = "" if segment is None else f"<segment_size>{segment}</segment_size>"
+    size += "" if message is None else f"<maxMessageSize>{message}</maxMessageSize>"
+    return (
+        "<transport_descriptor><transport_id>s</transport_id><type>SHM</type>"
+        f"{size}</transport_descriptor>"
+        "<transport_descriptor><transport_id>u</transport_id><type>UDPv4</type></transport_descriptor>"
+    )
+
+
+def used(*names: str, builtin: str = "false") -> str:
+    ids = "".join(f"<transport_id>{name}</transport_id>" for name in names)
+    return (
+        f"<userTransports>{ids}</userTransports>"
+        f"<useBuiltinTransports>{builtin}</useBuiltinTransports>"
+    )
+
+
+def with_profile(path: Path, text: str) -> dict[str, str]:
+    path.write_text(text, encoding="utf-8")
+    return dict.fromkeys(PROFILE_VARIABLES, str(path))
+
+
+def real_segments(environment: Mapping[str, str]) -> list[int]:
+    """Sizes of the segments that a node with this environment makes, bytes."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        env=dict(environment),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    (line,) = re.findall(r"^segments(.*)$", done.stdout, re.MULTILINE)
+    return [int(size) for size in line.split()]
+
+
+CASES = {
+    "default": ("", {}, DEFAULT_SEGMENT_BYTES),
+    "own": (profile(shm(3 * MIB), used("s", "u")), {}, 3 * MIB),
+    "own without size": (profile(shm(), used("s", "u")), {}, DEFAULT_SEGMENT_BYTES),
+    "socket buffers": (
+        profile(rtps="<listenSocketBufferSize>1000000</listenSocketBufferSize>"),
+        {},
+        2_000_000,
+    ),
+    "network alone": (profile(shm(), used("u")), {}, None),
+    "built in UDP": ("", {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, None),
+    # Differs between the versions.
+    "built in large data": ("", {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}, ...),
+    "built in with an option": (
+        "",
+        {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB&sockets_size=1MB"},
+        2_000_000,
+    ),
+    "with the built-in ones": (profile(shm(3 * MIB), used("s", builtin="true")), {}, 3 * MIB),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "reach"),
+    [*((case, "OFF") for case in CASES)]
+    + [(case, "LOCALHOST") for case in ("default", "own", "socket buffers", "network alone")],
+)
+def test_the_segment_is_the_one_that_fast_dds_makes(case: str, reach: str, tmp_path: Path) -> None:
+    """Discovery does not matter for it, except that rmw_fastrtps has transports of its own for LOCALHOST."""
+    text, environment, expected = CASES[case]
+    environment = {**CLEAN, "ROS_AUTOMATIC_DISCOVERY_RANGE": reach, **environment}
+    if text:
+        environment.update(with_profile(tmp_path / "profile.xml", text))
+    if reach == "LOCALHOST" and expected != 3 * MIB:
+        expected = DEFAULT_SEGMENT_BYTES
+    stated = shared_memory(environment).segment_bytes
+    assert expected in (..., stated)
+    made = max(real_segments(environment), default=None)
+    if stated is None:
+        assert made is None
+    else:
+        # Beside the messages it holds their descriptors: a twentieth with the default queue.
+        assert made is not None
+        assert stated <= made < 1.1 * stated
+
+
+def test_the_shipped_profile_carries_the_largest_frames() -> None:
+    environment = dict.fromkeys(PROFILE_VARIABLES, str(SHIPPED))
+    # Frames of 4096 x 4096 with 16 bits, and three of them waiting.
+    assert shared_memory(environment).segment_bytes >= 4 * 32 * MIB
+    assert transport_advice(32 * MIB, {**environment, **MALLOC}, FAST) == ""
+
+
+def test_only_what_does_not_fit_is_advised(tmp_path: Path) -> None:
+    environment = {**MALLOC, **with_profile(tmp_path / "p.xml", profile(shm(2 * MIB), used("s")))}
+    assert transport_advice(2 * MIB, environment, FAST) == ""
+    advice = transport_advice(2 * MIB + 1, environment, FAST)
+    assert "2.0 MiB" in advice
+    assert "p.xml" in advice
+    assert "Large images" in advice
+    small = with_profile(tmp_path / "small.xml", profile(shm(MIB // 4), used("s")))
+    assert "0.2 MiB" in transport_advice(MIB // 3, small, FAST)
+    assert transport_advice(DEFAULT_SEGMENT_BYTES, MALLOC, FAST) == ""
+    assert "no profile is set" in transport_advice(DEFAULT_SEGMENT_BYTES + 1, MALLOC, FAST)
+
+
+def test_other_middlewares_read_no_profile() -> None:
+    assert transport_advice(64 * MIB, MALLOC, "rmw_cyclonedds_cpp") == ""
+    assert "MALLOC" in transport_advice(64 * MIB, {}, "rmw_cyclonedds_cpp")
+    assert transport_advice(64 * MIB, {**MALLOC, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, FAST) == ""
+
+
+@pytest.mark.skipif(not os.confstr("CS_GNU_LIBC_VERSION"), reason="malloc of glibc")
+@pytest.mark.parametrize(
+    ("environment", "named"),
+    [
+        ({}, list(MALLOC_VARIABLES)),
+        ({"MALLOC_TRIM_THRESHOLD_": "536870912"}, ["MALLOC_MMAP_THRESHOLD_"]),
+        ({**MALLOC, "MALLOC_MMAP_THRESHOLD_": "131072"}, ["MALLOC_MMAP_THRESHOLD_"]),
+        ({**MALLOC, "MALLOC_TRIM_THRESHOLD_": "many"}, ["MALLOC_TRIM_THRESHOLD_"]),
+        (MALLOC, []),
+        ({"GLIBC_TUNABLES": "glibc.malloc.trim_threshold=1073741824"}, []),
+        ({"LD_PRELOAD": "/usr/lib/libjemalloc.so.2"}, []),
+    ],
+)
+def test_malloc_matters_for_large_images(environment: dict[str, str], named: list[str]) -> None:
+    environment = {**dict.fromkeys(PROFILE_VARIABLES, str(SHIPPED)), **environment}
+    advice = transport_advice(4 * MIB, environment, FAST)
+    assert re.findall(r"MALLOC_\w+", advice) == named
+    assert transport_advice(MIB - 1, environment, FAST) == ""
+
+
+BAD = {
+    "no file": None,
+    "empty": "",
+    "no XML": "<profiles",
+    "document type": '<!DOCTYPE p [<!ENTITY a "a">]>' + profile(shm(), used("s")),
+    "too large": profile(shm(), used("s")) + " " * MIB,
+    "no default": profile(shm(), used("s"), default="false"),
+    "unknown transport": profile(shm(), used("x")),
+    "message over segment": profile(shm(MIB, 2 * MIB), used("s")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_profile_is_named(case: str, tmp_path: Path) -> None:
+    path, text = tmp_path / "bad.xml", BAD[case]
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    environment = dict.fromkeys(PROFILE_VARIABLES, str(path))
+    with pytest.raises(ConfigError, match=r"bad\.xml"):
+        shared_memory(environment)
+    assert "bad.xml" in transport_advice(4 * MIB, environment, FAST)
+    assert transport_advice(100_000, environment, FAST) == ""
+
+
+def test_only_what_the_installed_version_reads_counts(tmp_path: Path) -> None:
+    """As seen with both: version 3 warns of the first variable, but it wins."""
+    first, second = PROFILE_VARIABLES
+    for folder in ("2/share/fastrtps", "3/share/fastdds"):
+        (tmp_path / folder).mkdir(parents=True)
+    two, three = ({"AMENT_PREFIX_PATH": f"/nowhere{os.pathsep}{tmp_path / v}"} for v in "23")
+    both = {first: "/first.xml", second: "/second.xml"}
+    for installed in (two, three):
+        assert profile_file({**installed, **both}) == (first, Path("/first.xml"))
+    assert profile_file({**three, second: "/second.xml"}) == (second, Path("/second.xml"))
+    assert profile_file({**two, second: "/second.xml"}) is None
+    advice = transport_advice(4 * MIB, {**two, second: str(SHIPPED), **MALLOC}, FAST)
+    assert f"{second} is not read" in advice
+
+
+def test_a_profile_in_the_working_directory_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with_profile(tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml", profile(shm(3 * MIB), used("s")))
+    assert shared_memory({}).segment_bytes == 3 * MIB
+    assert shared_memory({"SKIP_DEFAULT_XML_FILE": "1"}).segment_bytes == DEFAULT_SEGMENT_BYTES
