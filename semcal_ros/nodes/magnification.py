@@ -25,7 +25,8 @@ __all__ = ["MagnificationInput"]
 _KEPT = 4096
 # Smaller steps back are frames that came late.
 _CLOCK_STEP_NS = 1_000_000_000
-_PATIENCE_S = 1.0
+# Fast DDS offers a latched value once more every 3 s, should the first offer have come before the match.
+_PATIENCE_S = 4.0
 
 
 class MagnificationInput:

@@ -190,7 +190,13 @@ def test_every_turn_of_a_looping_bag_is_as_the_first(
 ) -> None:
     magnifications = [float(g) for g in np.geomspace(600.0, 6000.0, 8).round(1)]
     pictures = write_recording(tmp_path / "bag", magnifications, period_s=0.2)
-    playing = {"bag": tmp_path / "bag", "loop": True, "start_paused": True, "clock": True}
+    playing = {
+        "bag": tmp_path / "bag",
+        "loop": True,
+        "start_paused": True,
+        "clock": True,
+        "wait_for_subscribers": 1,
+    }
     parameters = _parameters(kind, calibration_file, use_sim_time=True)
     turns, count = 3, len(magnifications)
     with bench_of(peer, kind, parameters) as bench:
