@@ -20,8 +20,6 @@ Callback = Callable[[Any, MessageInfo], None]
 
 # What a middleware reports that does not number its messages.
 _NO_NUMBER = 2**64 - 1
-# Of a publisher that has only just begun.
-_FIRST_NUMBERS = 5
 
 
 def published_ns(info: MessageInfo) -> int:
@@ -67,7 +65,7 @@ class AdaptiveSubscription:
         self._refused: list[QoSPolicyKind] = []
         self.topic = topic
         self.lost = 0
-        # How often a publisher has begun to count anew.
+        # How often another publisher has begun.
         self.restarts = 0
         self._foreign_types: set[str] = set()
         self._guard = node.create_guard_condition(self._relax, callback_group=group)
@@ -91,6 +89,7 @@ class AdaptiveSubscription:
 
     def _subscribe(self, options: Any = None) -> Any:
         self._last_number = None
+        self._publishers = 0
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         return self._node.create_subscription(
             self._type,
@@ -111,12 +110,17 @@ class AdaptiveSubscription:
         number = info.get("publication_sequence_number")
         if number is None or number == _NO_NUMBER:
             return
-        # A smaller number is that of a publisher that started anew; several publishers count independently.
         missed = 0 if self._last_number is None else number - self._last_number - 1
-        self.restarts += missed < -1 and number <= _FIRST_NUMBERS
+        publishers = self._subscription.get_publisher_count()
+        # One that was killed still counts for a while, so its successor is one more; one that left is followed by
+        # smaller numbers. Several publishers at once count independently.
+        anew = publishers > self._publishers or (missed < 0 and publishers <= 1)
+        if self._last_number is not None and anew:
+            self.restarts += 1
         # None any more: it has ended since.
-        if missed > 0 and self._subscription.get_publisher_count() <= 1:
+        elif missed > 0 and publishers <= 1:
             self.lost += missed
+        self._publishers = publishers
         self._last_number = number
 
     def take_waiting(self) -> None:
