@@ -27,13 +27,17 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image
-from semcal_ros.files.bags import BagWriter, blank_message
-from semcal_ros.synthetic import Drift, RecordingPlan, VirtualMicroscope, calibration_plan, preset
+from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.synthetic import (
+    Drift,
+    RecordingPlan,
+    VirtualMicroscope,
+    calibration_plan,
+    preset,
+    truth_of,
+)
 from semcal_ros.synthetic.cantilever import CANTILEVER_PUSHES, CantileverPlan, cantilever_plan
 
-START_NS = 1_700_000_000_000_000_000
 GRID = (100, 250, 600, 1200, 2500, 4000, 5500, 7000, 8500, 10000)
 QUICK_GRID = (1500, 4000, 7000, 10000)
 LENGTH_M = 35e-6
@@ -66,23 +70,8 @@ def semcal(*arguments: object) -> None:
 
 def record(plan: RecordingPlan | CantileverPlan, folder: Path) -> None:
     """Write a plan to a bag."""
-    magnification = None
-    with BagWriter(folder, overwrite=True) as writer:
-        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        for index, frame in enumerate(plan.frames):
-            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
-            if frame.magnification != magnification:
-                magnification = frame.magnification
-                value = blank_message("std_msgs/msg/Float64")
-                value.data = magnification
-                writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
-            header = blank_message("std_msgs/msg/Header")
-            fill_header(header, stamp_ns, "sem_optical")
-            image = blank_message("sensor_msgs/msg/Image")
-            fill_image(image, plan.render(index), "mono8", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
-        if isinstance(plan, CantileverPlan):
-            writer.write_text("truth.json", json.dumps(plan.truth(), indent=1))
+    truth = plan.truth() if isinstance(plan, CantileverPlan) else truth_of(plan)
+    write_simulated(folder, plan.frames, map(plan.render, range(len(plan))), truth)
     print(f"{len(plan)} frames: {folder}", flush=True)
 
 
@@ -104,7 +93,7 @@ def config_of(microscope: VirtualMicroscope, folder: Path) -> Path:
 def compare(folder: Path) -> dict[str, float]:
     """Errors against the truth, nm, and errors over stated sigma."""
     truth = json.loads((folder / "bending" / "truth.json").read_text(encoding="utf-8"))["frames"]
-    stamps = {START_NS + round(f["start_time_s"] * 1e9): f for f in truth}
+    stamps = {SIMULATED_START_NS + round(f["start_time_s"] * 1e9): f for f in truth}
     errors: dict[str, list[float]] = defaultdict(list)
     poses: dict[tuple[str, int], list[float]] = defaultdict(list)
     with (folder / "bending.csv").open(encoding="utf-8") as file:

@@ -27,18 +27,15 @@ from tqdm import tqdm
 
 from semcal_ros import Calibration
 from semcal_ros.bridge.config import load_config
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image
 from semcal_ros.cli import main as semcal
 from semcal_ros.core.structure import Keyframe, SequenceTracker
-from semcal_ros.files.bags import BagWriter, blank_message
 from semcal_ros.files.recordings import open_recording
+from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.report.ball_figures import small_png
 from semcal_ros.report.style import INK, OURS, SECOND, new_figure, tidy
 from semcal_ros.synthetic.ball import BallPlan, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
 
-START_NS = 1_700_000_000_000_000_000
 GRID_MAGNIFICATIONS = (100, 500, 1000, 2000, 3000, 4500, 6000, 7500, 9000, 10000)
 CONFIG = """\
 name: virtual SEM, ten strips per second
@@ -66,23 +63,8 @@ def record(plan: BallPlan, path: Path) -> None:
     drawn = Parallel(n_jobs=-1, return_as="generator")(
         delayed(plan.render)(index) for index in range(len(plan))
     )
-    magnification = None
-    with BagWriter(path, overwrite=True) as writer:
-        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        bar = tqdm(drawn, total=len(plan), desc="simulating", unit="frame", disable=None)
-        for frame, pixels in zip(plan.frames, bar, strict=True):
-            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
-            if frame.magnification != magnification:
-                magnification = frame.magnification
-                value = blank_message("std_msgs/msg/Float64")
-                value.data = magnification
-                writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
-            header = blank_message("std_msgs/msg/Header")
-            fill_header(header, stamp_ns, "sem_optical")
-            image = blank_message("sensor_msgs/msg/Image")
-            fill_image(image, pixels, "mono8", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
-        writer.write_text("truth.json", json.dumps(plan.truth()))
+    bar = tqdm(drawn, total=len(plan), desc="simulating", unit="frame", disable=None)
+    write_simulated(path, plan.frames, bar, plan.truth(), overwrite=True)
 
 
 # -- comparison -----------------------------------------------------------------------------------
@@ -130,7 +112,7 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
                 break
             height, width = frame.image.shape
             camera = model.at(frame.magnification).resized(width, height)
-            tracker.add(frame.image, camera, (frame.stamp_ns - START_NS) * 1e-9)
+            tracker.add(frame.image, camera, (frame.stamp_ns - SIMULATED_START_NS) * 1e-9)
     keyframes = tracker.finish()
     chosen = [keyframes[int(k)] for k in np.linspace(0, len(keyframes) - 1, 3)]
     figure = new_figure(9.6, 2.6)

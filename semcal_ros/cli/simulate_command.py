@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image
 from semcal_ros.cli.common import overwrite_option, progress
-from semcal_ros.files.bags import BagWriter, blank_message
+from semcal_ros.files.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
     DRIFTS,
@@ -31,11 +28,6 @@ from semcal_ros.synthetic import (
 )
 
 __all__ = ["command"]
-
-# An arbitrary but fixed start keeps recordings of one seed identical.
-_START_NS = 1_700_000_000_000_000_000
-_MAGNIFICATION_LEAD_NS = 1_000_000
-_FRAME_ID = "sem_optical"
 
 
 @click.command("simulate")
@@ -114,7 +106,9 @@ def command(
     recording = _planned(
         plan, microscope, detector, specimen, drift_name, magnifications, views, frames, seed
     )
-    _record(recording, output, overwrite)
+    with progress(len(recording), "simulating") as bar:
+        bar.iterable = map(recording.render, range(len(recording)))
+        write_simulated(output, recording.frames, bar, truth_of(recording), overwrite=overwrite)
     click.echo(f"{len(recording)} frames: {output}")
 
 
@@ -177,27 +171,3 @@ def _planned(
     if drift_name is not None:
         made = replace(made, drift=drift_preset(drift_name))
     return made
-
-
-def _record(recording: RecordingPlan, output: Path, overwrite: bool) -> None:
-    magnification = None
-    with (
-        BagWriter(output, overwrite=overwrite) as writer,
-        progress(len(recording), "simulating") as bar,
-    ):
-        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        for index, frame in enumerate(recording.frames):
-            stamp_ns = _START_NS + round(frame.start_time_s * 1e9)
-            if frame.magnification != magnification:
-                magnification = frame.magnification
-                value = blank_message("std_msgs/msg/Float64")
-                value.data = magnification
-                writer.write("/sem/magnification", stamp_ns - _MAGNIFICATION_LEAD_NS, value)
-            header = blank_message("std_msgs/msg/Header")
-            fill_header(header, stamp_ns, _FRAME_ID)
-            pixels = recording.render(index)
-            image = blank_message("sensor_msgs/msg/Image")
-            fill_image(image, pixels, "mono8" if pixels.dtype.itemsize == 1 else "mono16", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
-            bar.update(1)
-        writer.write_text("truth.json", json.dumps(truth_of(recording), indent=1))

@@ -1,0 +1,78 @@
+"""Simulated frames into a bag, their truth beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import fill_image
+from semcal_ros.files.bags import BagWriter, blank_message
+
+__all__ = ["SIMULATED_START_NS", "write_simulated"]
+
+SIMULATED_START_NS = 1_700_000_000_000_000_000
+"""Stamp of time zero, ns: arbitrary but fixed, which keeps recordings of one seed identical."""
+
+_MAGNIFICATION_LEAD_NS = 1_000_000
+_FRAME_ID = "sem_optical"
+
+
+class SimulatedFrame(Protocol):
+    """What is known of a frame before it is drawn."""
+
+    @property
+    def start_time_s(self) -> float:
+        """When the scan of the frame begins."""
+
+    @property
+    def magnification(self) -> float:
+        """At which it is scanned."""
+
+
+def write_simulated(
+    folder: Path,
+    frames: Iterable[SimulatedFrame],
+    pictures: Iterable[NDArray[Any]],
+    truth: Any,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write frames to a bag with the topics of ``virtual_sem``, and ``truth.json``.
+
+    Parameters
+    ----------
+    folder
+        The bag.
+    frames, pictures
+        As many of both; pictures of 8 or 16 bit, drawn while they are written.
+    truth
+        Plain data in SI units.
+    overwrite
+        Whether a bag that is there may be replaced.
+
+    Raises
+    ------
+    BagError
+        The folder is there and ``overwrite`` is not set, or cannot be written; then nothing is left of it.
+    """
+    magnification = None
+    with BagWriter(folder, overwrite=overwrite) as writer:
+        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
+        for frame, pixels in zip(frames, pictures, strict=True):
+            stamp_ns = SIMULATED_START_NS + round(frame.start_time_s * 1e9)
+            if frame.magnification != magnification:
+                magnification = frame.magnification
+                value = blank_message("std_msgs/msg/Float64")
+                value.data = magnification
+                writer.write("/sem/magnification", stamp_ns - _MAGNIFICATION_LEAD_NS, value)
+            header = blank_message("std_msgs/msg/Header")
+            fill_header(header, stamp_ns, _FRAME_ID)
+            image = blank_message("sensor_msgs/msg/Image")
+            fill_image(image, pixels, "mono8" if pixels.dtype.itemsize == 1 else "mono16", header)
+            writer.write("/sem/image_raw", stamp_ns, image)
+        writer.write_text("truth.json", json.dumps(truth, indent=1))
