@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,6 +23,9 @@ from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import collect_views, find_views, named_frames
 
 __all__ = ["command"]
+
+# That of a stage, where the calibration does not say.
+_HEIGHT_SIGMA_M = 1e-4
 
 
 @click.command("evaluate")
@@ -54,11 +60,10 @@ def command(
         display_width_m=microscope.display_width_m,
         squares_m=microscope.squares_m,
     )
-    height = model.statistics.get("priors", {}).get("height_sigma_m", 1e-4)
     fit = fit_poses(
         collected.views,
         lambda g: model.at(g).resized(*collected.image_size),
-        height_sigma_m=float(height),
+        height_sigma_m=_height_sigma_m(model.statistics),
     )
     by_magnification = rms_by_magnification(fit)
     low, high = model.magnification_range
@@ -91,3 +96,12 @@ def command(
         f"{len(collected.views)} of {len(collected.views) + len(collected.rejected)} views, "
         f"RMS {fit.rms_px():.4f} px"
     )
+
+
+def _height_sigma_m(statistics: Mapping[str, Any]) -> float:
+    """The prior of the heights in the calibration; its statistics are for reading, and may have been edited."""
+    priors = statistics.get("priors")
+    height = priors.get("height_sigma_m") if isinstance(priors, Mapping) else None
+    if isinstance(height, (int, float)) and 0.0 < height < math.inf:
+        return float(height)
+    return _HEIGHT_SIGMA_M

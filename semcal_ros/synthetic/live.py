@@ -23,11 +23,13 @@ Array = NDArray[np.float64]
 
 # Changes of magnification that are remembered, for frames that have begun before them.
 _TURNS = 16
+# Commands of the stage that are remembered, for the same.
+_COMMANDS_KEPT = 32
 
 
 @dataclass(frozen=True)
 class VirtualStage:
-    """Stage position under the last commanded velocity.
+    """Stage position under the commanded velocities.
 
     Parameters
     ----------
@@ -39,6 +41,9 @@ class VirtualStage:
         Rotation about the beam at that time, from x towards y.
     velocity_m_s, turn_rad_s
         The command, valid from then on.
+    before
+        The stage before that command, for the rows of a frame that were scanned earlier; the oldest of
+        ``_COMMANDS_KEPT`` rests before its command.
     """
 
     time_s: float = 0.0
@@ -46,6 +51,7 @@ class VirtualStage:
     rotation_rad: float = 0.0
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     turn_rad_s: float = 0.0
+    before: VirtualStage | None = None
 
     def commanded(
         self, time_s: float, velocity_m_s: tuple[float, float], turn_rad_s: float = 0.0
@@ -68,17 +74,34 @@ class VirtualStage:
             )
         x, y = self.position_at(time_s)[0]
         return VirtualStage(
-            time_s, (float(x), float(y)), self.rotation_at(time_s), velocity_m_s, turn_rad_s
+            time_s,
+            (float(x), float(y)),
+            self.rotation_at(time_s),
+            velocity_m_s,
+            turn_rad_s,
+            self._recent(_COMMANDS_KEPT - 1),
         )
 
+    def _recent(self, commands: int) -> VirtualStage:
+        before = None if commands <= 1 or self.before is None else self.before._recent(commands - 1)
+        return replace(self, before=before)
+
     def position_at(self, time_s: ArrayLike) -> Array:
-        """Positions (n, 2) in m at times (n,); before the last command, that command's position."""
-        elapsed = np.maximum(np.atleast_1d(np.asarray(time_s, dtype=np.float64)) - self.time_s, 0.0)
-        travel: Array = elapsed[:, None] * np.array(self.velocity_m_s)
-        return np.array(self.position_m) + travel
+        """Positions (n, 2) in m at times (n,)."""
+        times = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
+        elapsed = np.maximum(times - self.time_s, 0.0)
+        positions: Array = np.array(self.position_m) + elapsed[:, None] * np.array(
+            self.velocity_m_s
+        )
+        earlier = times < self.time_s
+        if self.before is not None and earlier.any():
+            positions[earlier] = self.before.position_at(times[earlier])
+        return positions
 
     def rotation_at(self, time_s: float) -> float:
         """Rotation in rad at a time."""
+        if time_s < self.time_s and self.before is not None:
+            return self.before.rotation_at(time_s)
         return self.rotation_rad + max(time_s - self.time_s, 0.0) * self.turn_rad_s
 
 

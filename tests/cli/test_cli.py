@@ -10,26 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from semcal_runs import refused, run
 
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.cli import main
 from semcal_ros.files.bags import open_bag
 
 COMMANDS = ["at", "calibrate", "drift", "evaluate", "import", "info", "play", "rectify", "simulate"]
-
-
-def run(*arguments: object) -> int:
-    return main([str(a) for a in arguments])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one line that a refused command prints."""
-    capsys.readouterr()
-    assert run(*arguments) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert "Traceback" not in lines[0]
-    return lines[0]
 
 
 @pytest.fixture(scope="session")
@@ -96,6 +83,14 @@ def test_evaluate_on_views_that_were_not_used(folder, capsys):
     # Corner noise of the default detector is about 0.03 px.
     assert answer["views"] == 2
     assert answer["rms_px"] < 0.1
+    # Its statistics are notes: what stands in them must not matter.
+    edited = folder / "edited.yaml"
+    text = yaml.safe_load((folder / "cal.yaml").read_text())
+    for priors in (3, {"height_sigma_m": "low"}, {"height_sigma_m": -1.0}):
+        text["statistics"] = {"priors": priors}
+        edited.write_text(yaml.safe_dump(text))
+        assert run("evaluate", edited, other, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["views"] == 2
 
 
 def test_rectify_pairs_every_image_with_a_camera_info(folder):

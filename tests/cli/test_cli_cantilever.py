@@ -12,15 +12,13 @@ import numpy as np
 import pytest
 from semcal_runs import refused, run
 
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.files.bags import BagWriter, blank_message
+from semcal_ros.files.simulated import write_simulated
 from semcal_ros.synthetic import Drift, preset
 from semcal_ros.synthetic.cantilever import CantileverPlan, cantilever_plan
 
-SIZE, START_NS = 256, 1_700_000_000_000_000_000
+SIZE = 256
 SCOPE = preset("ideal").with_image_size(SIZE, SIZE)
 PLAN = cantilever_plan(
     SCOPE,
@@ -37,19 +35,10 @@ def recorded(
     path: Path, plan: CantileverPlan, images: dict[int, np.ndarray], frames: Iterable[int]
 ):
     """A bag of some frames of a plan."""
-    with BagWriter(path) as writer:
-        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        for index in frames:
-            frame = plan.frames[index]
-            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
-            value = blank_message("std_msgs/msg/Float64")
-            value.data = frame.magnification
-            writer.write("/sem/magnification", stamp_ns - 1_000_000, value)
-            header = blank_message("std_msgs/msg/Header")
-            fill_header(header, stamp_ns, "sem_optical")
-            image = blank_message("sensor_msgs/msg/Image")
-            fill_image(image, images[index], "mono8", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
+    chosen = list(frames)
+    write_simulated(
+        path, [plan.frames[k] for k in chosen], [images[k] for k in chosen], plan.truth()
+    )
     return path
 
 

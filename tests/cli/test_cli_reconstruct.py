@@ -7,23 +7,15 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from semcal_runs import run
 
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import fill_image
-from semcal_ros.cli import main
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.structure import SurfaceMesh
-from semcal_ros.files.bags import BagWriter, blank_message
 from semcal_ros.files.meshes import mesh_bytes, save_cloud, save_mesh
+from semcal_ros.files.simulated import write_simulated
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
-
-START_NS = 1_700_000_000_000_000_000
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +40,7 @@ def folder(tmp_path_factory):
         # Less noise than a fast scan has, as there are few frames.
         detector=Detector(electrons=400.0),
     )
-    with BagWriter(base / "ball") as writer:
-        writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        for index, frame in enumerate(plan.frames):
-            stamp_ns = START_NS + round(frame.start_time_s * 1e9)
-            value = blank_message("std_msgs/msg/Float64")
-            value.data = frame.magnification
-            writer.write("/sem/magnification", stamp_ns - 1, value)
-            header = blank_message("std_msgs/msg/Header")
-            fill_header(header, stamp_ns, "sem_optical")
-            image = blank_message("sensor_msgs/msg/Image")
-            fill_image(image, plan.render(index), "mono8", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
+    write_simulated(base / "ball", plan.frames, map(plan.render, range(len(plan))), plan.truth())
     return base
 
 

@@ -233,10 +233,24 @@ def test_stage_integrates_its_commands() -> None:
     stage = stage.commanded(6.0, (0.0, 0.0))
     assert stage.position_at([6.0, 50.0]) == pytest.approx(np.array([[3e-6, -2e-6]] * 2))
     assert stage.rotation_at(50.0) == pytest.approx(0.1)
+    # Rows scanned before a command moved as was commanded then.
+    earlier = stage.position_at([0.0, 2.0, 3.0, 5.5])
+    assert earlier == pytest.approx(np.array([[0.0, 0.0], [0.0, 0.0], [1e-6, 0.0], [3e-6, -1e-6]]))
+    assert stage.rotation_at(5.5) == pytest.approx(0.05)
     with pytest.raises(InvalidValueError, match="not before"):
         stage.commanded(5.9, (0.0, 0.0))
     with pytest.raises(InvalidValueError, match="finite"):
         stage.commanded(7.0, (math.nan, 0.0))
+
+
+def test_a_stage_that_is_commanded_for_hours_keeps_no_more_than_it_needs() -> None:
+    stage = VirtualStage()
+    for second in range(2000):
+        stage = stage.commanded(float(second), (1e-9, 0.0))
+    kept = 0
+    while stage.before is not None:
+        kept, stage = kept + 1, stage.before
+    assert 4 < kept < 100
 
 
 def test_a_frame_after_a_move_is_the_frame_of_the_moved_specimen() -> None:
