@@ -73,9 +73,17 @@ class Session:
 
     def show(self, picture: np.ndarray, g: float) -> None:
         """Publish a frame and wait until the server has it."""
+        self.publish(picture, g)
+        self.wait_seen(g)
+
+    def publish(self, picture: np.ndarray, g: float) -> None:
+        """Publish a frame."""
         self.published += 1
         self.magnification.publish(magnification_message(g))
         self.image.publish(image_message(picture, stamp_s=float(self.published)))
+
+    def wait_seen(self, g: float) -> None:
+        """Wait until the server has all frames and the magnification of the last."""
 
         def seen() -> bool:
             state = self.peer.state(SERVER)

@@ -105,7 +105,7 @@ def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> Non
         "ok", "/sem/image_raw", "/sem/virtual_sem", "/sem/stream_corrector", "reliable"
     )
     assert report.has("ok", "images", "Hz", "96 x 96 mono8")
-    assert report.has("ok", "/sem/image_rect", "Hz"), report.findings
+    assert report.has("ok", "/sem/image_rect", "Hz"), "\n".join(report.said("ok"))
     assert report.has("ok", "stamps", "ms old")
     assert report.has("ok", "clocks", "from publisher to here")
     assert report.has("ok", "magnification", "1000")
