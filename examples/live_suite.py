@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -12,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from ament_index_python.packages import get_package_prefix
+from live_nodes import LiveNodes
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
@@ -24,11 +22,6 @@ from semcal_ros.bridge.images import image_from_message
 NODES = ("parameter_server", "drift_compensator", "stream_corrector")
 IMAGES = ("image_raw", "image_stabilized", "image_rect")
 TIMEOUT_S = 60.0
-PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-MALLOC_VARIABLES = (
-    ("MALLOC_MMAP_THRESHOLD_", "268435456"),
-    ("MALLOC_TRIM_THRESHOLD_", "536870912"),
-)
 # Nothing new for so long after the end of the replay: what is missing was overtaken by newer frames.
 SILENCE_S = 3.0
 
@@ -56,62 +49,36 @@ class LiveSuite:
     """Context manager around the node processes and this process's own subscriber."""
 
     def __init__(self, logs: Path, *, config: str, calibration: Path) -> None:
-        # A domain of its own, so that the demo neither hears nor disturbs anybody else's robots.
-        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        prefix = Path(get_package_prefix("semcal_ros"))
-        profile = str(prefix / "share" / "semcal_ros" / "dds" / "fastdds_large_images.xml")
-        # As the launch files do: shared memory for whole images, and memory that is used again. A
-        # profile of the user's own stays.
-        if not any(name in os.environ for name in PROFILE_VARIABLES):
-            os.environ.update(dict.fromkeys(PROFILE_VARIABLES, profile))
-        for name, value in MALLOC_VARIABLES:
-            os.environ.setdefault(name, value)
-        self._executables = prefix / "lib" / "semcal_ros"
-        self._logs = logs
+        self._nodes = LiveNodes(logs)
         self._parameters = {
             "config": config,
             "calibration": str(calibration.absolute()),
             # Live, the newest frame wins; here all frames are to be measured, however busy the machine is.
             "qos_overrides./sem/image_raw.subscription.depth": "50",
         }
-        self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> LiveSuite:
-        self._logs.mkdir(parents=True, exist_ok=True)
         for name in NODES:
             parameters = dict(self._parameters)
             if name == "drift_compensator":
                 del parameters["calibration"]
             if name != "parameter_server":
                 parameters["drift_tracking"] = "every_frame"
-            self._start(name, parameters)
+            self._nodes.start(name, parameters)
         rclpy.init()
         self._node = rclpy.create_node("demo", namespace="/sem")
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for process in self._processes:
-            process.send_signal(signal.SIGINT)
-        for process in self._processes:
-            process.wait(TIMEOUT_S)
+        self._nodes.end()
         self._node.destroy_node()
         rclpy.try_shutdown()
-
-    def _start(self, name: str, parameters: dict[str, str]) -> subprocess.Popen[bytes]:
-        command = [str(self._executables / name), "--ros-args", "-r", "__ns:=/sem"]
-        for key, value in parameters.items():
-            command += ["-p", f"{key}:={value}"]
-        with open(self._logs / f"{name}.log", "wb") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        self._processes.append(process)
-        return process
 
     def replay(self, bag: Path, *, frames: int, rate: float) -> Received:
         """Replay a recording; returns what arrived when every frame has come through, or nothing comes any more."""
         received = Received()
         self._subscribe(received)
-        player = self._start(
+        player = self._nodes.start(
             "bag_player",
             {
                 "bag": str(bag.absolute()),
@@ -149,8 +116,7 @@ class LiveSuite:
         seen, last_s = 0, time.monotonic()
         while min(received.counts()[topic] for topic in topics) < frames:
             rclpy.spin_once(self._node, timeout_sec=0.1)
-            if any(process.poll() for process in self._processes):
-                raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+            self._nodes.check()
             total = sum(received.counts().values())
             if total > seen or player.poll() is None:
                 seen, last_s = total, time.monotonic()

@@ -6,9 +6,11 @@
    scale of the display, with the interpolated calibration, and with the continuous one.
 3. What is judged is where the target really is.
 
-    python examples/visual_servo.py [--quick] [--live] [--preset jsm820] [--drift slow] [--fixed-axis] [--output FOLDER]
+    python examples/visual_servo.py [--quick] [--live | --replay] [--preset jsm820] [--drift slow] [--fixed-axis]
 
 With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
+With --replay the frames of the continuous case become a recording, which bag_player replays to the nodes: what
+visual_servo says of each frame is compared with the truth.
 """
 
 from __future__ import annotations
@@ -144,6 +146,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer frames and magnifications")
     parser.add_argument("--live", action="store_true", help="the nodes, over ROS")
+    parser.add_argument(
+        "--replay", action="store_true", help="the recording, replayed to the nodes"
+    )
+    parser.add_argument("--rate", type=float, default=1.0, help="of the replay")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="jsm820")
     parser.add_argument("--drift", choices=tuple(DRIFTS), default="slow")
     parser.add_argument("--seed", type=int, default=0)
@@ -166,6 +172,12 @@ def main() -> int:
         return 0
     settings = ServoSettings(axis_sigma_px=0.0) if options.fixed_axis else ServoSettings()
     task = Task(scope, START, GOAL, schedule(options.quick), options.drift, options.seed, settings)
+    if options.replay:
+        from visual_servo_replay import replayed
+
+        run = servo_run(task, cases_of(scope, continuous, discrete)[-1])
+        replayed(options.output, run, scope, GOAL, options.rate)
+        return 0
     work = Parallel(n_jobs=min(cpu_count(), 3))
     cases = cases_of(scope, continuous, discrete)
     runs = work(delayed(servo_run)(task, case) for case in cases)

@@ -7,10 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,6 +14,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
+from live_nodes import LiveNodes
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -42,8 +39,6 @@ class Suite:
     """The nodes, and what this process hears of them."""
 
     def __init__(self, folder: Path, preset: str, drift: str, seed: int, goal: PlanePose) -> None:
-        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         calibrated = {"calibration": (folder / "cal.yaml").absolute()}
         parameters = {
             "parameter_server": calibrated,
@@ -62,9 +57,9 @@ class Suite:
                 "rotation_deg": 22.0,
             },
         }
-        self._logs = folder / "logs"
-        self._logs.mkdir(exist_ok=True)
-        self._processes = [self._started(name, parameters[name]) for name in NODES]
+        self._nodes = LiveNodes(folder / "logs")
+        for name in NODES:
+            self._nodes.start(name, {"config": "virtual_sem", **parameters[name]})
         rclpy.init()
         self._node = rclpy.create_node("referee", namespace="/sem")
         self._executor = SingleThreadedExecutor()
@@ -80,15 +75,6 @@ class Suite:
         self._start = self._node.create_client(Trigger, "visual_servo/start")
         self.knob = self._node.create_publisher(Float64, "virtual_sem/set_magnification", queue)
 
-    def _started(self, name: str, parameters: dict[str, object]) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", f"semcal_ros.nodes.{name}"]
-        command += ["--ros-args", "-r", "__ns:=/sem", "-p", "config:=virtual_sem"]
-        for key, value in parameters.items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            command += ["-p", f"{key}:={text}"]
-        with open(self._logs / f"{name}.log", "wb") as log:
-            return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-
     def _on_image(self, message: Image) -> None:
         self.images[stamp_ns_from_msg(message)] = image_from_message(message).copy()
 
@@ -99,10 +85,7 @@ class Suite:
 
     def close(self) -> None:
         """End the nodes, the servo before the microscope."""
-        for process in self._processes:
-            process.send_signal(signal.SIGINT)
-        for process in self._processes:
-            process.wait(30.0)
+        self._nodes.end()
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown()
@@ -112,8 +95,7 @@ class Suite:
         until = time.monotonic() + limit_s
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
-            if any(process.poll() is not None for process in self._processes):
-                raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+            self._nodes.check()
             if time.monotonic() > until:
                 return False
         return True

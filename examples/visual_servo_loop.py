@@ -65,6 +65,9 @@ class Run:
     axis_sigma_px: list[float] = field(default_factory=list)
     converged: list[bool] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
+    start_s: list[float] = field(default_factory=list)
+    twist: list[np.ndarray] = field(default_factory=list)
+    raw: list[np.ndarray] = field(default_factory=list)
     images: dict[float, np.ndarray] = field(default_factory=dict)
 
     def true_m(self) -> np.ndarray:
@@ -138,6 +141,9 @@ def _record(run: Run, task: Task, g: float, frame, step) -> None:
     error = truth.minus(task.goal)
     slope = task.microscope.camera_at(g).ideal_from_sem_jacobian
     run.magnification.append(g)
+    run.start_s.append(frame.start_time_s)
+    run.twist.append(step.twist)
+    run.raw.append(frame.image)
     run.true_error.append(error)
     run.true_px.append(float(np.hypot(*(slope @ error[:2]))))
     run.own_px.append(step.error_px)

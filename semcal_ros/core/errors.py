@@ -14,6 +14,7 @@ __all__ = [
     "InvalidValueError",
     "MessageError",
     "SemcalError",
+    "StructureError",
     "TiffError",
 ]
 
@@ -65,6 +66,10 @@ class MessageError(SemcalError):
 
 class BagError(SemcalError):
     """A recording cannot be read or written."""
+
+
+class StructureError(SemcalError):
+    """The views do not allow a reconstruction."""
 
 
 class TiffError(SemcalError):

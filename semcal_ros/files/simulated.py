@@ -40,6 +40,7 @@ def write_simulated(
     pictures: Iterable[NDArray[Any]],
     truth: Any,
     *,
+    delay_s: float = 0.0,
     overwrite: bool = False,
 ) -> None:
     """Write frames to a bag with the topics of ``virtual_sem``, and ``truth.json``.
@@ -52,6 +53,8 @@ def write_simulated(
         As many of both; pictures of 8 or 16 bit, drawn while they are written.
     truth
         Plain data in SI units.
+    delay_s
+        From the stamp of a frame until it was published.
     overwrite
         Whether a bag that is there may be replaced.
 
@@ -74,5 +77,5 @@ def write_simulated(
             fill_header(header, stamp_ns, _FRAME_ID)
             image = blank_message("sensor_msgs/msg/Image")
             fill_image(image, pixels, "mono8" if pixels.dtype.itemsize == 1 else "mono16", header)
-            writer.write("/sem/image_raw", stamp_ns, image)
+            writer.write("/sem/image_raw", stamp_ns + round(delay_s * 1e9), image)
         writer.write_text("truth.json", json.dumps(truth, indent=1))

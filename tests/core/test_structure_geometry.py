@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from structure_scenes import RADIUS_M, aligned_rms_m, ball_scene
 
+from semcal_ros.core.errors import StructureError
 from semcal_ros.core.structure import (
     Observations,
-    StructureError,
     Tracks,
     adjust,
     factorize,

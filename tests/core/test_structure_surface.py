@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.structure import StructureError, fit_sphere, mesh_of_cloud
+from semcal_ros.core.errors import StructureError
+from semcal_ros.core.structure import fit_sphere, mesh_of_cloud
 from semcal_ros.core.structure.mls import local_surface
 
 RADIUS_M = 450e-9

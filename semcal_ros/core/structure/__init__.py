@@ -13,7 +13,7 @@ from semcal_ros.core.structure.keyframes import Keyframe, SequenceTracker, Track
 from semcal_ros.core.structure.mesh import SurfaceMesh, mesh_of_cloud
 from semcal_ros.core.structure.reconstruct import Structure, StructureSettings, reconstruct
 from semcal_ros.core.structure.sphere import SphereFit, fit_sphere
-from semcal_ros.core.structure.types import Observations, StructureError, Tracks
+from semcal_ros.core.structure.types import Observations, Tracks
 from semcal_ros.core.structure.upgrade import MetricUpgrade, mirrored, upgrade_to_metric
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "SequenceTracker",
     "SphereFit",
     "Structure",
-    "StructureError",
     "StructureSettings",
     "SurfaceMesh",
     "TrackerSettings",

@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from semcal_ros.core.structure.types import StructureError
+from semcal_ros.core.errors import StructureError
 
 __all__ = ["SurfaceMesh", "mesh_of_cloud"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semcal_ros.core.structure.types import StructureError
+from semcal_ros.core.errors import StructureError
 
 __all__ = ["LocalSurface", "local_surface", "typical_spacing_m"]
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.errors import StructureError
 from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.structure.adjustment import Adjustment, adjust
 from semcal_ros.core.structure.appearance import Appearance, appearance_of
@@ -18,7 +19,7 @@ from semcal_ros.core.structure.keyframes import Keyframe
 from semcal_ros.core.structure.mls import local_surface, typical_spacing_m
 from semcal_ros.core.structure.patches import WINDOW, PatchSettings, Posed, measure_patches
 from semcal_ros.core.structure.raster_motion import plane_at_centre
-from semcal_ros.core.structure.types import Observations, StructureError, Tracks
+from semcal_ros.core.structure.types import Observations, Tracks
 from semcal_ros.core.structure.upgrade import mirrored, upgrade_to_metric
 
 __all__ = ["Structure", "StructureSettings", "mirror_of", "reconstruct", "tracks_of"]

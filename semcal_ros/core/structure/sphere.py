@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.structure.types import StructureError
+from semcal_ros.core.errors import StructureError
 
 __all__ = ["SphereFit", "fit_sphere"]
 

@@ -9,17 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Observations", "StructureError", "Tracks", "camera_table"]
+__all__ = ["Observations", "Tracks", "camera_table"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
-
-
-class StructureError(SemcalError):
-    """The views do not allow a reconstruction."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from semcal_ros.core.errors import StructureError
 from semcal_ros.core.structure.factorization import AffineStructure
-from semcal_ros.core.structure.types import StructureError
 
 __all__ = ["MetricUpgrade", "mirrored", "upgrade_to_metric"]
 

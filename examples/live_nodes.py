@@ -1,0 +1,61 @@
+"""Executables of the suite as processes of their own, set up as the launch files do it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+from ament_index_python.packages import get_package_prefix
+
+END_S = 60.0
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+MALLOC_VARIABLES = (
+    ("MALLOC_MMAP_THRESHOLD_", "268435456"),
+    ("MALLOC_TRIM_THRESHOLD_", "536870912"),
+)
+
+
+class LiveNodes:
+    """Started nodes, below /sem; what they print goes to files in ``logs``."""
+
+    def __init__(self, logs: Path) -> None:
+        # A domain of its own, so that an example neither hears nor disturbs anybody else's robots.
+        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        prefix = Path(get_package_prefix("semcal_ros"))
+        profile = str(prefix / "share" / "semcal_ros" / "dds" / "fastdds_large_images.xml")
+        # Shared memory for whole images, and memory that is used again. A profile of the user's own stays.
+        if not any(name in os.environ for name in PROFILE_VARIABLES):
+            os.environ.update(dict.fromkeys(PROFILE_VARIABLES, profile))
+        for name, value in MALLOC_VARIABLES:
+            os.environ.setdefault(name, value)
+        self._executables = prefix / "lib" / "semcal_ros"
+        self._logs = logs
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self, name: str, parameters: Mapping[str, object]) -> subprocess.Popen[bytes]:
+        """Start an executable with parameters."""
+        command = [str(self._executables / name), "--ros-args", "-r", "__ns:=/sem"]
+        for key, value in parameters.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ["-p", f"{key}:={text}"]
+        with open(self._logs / f"{name}.log", "wb") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        self._processes.append(process)
+        return process
+
+    def check(self) -> None:
+        """Raise if one has failed."""
+        if any(process.poll() for process in self._processes):
+            raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+
+    def end(self) -> None:
+        """End them in the order in which they were started."""
+        for process in self._processes:
+            process.send_signal(signal.SIGINT)
+        for process in self._processes:
+            process.wait(END_S)
