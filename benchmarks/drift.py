@@ -23,7 +23,7 @@ import numpy as np
 from drift_methods import METHODS, PREDICTION_PX, UNIT, Answer, Method, phase_correlate_pictures
 from drift_scores import WRONG_PX, Score
 from drift_truth import KINDS, MAGNIFICATION, Pair, Scene, Views, large_shifts, small_shifts
-from live import pictures
+from live_scenes import pictures
 from table import interleaved, quick_from_command_line, show
 
 from semcal_ros.core.drift import DriftTracker

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -49,6 +51,15 @@ def test_a_public_module_says_what_it_offers(path: Path) -> None:
         and not (isinstance(node, ast.ImportFrom) and node.module == "__future__")
     ]
     assert "__all__" in names or not body
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "examples"])
+def test_scripts_find_what_they_import(folder: str) -> None:
+    """Benchmarks are not run here, so that a name that has moved would be noticed late."""
+    names = sorted(path.stem for path in (ROOT / folder).glob("*.py"))
+    command = [sys.executable, "-W", "error", "-c", f"import {', '.join(names)}"]
+    done = subprocess.run(command, cwd=ROOT / folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def _version_of_setup() -> str:
