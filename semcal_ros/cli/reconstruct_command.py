@@ -54,7 +54,7 @@ __all__ = ["command"]
 @click.option(
     "--spacing",
     type=click.FloatRange(3.0, 100.0),
-    default=6.0,
+    default=5.0,
     show_default=True,
     help="Least distance of features in px.",
 )

@@ -59,7 +59,7 @@ class TrackerSettings:
         Only this far from the features of the last frame is looked at.
     """
 
-    spacing_px: float = 6.0
+    spacing_px: float = 5.0
     max_features: int = 1500
     window_px: int = 21
     levels: int = 3

@@ -1,0 +1,79 @@
+"""The examples run, in their short form, and come near to the truth that they know."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# They make their recordings and calibrations themselves.
+pytestmark = pytest.mark.timeout(400)
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def ran(name: str, *arguments: object) -> str:
+    """What an example prints."""
+    command = [sys.executable, str(EXAMPLES / name), "--quick", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_cantilever(tmp_path: Path) -> None:
+    printed = ran("cantilever.py", "--only", "whole", "--output", tmp_path / "out")
+    out = tmp_path / "out" / "whole"
+    truth = json.loads((out / "bending" / "truth.json").read_text())["frames"]
+    with (out / "bending.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(truth)
+    measured = np.array([float(row["deflection_m"]) for row in rows])
+    sigma = np.array([float(row["sigma_m"]) for row in rows])
+    error = measured - [frame["deflection_m"] for frame in truth]
+    # Four magnifications with three views each are a poor calibration, and half the pixels of the whole example.
+    assert np.sqrt(np.mean(error**2)) < 6e-9
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
+    assert "spread between magnifications" in printed
+    for name in ("poses.png", "strip.png"):
+        assert (out / name).read_bytes()[1:4] == b"PNG"
+
+
+def test_nano_ball(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran("nano_ball.py", "--output", out)
+    result = json.loads((out / "summary.json").read_text())
+    # As asked of the whole example.
+    assert result["points_on_ball"] >= 264
+    assert abs(result["diameter_error_percent"]) < 1.0
+    assert result["interval_holds_truth"] == 1.0
+    # A third of a pixel.
+    assert result["points_rms_nm"] < 3.0
+    for name in ("nano_ball_mesh.png", "nano_ball_tracks.png", "nano_ball_error.png"):
+        assert (out / name).read_bytes()[1:4] == b"PNG"
+
+
+def test_visual_servo(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran("visual_servo.py", "--output", out)
+    results = json.loads((out / "results.json").read_text())
+    final = {name: result["final_true_px"] for name, result in results.items()}
+    # Two steps of the magnification are too few to learn the axis well; what they leave is under a pixel.
+    assert final["continuous"] < 1.0
+    assert final["continuous"] < min(final["interpolated"], final["uncalibrated"])
+    assert (out / "visual_servo.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_visual_servo_on_a_replay(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran("visual_servo.py", "--replay", "--rate", 2, "--output", out)
+    rows = json.loads((out / "replay.json").read_text())
+    assert [row["magnification"] for row in rows] == [500.0, 1600.0, 5000.0]
+    # The first frame has none before it.
+    assert sum(row["measured"] for row in rows) >= sum(row["frames"] for row in rows) - 2
+    # A pixel is 47 nm at 5000x.
+    assert rows[-1]["rms_nm"] < 24.0
