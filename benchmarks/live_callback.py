@@ -173,10 +173,6 @@ def node_actions(
     known = corrector._drift._known.update
     camera = calibration().at(MAGNIFICATION).resized(size, size)
     tracker, corrector._drift = corrector._drift, KnownDrift(corrector._drift, known, camera)
-    held = {"frame": None}
-
-    def keep(frame: Any) -> None:
-        held["frame"] = frame
 
     def registration() -> None:
         clock["ns"] += 100_000_000
