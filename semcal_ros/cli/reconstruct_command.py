@@ -208,6 +208,11 @@ def _doubts(structure: Structure, timed: bool) -> list[str]:
         )
     if not structure.adjustment.converged:
         notes.append("the adjustment did not converge")
+    if not structure.settled:
+        notes.append(
+            f"measuring did not settle in {structure.passes} passes: points still moved by more than"
+            " half of their 1-sigma"
+        )
     return notes
 
 
@@ -218,6 +223,7 @@ def _result(structure: Structure, ball: Ball, frames: int) -> dict[str, Any]:
         "views": len(structure.cameras),
         "points": len(structure.points_m),
         "points_on_ball": int(np.count_nonzero(ball.sphere.inliers)),
+        "passes": structure.passes,
         "median_views_per_point": float(np.median(counts)),
         "residual_rms_px": structure.adjustment.rms_px,
         "vertices": len(ball.mesh.vertices_m),

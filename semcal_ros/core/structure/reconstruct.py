@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import StructureError
@@ -37,8 +38,10 @@ class StructureSettings:
     ----------
     patches
         Comparison of patches.
-    passes
-        How often patches are measured and adjusted.
+    most_passes
+        How often patches are measured and adjusted at most.
+    settled_sigma
+        Enough when a pass moves the points by less than this many of their 1-sigma (RMS).
     smoothing_px
         Sigma of the smoothing of patches.
     least_track
@@ -54,7 +57,8 @@ class StructureSettings:
     """
 
     patches: PatchSettings = field(default_factory=PatchSettings)
-    passes: int = 3
+    most_passes: int = 10
+    settled_sigma: float = 0.5
     smoothing_px: float = 1.3
     least_track: int = 4
     least_views: int = 6
@@ -96,6 +100,8 @@ class Structure:
         near 0 it cannot tell, and negative values speak against the choice.
     patch_sigma_m
         Sigma of the window in which a point was compared: nearer points share pixels and their noise, m.
+    passes, settled
+        How often patches were measured, and whether the last time moved the points by less than was asked.
     """
 
     points_m: Array
@@ -112,6 +118,8 @@ class Structure:
     convexity: float
     mirror_sigma: float
     patch_sigma_m: float
+    passes: int
+    settled: bool
 
     @property
     def normal_sigma_m(self) -> Array:
@@ -173,8 +181,8 @@ def reconstruct(
     work.looks = [
         appearance_of(frame.image, smoothing_px=chosen.smoothing_px) for frame in work.keyframes
     ]
-    for number in range(chosen.passes):
-        on_step(f"measuring {number + 1} of {chosen.passes}")
+    while not work.settled and work.passes < chosen.most_passes:
+        on_step(f"measuring, pass {work.passes + 1}")
         work.refined()
     on_step("uncertainty")
     return work.structure(len(keyframes), tracks.seen.shape[1], metric.condition)
@@ -228,6 +236,8 @@ class _Work:
         self.seen = observations
         self.looks: list[Appearance] = []
         self.adjusted: Adjustment | None = None
+        self.ids = np.arange(len(points))
+        self.passes, self.settled = 0, False
         self.pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in cameras]))
 
     def first(self) -> None:
@@ -247,6 +257,7 @@ class _Work:
 
     def refined(self) -> None:
         """Measure all patches against their templates, and adjust."""
+        ids, before = self.ids, self.points
         normals, curvature = self._surface()
         posed = Posed(self.rotations, self.translations, self.points, normals, curvature)
         self.seen = measure_patches(
@@ -257,6 +268,18 @@ class _Work:
         assert self.adjusted is not None
         self.seen = self.seen.chosen(self.adjusted.weights > 0.25)
         self._prune(self.settings.least_views, worst_px=self.settings.worst_sigma_px)
+        self.passes += 1
+        self.settled = self._moved_sigma(before[np.isin(ids, self.ids)]) < (
+            self.settings.settled_sigma
+        )
+
+    def _moved_sigma(self, before: Array) -> float:
+        """RMS way of the points from where they were, moved and turned to fit, over their RMS 1-sigma."""
+        assert self.adjusted is not None
+        centred = self.points - self.points.mean(axis=0), before - before.mean(axis=0)
+        _, distance = Rotation.align_vectors(*centred)
+        own = np.trace(self.adjusted.point_covariance_m2, axis1=1, axis2=2)
+        return float(distance / np.sqrt(len(before) * np.mean(own)))
 
     def _adjust(self, tolerance: float = 1e-4) -> None:
         self.adjusted = adjust(
@@ -304,7 +327,7 @@ class _Work:
         new_point, new_view = np.cumsum(points) - 1, np.cumsum(views) - 1
         seen = self.seen.chosen(use)
         self.seen = replace(seen, view=new_view[seen.view], point=new_point[seen.point])
-        self.points = self.points[points]
+        self.points, self.ids = self.points[points], self.ids[points]
         self.rotations, self.translations = self.rotations[views], self.translations[views]
         kept = np.flatnonzero(views)
         self.keyframes = [self.keyframes[int(v)] for v in kept]
@@ -368,4 +391,6 @@ class _Work:
             convexity=float(np.mean(bulge > 0.0)),
             mirror_sigma=float(np.sign(preference) * np.sqrt(2.0 * abs(preference))),
             patch_sigma_m=WINDOW * self.settings.patches.half_px * self.pixel_m,
+            passes=self.passes,
+            settled=self.settled,
         )
