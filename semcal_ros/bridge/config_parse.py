@@ -43,7 +43,9 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[str] = set()
-        for key_node, _ in node.value:
+        # A tag such as ``!!set`` may stand before a list; the base class refuses it.
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        for key_node, _ in pairs:
             key = str(key_node.value)
             if len(key) > _MAX_KEY:
                 raise yaml.constructor.ConstructorError(

@@ -79,6 +79,7 @@ def test_the_valid_files_are_accepted() -> None:
 @example(text="a: !!timestamp x")
 @example(text='a: !!int ""')
 @example(text="a: !!bool maybe")
+@example(text="!!set [x, x]")
 @example(text='a: "\\UFFFFFFFF"')
 @example(text="a" * 2000 + ": 1")
 @example(text="name: 0x" + "f" * 5000)

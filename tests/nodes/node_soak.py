@@ -229,13 +229,14 @@ class Soak:
             self._until(lambda n=name: self._watch.states(n), f"{name} to report")
         self._until(self._comes_through, "frames in a row from both")
         # Before the calibration has come a restarted rectifier passes frames on, and says so.
-        raw = {m.header.stamp.nanosec for m in self._infos if not any(m.k)}
+        told = {m.header.stamp.nanosec: any(m.k) for m in self._infos}
         for kind, images in self._outputs.items():
             for message in images:
                 number = message.header.stamp.nanosec
                 # Nothing is known of frames of a burst long ago, or without a magnification.
                 if number in self._sent:
-                    known = kind is CORRECTOR or number not in raw
+                    # The first camera_info of a restarted node may come before it is found, the image after.
+                    known = True if kind is CORRECTOR else told.get(number)
                     self._check(kind, message, self._sent[number], known)
             images.clear()
         self._infos.clear()
@@ -267,9 +268,11 @@ class Soak:
         calibrated = {m.header.stamp.nanosec for m in self._infos if any(m.k)}
         return all(wanted <= numbers for numbers in (*got, calibrated))
 
-    def _check(self, kind: Any, message: Any, frame: _Frame, calibrated: bool) -> None:
-        right = kind.right(frame.picture, frame.magnification) if calibrated else frame.picture
-        error = difference(pixels(message), right)
+    def _check(self, kind: Any, message: Any, frame: _Frame, calibrated: bool | None) -> None:
+        """Whether an image is the corrected frame, the frame itself, or, where that is not known, either."""
+        rights = {True: kind.right(frame.picture, frame.magnification), False: frame.picture}
+        wanted = [r for known, r in rights.items() if calibrated in (known, None)]
+        error = min(difference(pixels(message), right) for right in wanted)
         number = message.header.stamp.nanosec
         assert error < 2.0 * NOISE, (
             f"{kind.node}, frame {number}, {calibrated=}: {error:.1f} grey levels; {self.history[-20:]}"
