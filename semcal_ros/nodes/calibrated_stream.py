@@ -27,14 +27,11 @@ class CalibratedStreamNode(StreamNode):
         self.settings.on_change("interpolation", self._set_interpolation)
         self.calibration = CalibrationInput(self, on_change=self.on_calibration)
         self.output = RectifiedOutput(self)
+        # After the last compressed image.
+        self.closing.callback(self.output.close)
         self._out_of_range = False
         # The latest: most frames have the magnification of the one before.
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
-
-    def destroy_node(self) -> None:
-        """As in the base class, after the last compressed image."""
-        self.output.close()
-        super().destroy_node()
 
     def on_calibration(self) -> None:
         """Called when another calibration is in force."""

@@ -28,16 +28,13 @@ class DriftCompensator(StreamNode):
         )
         self._rectifier = Rectifier(self.settings["interpolation"])
         self.settings.on_change("interpolation", self._set_interpolation)
-        self._drift = LiveDrift(self)
+        # Ended the other way round: the last compressed image comes out.
         self._images = ImageOutput(self, "image_stabilized")
+        self.closing.callback(self._images.close)
+        self._drift = LiveDrift(self)
+        self.closing.callback(self._drift.close)
         self._drifts = DriftOutput(self)
         self._input = FrameInput(self, self._on_frame)
-
-    def destroy_node(self) -> None:
-        """As in the base class, after the last compressed image."""
-        self._drift.close()
-        self._images.close()
-        super().destroy_node()
 
     def _set_interpolation(self, value: str) -> None:
         self._rectifier = Rectifier(value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -197,11 +198,18 @@ class StreamNode(SemNode):
     """A node that consumes frames."""
 
     def __init__(self, name: str, settings: Iterable[Setting] = ()) -> None:
+        # What is to be ended with the node; one that could not be made completely is destroyed, too.
+        self.closing = ExitStack()
         super().__init__(name, (_MIXED, *settings))
         self._waiting = 0
         self._is_waiting = False
         self._image_bytes = 0
         self._transport = ""
+
+    def destroy_node(self) -> None:
+        """As in the base class, after what is to be ended first."""
+        self.closing.close()
+        super().destroy_node()
 
     @property
     def effective_config(self) -> Any:

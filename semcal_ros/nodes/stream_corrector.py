@@ -23,14 +23,9 @@ class StreamCorrector(CalibratedStreamNode):
         self._drift: LiveDrift | None = None
         super().__init__("stream_corrector", DRIFT_SETTINGS)
         self._drift = LiveDrift(self)
+        self.closing.callback(self._drift.close)
         self._drifts = DriftOutput(self)
         self._input = FrameInput(self, self._on_frame)
-
-    def destroy_node(self) -> None:
-        """As in the base class, and the end of what runs beside the stream."""
-        if self._drift is not None:
-            self._drift.close()
-        super().destroy_node()
 
     def on_calibration(self) -> None:
         """A keyframe in the coordinates of the old calibration is of no use."""
