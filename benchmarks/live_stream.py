@@ -143,7 +143,7 @@ def relay(plan: Plan) -> None:
     from rclpy.executors import ExternalShutdownException
     from sensor_msgs.msg import Image
 
-    from semcal_ros.bridge import image_from_message, pixel_memory
+    from semcal_ros.bridge.images import image_from_message, pixel_memory
     from semcal_ros.core.rectify import Rectifier
 
     rclpy.init()

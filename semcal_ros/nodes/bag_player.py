@@ -12,7 +12,7 @@ from rclpy.executors import ExternalShutdownException
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool
 
-from semcal_ros.bridge import fill_stamp
+from semcal_ros.bridge.headers import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, SemcalError
 from semcal_ros.files.bags import BagTopic, RawMessage, open_bag
 from semcal_ros.nodes.base import SemNode

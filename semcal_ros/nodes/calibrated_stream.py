@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from semcal_ros.bridge import MicroscopeConfig
+from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.rectify import Rectifier
 from semcal_ros.nodes.calibration_input import CalibrationInput

@@ -11,12 +11,12 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from semcal_ros.bridge import (
-    MicroscopeConfig,
+from semcal_ros.bridge.calibration_text import (
+    MAX_TEXT_BYTES,
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
+from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError

@@ -12,14 +12,9 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from semcal_ros.bridge import (
-    DiagnosticLevel,
-    DiagnosticSummary,
-    fill_calibration_text,
-    fill_diagnostic_status,
-    fill_image,
-    to_gray,
-)
+from semcal_ros.bridge.calibration_text import fill_calibration_text
+from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
+from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.bridge.overlay import corner_overlay
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge import TrackingPace
+from semcal_ros.bridge.pace import TrackingPace
 from semcal_ros.core.binning import binned
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.drift import DriftSettings, DriftTracker, DriftUpdate

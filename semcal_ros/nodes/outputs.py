@@ -8,13 +8,10 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from semcal_ros.bridge import (
-    copy_header,
-    fill_camera_info,
-    fill_drift,
-    fill_drift_velocity,
-    pixel_memory,
-)
+from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
+from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.compressed import CompressedOutput

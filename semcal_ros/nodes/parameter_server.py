@@ -12,13 +12,10 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
 
-from semcal_ros.bridge import (
-    MagnificationReading,
-    fill_camera_info,
-    fill_projection,
-    is_continuous_parameter,
-    read_parameter,
-)
+from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.bridge.parameters import is_continuous_parameter, read_parameter
+from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.calibration_input import CalibrationInput

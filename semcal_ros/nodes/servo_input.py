@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray
 
-from semcal_ros.bridge import (
-    image_from_message,
-    projection_from_message,
-    stamp_ns_from_msg,
-    to_gray,
-)
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message, to_gray
+from semcal_ros.bridge.projection import projection_from_message
 from semcal_ros.nodes.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.qos import image_input, stream_output, value_input
 from semcal_ros.nodes.subscription import MessageInfo

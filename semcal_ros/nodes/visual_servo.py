@@ -11,7 +11,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
-from semcal_ros.bridge import MagnificationReading
+from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.core.servoing import (
     NestedTarget,
     PlaneCamera,

@@ -17,9 +17,15 @@ class Blocker:
         return None
 
 sys.meta_path.insert(0, Blocker())
-import semcal_ros.bridge as bridge
-assert all(hasattr(bridge, name) for name in bridge.__all__)
-assert bridge.load_config("generic").name == "generic"
+import importlib
+import pkgutil
+import semcal_ros.bridge
+
+for module in pkgutil.iter_modules(semcal_ros.bridge.__path__, "semcal_ros.bridge."):
+    importlib.import_module(module.name)
+from semcal_ros.bridge.config import load_config
+
+assert load_config("generic").name == "generic"
 """
 
 

@@ -31,7 +31,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from semcal_ros.bridge import fill_image
+from semcal_ros.bridge.images import fill_image
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.files.bags import BagReader, RawMessage, blank_message, open_bag
 from semcal_ros.files.messages import jazzy_types, serialize_message

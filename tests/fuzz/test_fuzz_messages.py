@@ -14,26 +14,24 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from semcal_ros.bridge import (
-    ENCODINGS,
-    MagnificationConfig,
-    MicroscopeConfig,
+from semcal_ros.bridge.calibration_text import (
+    MAX_TEXT_BYTES,
     calibration_text_from_message,
     fill_calibration_text,
-    fill_camera_info,
-    fill_drift,
-    fill_drift_velocity,
+)
+from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
+from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.images import (
+    ENCODINGS,
     fill_image,
-    fill_projection,
     image_from_message,
-    optional_stamp_ns,
-    projection_from_message,
-    read_magnification,
     to_gray,
     without_databar,
 )
-from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
-from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
+from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
+from semcal_ros.bridge.projection import fill_projection, projection_from_message
 from semcal_ros.core.camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message

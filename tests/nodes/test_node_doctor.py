@@ -21,7 +21,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64, String
 
-from semcal_ros.bridge import fill_stamp
+from semcal_ros.bridge.headers import fill_stamp
 
 CALIBRATION = make_calibration()
 # Imports and discovery on a machine that is busy with other things.

@@ -18,7 +18,9 @@ from ros_process import LATCHED, RELIABLE, NodeProcess, Peer, running
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, Float64MultiArray
 
-from semcal_ros.bridge import fill_camera_info, fill_drift, fill_projection
+from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.drift import fill_drift
+from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.functions import ContinuousFunction
 from semcal_ros.core.raster import ScanTiming
