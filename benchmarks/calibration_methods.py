@@ -13,17 +13,17 @@ from calibration_views import HEIGHT_SIGMA_M, Array, Case, PixelSize
 from numpy.polynomial import Polynomial
 from scipy.interpolate import PchipInterpolator
 
-from semcal_ros.core.calibrate import calibrate_views
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.discrete import DiscreteFit, fit_discrete, table_functions
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
+from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.pda import pda_functions
+from semcal_ros.core.calibration.problem import Priors, Setup
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.evaluate import fit_poses
-from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.model import CalibrationModel
-from semcal_ros.core.pda import pda_functions
-from semcal_ros.core.problem import Priors, Setup
-from semcal_ros.core.projection import PARAMETER_NAMES
-from semcal_ros.core.views import GridView
 
 CameraAt = Callable[[float], ScanCamera]
 Curve = Callable[[float], Array]

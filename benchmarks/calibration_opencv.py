@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from calibration_views import Array, Case, PixelSize
 
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.errors import CalibrationError
-from semcal_ros.core.views import GridView
 
 # What OpenCV's camera consists of, in the order of the rows below; the last two columns are the pixel size.
 _DISTORTION = slice(4, 9)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.config import load_config
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.evaluate import fit_poses
-from semcal_ros.core.views import GridView
+from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import CollectedViews, collect_views, find_views, named_frames
 from semcal_ros.synthetic import (

@@ -19,7 +19,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from table import quick_from_command_line, show
 
-from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.synthetic import preset
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))

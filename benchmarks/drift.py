@@ -26,8 +26,8 @@ from drift_truth import KINDS, MAGNIFICATION, Pair, Scene, Views, large_shifts, 
 from live_scenes import pictures
 from table import interleaved, quick_from_command_line, show
 
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.synthetic import preset
 
 

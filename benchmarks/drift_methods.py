@@ -17,7 +17,12 @@ import numpy as np
 from drift_truth import Array, Gray, Pair
 from numpy.typing import NDArray
 
-from semcal_ros.core.registration import Reference, Registration, prepare_reference, register
+from semcal_ros.core.registration.register import (
+    Reference,
+    Registration,
+    prepare_reference,
+    register,
+)
 
 try:
     from skimage.registration import phase_cross_correlation

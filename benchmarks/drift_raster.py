@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.raw_map import RasterDrift, raw_from_output
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.synthetic import (
     Detector,
     Drift,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from table import show
 
-from semcal_ros.core.drift import DriftTracker
+from semcal_ros.core.drift.tracker import DriftTracker
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ import numpy as np
 from live_scenes import CONFIG, calibration, pictures
 from table import interleaved
 
-from semcal_ros.core.raw_map import RasterDrift
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.rectifier import Rectifier
 
 MAGNIFICATION = 5000.0
 # More than any cache keeps: each is new to it.

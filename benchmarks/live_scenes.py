@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from semcal_ros import Calibration
-from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.scan_timing import ScanTiming
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def relay(plan: Plan) -> None:
     from sensor_msgs.msg import Image
 
     from semcal_ros.bridge.images import image_from_message, pixel_memory
-    from semcal_ros.core.rectify import Rectifier
+    from semcal_ros.core.rectification.rectifier import Rectifier
 
     rclpy.init()
     node = rclpy.create_node("relay", namespace="/sem")

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from table import interleaved, quick_from_command_line, show
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.raw_map import RasterDrift
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import preset
 
 TIMING = ScanTiming(1.0 / 15.0, 8, 0.1)

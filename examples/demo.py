@@ -25,9 +25,9 @@ from demo_picture import overview
 from live_suite import LiveSuite, Received
 
 from semcal_ros import Calibration
+from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.evaluate import fit_poses
-from semcal_ros.core.views import GridView
 from semcal_ros.report import DemoRow, correction_report
 
 OUTPUT = Path("demo_output")

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.servoing import (
     NestedTarget,
     PlaneCamera,

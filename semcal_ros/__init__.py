@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from semcal_ros.calibration import Calibration
-    from semcal_ros.core.camera import ScanCamera
+    from semcal_ros.core.camera.scan_camera import ScanCamera
     from semcal_ros.core.errors import SemcalError
     from semcal_ros.pipeline import calibrate
 
@@ -17,7 +17,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "semcal_ros.calibration",
-    "ScanCamera": "semcal_ros.core.camera",
+    "ScanCamera": "semcal_ros.core.camera.scan_camera",
     "SemcalError": "semcal_ros.core.errors",
     "calibrate": "semcal_ros.pipeline",
 }

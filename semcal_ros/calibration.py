@@ -17,10 +17,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
-from semcal_ros.core.field import ResidualField
-from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.confined import read_plain_text
 from semcal_ros.files.plain_yaml import check_plain_yaml

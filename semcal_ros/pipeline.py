@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.config import MicroscopeConfig, load_config
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibrate import CalibrationResult, MethodOptions, calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
+from semcal_ros.core.calibration.views import GridView, SquareAssignment, views_from_detections
+from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import CalibrationError
-from semcal_ros.core.model import checked_magnification
-from semcal_ros.core.views import GridView, SquareAssignment, views_from_detections
 from semcal_ros.files.recordings import Recording, open_recording
 
 __all__ = [
@@ -354,7 +354,7 @@ def calibrate(
     method
         ``"joint"``, ``"pda"`` or ``"discrete"``.
     options, breakpoints, residual
-        As for :func:`~semcal_ros.core.calibrate.calibrate_views`.
+        As for :func:`~semcal_ros.core.calibration.calibrate.calibrate_views`.
 
     Examples
     --------

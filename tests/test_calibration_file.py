@@ -8,7 +8,7 @@ import yaml
 from grid_views import grid_views
 
 from semcal_ros import Calibration, SemcalError
-from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
 

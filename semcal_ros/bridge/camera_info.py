@@ -7,7 +7,7 @@ import numpy as np
 from semcal_ros.bridge.fields import assign_floats
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.protocols import CameraInfoMessage, HeaderMessage
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["fill_camera_info"]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.fields import assign_floats, new_nested, whole_number
 from semcal_ros.bridge.protocols import MultiArrayMessage
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
 
 __all__ = ["fill_projection", "projection_from_message"]

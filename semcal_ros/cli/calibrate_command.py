@@ -14,7 +14,7 @@ from semcal_ros.cli.common import (
     progress,
     require_folder,
 )
-from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
+from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views, named_frames
 

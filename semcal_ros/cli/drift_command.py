@@ -31,7 +31,7 @@ from semcal_ros.cli.drift_common import (
     timing_seen,
     with_frame_time,
 )
-from semcal_ros.core.drift_path import DriftPath
+from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv

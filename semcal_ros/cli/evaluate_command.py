@@ -18,7 +18,7 @@ from semcal_ros.cli.common import (
     magnification_option,
     progress,
 )
-from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import collect_views, find_views, named_frames
 

@@ -29,7 +29,7 @@ from semcal_ros.cli.drift_common import (
     start_time_s,
     with_frame_time,
 )
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.cantilever import (
     SHAPES,
     Repeatability,

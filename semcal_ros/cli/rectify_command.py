@@ -27,9 +27,9 @@ from semcal_ros.cli.drift_common import (
     timing_seen,
     with_frame_time,
 )
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift_types import DriftUpdate
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.files.bags import BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording
 

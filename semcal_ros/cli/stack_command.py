@@ -30,9 +30,9 @@ from semcal_ros.cli.drift_common import (
     with_frame_time,
 )
 from semcal_ros.cli.survey import Job, Survey, surveyed
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
-from semcal_ros.core.stack import Stack, StackedImage
+from semcal_ros.core.rectification.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.recordings import Frame, Recording, open_recording
 from semcal_ros.files.video import VIDEO_CODECS, Film, film_of

@@ -15,8 +15,8 @@ from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.bridge.fields import require_fields
 from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
-from semcal_ros.core.model import checked_magnification
 from semcal_ros.files.bag_errors import reading
 from semcal_ros.files.bags import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.image_topics import find_image_topic

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from semcal_ros.bridge.config import MicroscopeConfig
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.calibration_input import CalibrationInput
 from semcal_ros.nodes.compressed import compressed_settings
 from semcal_ros.nodes.outputs import RectifiedOutput

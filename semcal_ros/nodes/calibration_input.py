@@ -18,7 +18,7 @@ from semcal_ros.bridge.calibration_text import (
 )
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.confined import read_plain_text
 from semcal_ros.nodes.background import NewestWork

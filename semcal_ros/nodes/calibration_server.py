@@ -17,7 +17,7 @@ from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fi
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.bridge.overlay import corner_overlay
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibrate import METHODS, RESIDUAL_MODES
+from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.nodes.calibration_input import calibration_digest

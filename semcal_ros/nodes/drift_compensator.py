@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.compressed import compressed_settings
 from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
 from semcal_ros.nodes.outputs import DriftOutput, ImageOutput

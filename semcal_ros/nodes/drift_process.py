@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftOutlook, DriftTracker, DriftUpdate
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.tracker import DriftOutlook, DriftTracker, DriftUpdate
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.core.raster import ScanTiming
 
 __all__ = ["DriftProcess", "Measured", "measured", "serve"]
 

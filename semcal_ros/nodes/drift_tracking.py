@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.pace import TrackingPace
-from semcal_ros.core.binning import binned
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftSettings, DriftTracker, DriftUpdate
-from semcal_ros.core.raw_map import RasterDrift
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
+from semcal_ros.core.rectification.binning import binned
+from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.nodes.base import NODE_ERRORS
 from semcal_ros.nodes.drift_process import DriftProcess, Measured, measured
 from semcal_ros.nodes.services import trigger_service
@@ -78,7 +78,7 @@ class FrameDrift:
     Attributes
     ----------
     drift_m, velocity_m_s, covariance, raster
-        As in :class:`~semcal_ros.core.drift.DriftUpdate`.
+        As in :class:`~semcal_ros.core.drift.tracker.DriftUpdate`.
     measured
         The latest frame of which the drift was measured: this one, or one before it.
     is_forecast

@@ -12,7 +12,7 @@ from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.compressed import CompressedOutput
 from semcal_ros.nodes.drift_tracking import FrameDrift

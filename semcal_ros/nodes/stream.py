@@ -17,7 +17,7 @@ from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.config import IMAGE_TYPE
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.magnification import MagnificationInput
 from semcal_ros.nodes.message_types import message_class

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.evaluate import rms_by_magnification
-from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.coverage_figures import (
     coverage_picture,
     filled_picture,

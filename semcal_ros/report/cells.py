@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.calibration.calibrate import CalibrationResult
 
 __all__ = ["Cells", "all_corners", "cells_of", "empty_share", "filled_shares"]
 

@@ -10,7 +10,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.report.cells import all_corners, cells_of, filled_shares
 from semcal_ros.report.encode import Picture, picture_of_figure
 from semcal_ros.report.style import (

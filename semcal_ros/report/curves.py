@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.model import CalibrationModel
 from semcal_ros.report.style import SECOND
 
 __all__ = ["cameras_around", "curve", "marks_of_magnifications", "sampled_cameras", "wide_enough"]

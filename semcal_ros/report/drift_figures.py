@@ -16,8 +16,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift_path import DriftPath
-from semcal_ros.core.drift_types import kind_of
+from semcal_ros.core.drift.estimates import kind_of
+from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.style import (

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.report.encode import Picture, picture_of_figure
 from semcal_ros.report.numbers import PAPER_RMS_PX
 from semcal_ros.report.style import (

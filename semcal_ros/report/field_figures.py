@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.cells import all_corners, cells_of
 from semcal_ros.report.encode import Picture, picture_of_figure
 from semcal_ros.report.geometry import displacement_field, without_residual_field

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from semcal_ros.core.calibrate import CalibrationResult
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.evaluate import rms_by_magnification
 from semcal_ros.report.cells import all_corners, cells_of, empty_share, filled_shares
 from semcal_ros.report.coverage_figures import tilts_deg
 from semcal_ros.report.error_figures import normalised_residuals

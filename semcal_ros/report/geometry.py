@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.projection import ProjectionJacobians, project_points_with_jacobians
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.camera.projection import ProjectionJacobians, project_points_with_jacobians
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
     "aligned_sigma_px",

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.evaluate import rms_by_magnification
 
 __all__ = [
     "PAPER_RMS_PX",

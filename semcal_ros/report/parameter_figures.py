@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.model import CalibrationModel
-from semcal_ros.core.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.curves import (
     curve,
     marks_of_magnifications,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.curves import (
     curve,
     marks_of_magnifications,

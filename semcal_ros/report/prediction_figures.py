@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.model import CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.curves import cameras_around, marks_of_magnifications, sampled_cameras
 from semcal_ros.report.encode import Picture, picture_of_figure
 from semcal_ros.report.geometry import aligned_sigma_px, field_lattice, shape_sigma_px

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.poses import rotations_from_vectors
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.synthetic.ball_body import BallOnTip
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.camera import ScanCamera, as_points
+from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.synthetic.laws import Constant, Law
 
 __all__ = ["Residual", "VirtualMicroscope"]
@@ -86,7 +86,7 @@ class VirtualMicroscope:
     scale_error
         Law of the relative deviation of the true scale m from ``g width / display_width_m``.
     aspect, skew, rho, xi_r, xi_t
-        Laws of the parameters of :class:`~semcal_ros.core.camera.ScanCamera`; rho in 1/m.
+        Laws of the parameters of :class:`~semcal_ros.core.camera.scan_camera.ScanCamera`; rho in 1/m.
     px, py, ex, ey
         Laws of the principal point and of the distortion centre, in native pixels.
     residual

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 

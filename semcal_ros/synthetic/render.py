@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.messages import blank_message
 
 

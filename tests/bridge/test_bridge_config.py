@@ -19,8 +19,8 @@ from semcal_ros.bridge.config import (
     parse_config,
 )
 from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.core.raster import ScanTiming
 
 CONFIGS = Path(__file__).resolve().parents[2] / "msg_configs"
 

@@ -27,7 +27,7 @@ from semcal_ros.bridge.headers import (
     stamp_ns_from_msg,
 )
 from semcal_ros.bridge.projection import fill_projection, projection_from_message
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message
 

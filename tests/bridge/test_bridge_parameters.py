@@ -16,7 +16,7 @@ from semcal_ros.bridge.parameters import (
     read_parameter,
     value_of,
 )
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 

@@ -11,7 +11,7 @@ import pytest
 from semcal_ros import Calibration
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.cli import main
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags import open_bag
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.poses import rotations_from_vectors
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.structure import Tracks
 from semcal_ros.synthetic import preset
 

@@ -8,8 +8,8 @@ from drift_scenes import small_camera
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.core.binning import binned
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectification.binning import binned
 
 
 @given(width=st.integers(3, 90), height=st.integers(3, 90), largest=st.integers(30, 90))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.calibrate import MethodOptions, calibrate_views
+from semcal_ros.core.calibration.calibrate import MethodOptions, calibrate_views
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.synthetic import preset
 
 CALIBRATED = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.distortion import distort_normalised, undistort_normalised
+from semcal_ros.core.camera.distortion import distort_normalised, undistort_normalised
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 PLAIN = ScanCamera(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.centre import find_distortion_centre
-from semcal_ros.core.pda import ode_weights
+from semcal_ros.core.calibration.distortion_centre import find_distortion_centre
+from semcal_ros.core.calibration.pda import ode_weights
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 BARREL = ScanCamera(
     500.0, 2.1e6, 1.0, 0.0, 255.5, 255.5, 50.0, 0.01, 0.0, 290.0, 240.0, 256.0, 512, 512

@@ -12,11 +12,11 @@ import pytest
 from drift_scenes import DriftingSpecimen, Texture, lattice, noisy, small_camera
 from scipy import ndimage
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.drift_types import DriftSettings, DriftUpdate
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 
 TIMING = ScanTiming(0.9, 1, 0.1)
 SPECIMEN = DriftingSpecimen(pitch_m=0.1e-6, seed=3)

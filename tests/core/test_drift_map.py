@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from semcal_ros.core.drift_map import DriftMap, still
-from semcal_ros.core.drift_operations import Carry, Drop, Measure, Move, Reshear, Settle, Widen
+from semcal_ros.core.drift.operations import Carry, Drop, Measure, Move, Reshear, Settle, Widen
+from semcal_ros.core.drift.process_noise import Restlessness
+from semcal_ros.core.drift.state import DriftMap, still
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.restlessness import Restlessness
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from drift_scenes import Texture, noisy, small_camera
 
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.drift_operations import Move
-from semcal_ros.core.drift_uncertainty import scale_covariance
+from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.operations import Move
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 
 SIZE = 192

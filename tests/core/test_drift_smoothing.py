@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from semcal_ros.core.drift_map import DriftMap, still
-from semcal_ros.core.drift_operations import (
+from semcal_ros.core.drift.operations import (
     Carry,
     Drop,
     Measure,
@@ -21,15 +20,16 @@ from semcal_ros.core.drift_operations import (
     Settle,
     Widen,
 )
-from semcal_ros.core.drift_smoothing import (
+from semcal_ros.core.drift.process_noise import Restlessness
+from semcal_ros.core.drift.smoother import (
     Event,
     Mark,
     likely_restlessness,
     replayed,
     smoothed,
 )
+from semcal_ros.core.drift.state import DriftMap, still
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.restlessness import Restlessness
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.residual_field import ResidualField, zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.field import ResidualField, zero_field
-from semcal_ros.core.raw_map import RasterDrift, raw_from_output
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.core.rectification.rectifier import Rectifier
 
 SIZE = (640, 480)
 CAMERA = ScanCamera(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.laws import Exponential
 from semcal_ros.synthetic.microscope import Residual

@@ -10,13 +10,18 @@ import numpy as np
 import pytest
 from drift_scenes import DriftingSpecimen, small_camera
 
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.drift_history import DriftHistory
-from semcal_ros.core.drift_path import DriftPath, path_of_updates
-from semcal_ros.core.drift_types import DriftUpdate
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.frame_time import (
+    LEFT_IN,
+    REMOVED,
+    FrameTimeEstimate,
+    estimate_frame_time,
+)
+from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.path import DriftPath, path_of_updates
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.frame_time import LEFT_IN, REMOVED, FrameTimeEstimate, estimate_frame_time
-from semcal_ros.core.raster import ScanTiming
 
 PX_M = 50e-9
 Law = Callable[[np.ndarray], np.ndarray]

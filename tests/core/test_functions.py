@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.functions import ContinuousFunction
 
 RANGE = (100.0, 10000.0)
 

@@ -11,27 +11,27 @@ import pytest
 from drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.drift_map import DriftMap, still
-from semcal_ros.core.drift_uncertainty import (
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.camera_uncertainty import (
     carry_covariance,
     centre_covariance,
     relative_scale_sigma,
     scale_covariance,
     zoom_of,
 )
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.keyframe import (
+from semcal_ros.core.drift.frame import Shot, Stills, resampleable
+from semcal_ros.core.drift.keyframe import (
     Keyframe,
     carried,
     keyframe_of,
     scale_ratio,
 )
-from semcal_ros.core.keyframe_store import KeyframeStore
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.registration import Registration, RegistrationSettings, register
-from semcal_ros.core.shot import Shot, Stills, resampleable
-from semcal_ros.core.subpixel import FINE
+from semcal_ros.core.drift.keyframe_store import KeyframeStore
+from semcal_ros.core.drift.state import DriftMap, still
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.fractional_delay import FINE
+from semcal_ros.core.registration.register import Registration, RegistrationSettings, register
 
 Array = NDArray[np.float64]
 

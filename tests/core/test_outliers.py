@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.synthetic import preset
 
 MAGNIFICATIONS = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.core.poses import (
+from semcal_ros.core.camera.plane_geometry import (
     cross_matrices,
     fit_homography,
     mirrored_tilt,

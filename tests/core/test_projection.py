@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.projection import (
+from semcal_ros.core.camera.projection import (
     PARAMETER_NAMES,
     project_points,
     project_points_with_jacobians,

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.views import views_from_detections
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.evaluate import fit_poses
-from semcal_ros.core.views import views_from_detections
 
 SIZE = (640, 480)
 

@@ -8,11 +8,11 @@ from drift_scenes import small_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.raw_map import RasterDrift, raw_from_output
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.core.rectification.rectifier import Rectifier
 
 SIZE = 192
 CAMERA = small_camera(1000.0, SIZE)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.registration import Registration, prepare_reference, register
-from semcal_ros.core.subpixel import FINE, SHARP, Band, gradients, sampled
+from semcal_ros.core.registration.fractional_delay import FINE, SHARP, Band, gradients, sampled
+from semcal_ros.core.registration.register import Registration, prepare_reference, register
 
 SIZE = 192
 TEXTURE = Texture(1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.core.calibrate import calibrate_views
-from semcal_ros.core.scatter import excess_sigma_px, with_excess
-from semcal_ros.core.views import GridView
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.scatter import excess_sigma_px, with_excess
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import preset
 
 

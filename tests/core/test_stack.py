@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.raw_map import RasterDrift
-from semcal_ros.core.stack import Stack, scanned
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.stack import Stack, scanned
 
 SIZE = 128
 TEXTURE = Texture(seed=5)

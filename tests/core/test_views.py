@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration.views import GridView, assign_squares, views_from_detections
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.views import GridView, assign_squares, views_from_detections
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 

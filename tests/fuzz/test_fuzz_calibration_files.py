@@ -16,10 +16,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from semcal_ros import Calibration
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.field import ResidualField
-from semcal_ros.core.functions import ContinuousFunction
-from semcal_ros.core.model import FUNCTION_NAMES
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 _RANGE = (500.0, 4000.0)
 _VALUES = [1.02, 1.01, 0.002, 249.0, 262.0, 50.0, 0.002, 0.001, 227.0, 267.0]

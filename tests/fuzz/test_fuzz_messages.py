@@ -32,7 +32,7 @@ from semcal_ros.bridge.images import (
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
 from semcal_ros.bridge.projection import fill_projection, projection_from_message
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message
 

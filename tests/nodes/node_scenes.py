@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.functions import ContinuousFunction
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.files.bags import BagWriter
 from semcal_ros.files.messages import blank_message
 

@@ -20,7 +20,7 @@ from ros_process import LATCHED, RELIABLE, NodeProcess, Peer
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64
 
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.rectifier import Rectifier
 
 CALIBRATION = make_calibration()
 MAGNIFICATION = 2000.0

@@ -36,7 +36,7 @@ from ros_process import (
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.rectification.rectifier import Rectifier
 
 CALIBRATION = make_calibration()
 NODE = "/sem/rectifier"

@@ -28,8 +28,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.field import zero_field
-from semcal_ros.core.rectify import Rectifier
+from semcal_ros.core.camera.residual_field import zero_field
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.calibration_input import calibration_digest
 
 MAGNIFICATION = 2000.0

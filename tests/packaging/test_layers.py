@@ -188,7 +188,7 @@ def _run(code: str) -> subprocess.CompletedProcess[str]:
 def test_core_imports_without_ros_or_any_other_layers_library() -> None:
     done = _run(BLOCKER)
     assert done.returncode == 0, done.stderr
-    assert "semcal_ros.core.camera" in done.stdout.split()
+    assert "semcal_ros.core.camera.scan_camera" in done.stdout.split()
 
 
 def test_the_api_imports_without_ros() -> None:

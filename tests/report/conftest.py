@@ -16,7 +16,7 @@ from report_samples import (
     grid_view,
 )
 
-from semcal_ros.core.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
 from semcal_ros.report import calibration_report
 
 

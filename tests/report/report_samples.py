@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.corners import LatticeDetection
-from semcal_ros.core.views import GridView
 
 SIZE = 256
 DISPLAY_M = 0.12

@@ -23,11 +23,11 @@ from report_samples import (
     grid_view,
 )
 
-from semcal_ros.core.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.evaluate import rms_by_magnification
-from semcal_ros.core.views import GridView
 from semcal_ros.report import calibration_report
 from semcal_ros.report.examples import best_per_magnification, overlay_of, rejected_pictures
 from semcal_ros.report.geometry import rms_without_distortion

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from report_samples import SIZE, Unused, camera_at
 
-from semcal_ros.core.calibrate import CalibrationResult
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.core.field import zero_field
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.camera.residual_field import zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.cells import empty_share, filled_shares
 from semcal_ros.report.coverage_figures import tilts_deg
 from semcal_ros.report.error_figures import rms_picture

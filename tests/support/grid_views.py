@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.poses import rotations_from_vectors
-from semcal_ros.core.views import GridView
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["grid_view", "grid_views"]
 

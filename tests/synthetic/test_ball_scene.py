@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.synthetic import NOISE_FREE
 from semcal_ros.synthetic.ball import BallOnTip, Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import Drift

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.synthetic import (
     PRESETS,
     ChessGrid,

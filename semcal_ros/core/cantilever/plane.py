@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
-from semcal_ros.core.raw_map import RasterDrift
+from semcal_ros.core.rectification.raw_positions import RasterDrift
 
 __all__ = ["Axis", "PlaneMap", "drift_at"]
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.cantilever.bending import (
     Bending,
     Shape,
@@ -23,10 +24,9 @@ from semcal_ros.core.cantilever.finding import Strip, find_strip
 from semcal_ros.core.cantilever.plane import Axis, PlaneMap
 from semcal_ros.core.cantilever.rest import REACH_PX, Rest, View, beam_at_rest
 from semcal_ros.core.cantilever.still import follow_background
-from semcal_ros.core.drift_path import DriftPath
-from semcal_ros.core.drift_uncertainty import scale_covariance
+from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.raster import ScanTiming
 
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 

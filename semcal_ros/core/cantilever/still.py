@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.cantilever.plane import Axis, PlaneMap
-from semcal_ros.core.drift import DriftTracker
-from semcal_ros.core.drift_history import DriftHistory
-from semcal_ros.core.drift_path import DriftPath
-from semcal_ros.core.registration import prepare_reference, register
+from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.registration.register import prepare_reference, register
 
 __all__ = ["Background", "follow_background"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.corners.corner_fit import CornerFit
 from semcal_ros.core.corners.local_map import LocalMaps
-from semcal_ros.core.corners.refine import CornerFit
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [

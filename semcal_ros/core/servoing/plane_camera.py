@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.camera import ScanCamera, as_points
+from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["PlaneCamera", "projection_of_frame"]

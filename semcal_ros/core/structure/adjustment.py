@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
-from semcal_ros.core.poses import cross_matrices, rotations_from_vectors
+from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.structure.types import Observations, camera_table
 
 __all__ = ["Adjustment", "adjust"]

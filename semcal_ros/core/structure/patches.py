@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.raster import ScanTiming
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.structure.appearance import Appearance
 from semcal_ros.core.structure.keyframes import Keyframe
 from semcal_ros.core.structure.raster_motion import displacement_m, plane_at_centre

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
-from semcal_ros.core.raster import ScanTiming
 from semcal_ros.core.structure.adjustment import Adjustment, adjust
 from semcal_ros.core.structure.appearance import Appearance, appearance_of
 from semcal_ros.core.structure.factorization import factorize

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Observations", "Tracks", "camera_table"]
@@ -26,7 +26,7 @@ class Tracks:
     ----------
     xy_m
         (views, points, 2) sem-frame X and Y at height 0 of the line of sight, m
-        (:meth:`~semcal_ros.core.camera.ScanCamera.sem_from_ideal` of undistorted pixels). The calibrated
+        (:meth:`~semcal_ros.core.camera.scan_camera.ScanCamera.sem_from_ideal` of undistorted pixels). The calibrated
         intrinsics are divided out, so that every view is a parallel projection in true scale, up to
         ``1 / (1 + rho Z)``. Anything where not seen.
     seen

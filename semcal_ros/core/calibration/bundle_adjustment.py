@@ -1,0 +1,263 @@
+"""Bundle adjustment of coefficient vectors and grid poses: Levenberg-Marquardt with a Huber loss.
+
+Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibration.normal_equations import (
+    NormalEquations,
+    Problem,
+    State,
+    moved,
+    normal_equations,
+    part_of,
+    prior_cost,
+    reduced,
+    residuals,
+    scaled_solve,
+    theta_system,
+    view_costs,
+)
+
+__all__ = ["BundleResult", "refine"]
+
+Array = NDArray[np.float64]
+
+_MAX_ITERATIONS = 60
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
+# Decrease over its prediction, below which the quadratic model of a view has failed.
+_POOR_GAIN = 0.25
+_FOLLOWING_STEPS = 6
+# A change of a view's half chi-square that is nothing.
+_NEGLIGIBLE = 1e-2
+# Relative decrease of the cost below which another step cannot matter to the result.
+_COST_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    """Outcome of :func:`refine`.
+
+    Attributes
+    ----------
+    state
+        Adjusted unknowns.
+    residuals_px
+        (N, 2) observed minus projected pixels.
+    huber_weight
+        (N,) weights in (0, 1]; below 1 where a corner is an outlier.
+    cost
+        Half the robust sum of squares, with priors.
+    information
+        (M, 10, 10) information on each magnification's camera with the poses eliminated.
+    gradient
+        (M, 10) the matching right-hand side (zero sum over a free camera at the optimum).
+    covariance
+        (K, K) of theta for unit variance of the whitened residuals.
+    height_variance_m2
+        (V,) posterior variance of the heights.
+    iterations, converged, reason
+        How the iteration ended.
+    """
+
+    state: State
+    residuals_px: Array
+    huber_weight: Array
+    cost: float
+    information: Array
+    gradient: Array
+    covariance: Array
+    height_variance_m2: Array
+    iterations: int
+    converged: bool
+    reason: str
+
+    def rms_px(self) -> float:
+        """RMS distance of observed and projected corners, px."""
+        return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A damped Gauss-Newton step, and the decrease of the cost that its quadratic model predicts for each view."""
+
+    state: State
+    predicted: Array
+    predicted_prior: float
+
+
+def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
+    information, gradient, back_camera, back_right = reduced(problem, normal, damping)
+    matrix, right = theta_system(problem, state.theta, information, gradient)
+    change = scaled_solve(matrix, right, damping)
+    camera_change = (problem.designs @ change)[problem.group]
+    pose = back_right - np.einsum("vpq,vq->vp", back_camera, camera_change)
+    new = moved(problem, state, change, pose)
+    whole = np.concatenate([camera_change, pose], axis=1)
+    bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
+    precision = problem.prior_sigma**-2.0
+    prior = (problem.prior_mean - state.theta) * precision * change - 0.5 * change**2 * precision
+    return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), float(prior.sum()))
+
+
+def refine(
+    problem: Problem,
+    state: State,
+    *,
+    fixed_theta: bool = False,
+    max_iterations: int = _MAX_ITERATIONS,
+    tolerance: float = _COST_TOLERANCE,
+) -> BundleResult:
+    """Minimise the robust reprojection error from ``state``.
+
+    With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost that ends the
+    iteration. Never raises for lack of convergence: the result says how it ended.
+    """
+    costs = view_costs(problem, state)
+    cost = float(costs.sum()) + prior_cost(problem, state)
+    if not np.isfinite(cost):
+        return _no_result(problem, state)
+    if fixed_theta:
+        state, costs, iterations, reason = _refined_poses(
+            problem, state, costs, max_iterations, tolerance
+        )
+        cost = float(costs.sum()) + prior_cost(problem, state)
+        return _result(problem, state, cost, iterations, reason)
+    damping, iterations, reason = _FIRST_DAMPING, 0, ""
+    while not reason and iterations < max_iterations:
+        iterations += 1
+        normal = normal_equations(problem, state)
+        while True:
+            step = _step(problem, state, normal, damping)
+            trial, trial_costs = _with_poses_that_follow(problem, state, costs, step)
+            trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
+            if trial_cost <= cost or damping >= _MAX_DAMPING:
+                break
+            damping *= 10.0
+        if trial_cost > cost:
+            reason = "converged: no step lowers the cost"
+            break
+        decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
+        damping = max(0.1 * damping, _MIN_DAMPING)
+        predicted = float(step.predicted.sum()) + step.predicted_prior
+        if decrease <= tolerance * cost and predicted <= 1e3 * tolerance * (1.0 + cost):
+            reason = "converged: relative decrease below the tolerance"
+    return _result(problem, state, cost, iterations, reason)
+
+
+def _with_poses_that_follow(
+    problem: Problem, state: State, costs: Array, step: _Step
+) -> tuple[State, Array]:
+    """The state after a step, and its costs per view.
+
+    The tilt of a nearly flat view acts by its square, so that its quadratic model holds for very small steps only.
+    Where the model failed, the pose is adjusted to the new camera by itself; else a few such views would hold back
+    the rest.
+    """
+    trial = step.state
+    trial_costs = view_costs(problem, trial)
+    short = trial_costs > costs - _POOR_GAIN * step.predicted + _NEGLIGIBLE
+    if not np.any(short):
+        return trial, trial_costs
+    part = part_of(problem, short)
+    start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
+    own, own_costs, _, _ = _refined_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
+    rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
+    rotations[short], translations[short] = own.rotations, own.translations_m
+    trial = State(trial.theta, rotations, translations)
+    trial_costs[short] = own_costs
+    return trial, trial_costs
+
+
+def _refined_poses(
+    problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
+) -> tuple[State, Array, int, str]:
+    """Levenberg-Marquardt on each view by itself, for all views at once.
+
+    Returns the state, the costs of the views, the number of iterations, and why they ended (empty at the limit).
+    """
+    damping = np.full(len(costs), _FIRST_DAMPING)
+    iterations, reason = 0, ""
+    while not reason and iterations < max_iterations:
+        iterations += 1
+        normal = normal_equations(problem, state)
+        pose = normal.matrix[:, 10:, 10:].copy()
+        diagonal = np.arange(6)
+        pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        change = np.asarray(
+            np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0], dtype=np.float64
+        )
+        trial = moved(problem, state, np.zeros_like(state.theta), change)
+        trial_costs = view_costs(problem, trial)
+        better = trial_costs <= costs
+        decrease = np.where(better, costs - trial_costs, 0.0)
+        state = State(
+            state.theta,
+            np.where(better[:, None, None], trial.rotations, state.rotations),
+            np.where(better[:, None], trial.translations_m, state.translations_m),
+        )
+        costs = np.where(better, trial_costs, costs)
+        damping = np.where(better, np.maximum(0.1 * damping, _MIN_DAMPING), 10.0 * damping)
+        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, 10:], change)
+        small = tolerance * (1.0 + costs)
+        if np.all(np.where(better, decrease, predicted) <= small):
+            reason = "converged: relative decrease below the tolerance"
+    return state, costs, iterations, reason
+
+
+def _result(
+    problem: Problem, state: State, cost: float, iterations: int, reason: str
+) -> BundleResult:
+    normal = normal_equations(problem, state)
+    information, gradient, back_camera, _ = reduced(problem, normal, 0.0)
+    matrix, _ = theta_system(problem, state.theta, information, gradient)
+    covariance = _covariance(matrix)
+    spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)
+    height_row = back_camera[:, 5]
+    own = np.linalg.inv(normal.matrix[:, 10:, 10:])[:, 5, 5]
+    coupled = np.einsum("vp,vpq,vq->v", height_row, spread[problem.group], height_row)
+    return BundleResult(
+        state=state,
+        residuals_px=normal.residuals_px,
+        huber_weight=normal.huber_weight,
+        cost=cost,
+        information=information,
+        gradient=gradient,
+        covariance=covariance,
+        height_variance_m2=(own + coupled) * problem.unit_m**2,
+        iterations=iterations,
+        converged=reason.startswith("converged"),
+        reason=reason or "stopped at the iteration limit",
+    )
+
+
+def _no_result(problem: Problem, state: State) -> BundleResult:
+    """What is known when some point has no projection at the start: nothing."""
+    groups, size = len(problem.designs), len(state.theta)
+    return BundleResult(
+        state=state,
+        residuals_px=residuals(problem, state),
+        huber_weight=np.zeros(len(problem.board_m)),
+        cost=float("inf"),
+        information=np.zeros((groups, 10, 10)),
+        gradient=np.zeros((groups, 10)),
+        covariance=np.full((size, size), np.inf),
+        height_variance_m2=np.full(len(problem.group), np.inf),
+        iterations=0,
+        converged=False,
+        reason="a point has no projection at the start",
+    )
+
+
+def _covariance(matrix: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
+    # pinv: a direction that neither data nor prior hold gets no spurious certainty from rounding.
+    inverse = np.linalg.pinv(matrix * np.outer(scale, scale), rcond=1e-15, hermitian=True)
+    inverse = 0.5 * (inverse + inverse.T)
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)

@@ -1,0 +1,129 @@
+"""Starting values of a calibration: scales and poses from the affine part of every view.
+
+Only the nominal scale (magnification, image width, display width) is presumed, and zero distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.plane_geometry import (
+    AffineView,
+    mirrored_tilt,
+    rotation_from_affine,
+    view_affine,
+)
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import CalibrationError
+
+__all__ = ["InitialValues", "initial_values", "pose_from_camera"]
+
+Array = NDArray[np.float64]
+
+# Width of the field over the distance of the pivot. Noise and distortion imitate some hundredths; an SEM at 100x has
+# 0.06 to 0.15, a photographic lens about 1.
+_WIDE = 0.3
+
+
+@dataclass(frozen=True)
+class InitialValues:
+    """Start of the adjustment.
+
+    Attributes
+    ----------
+    scale_factor
+        Observed over nominal scale, median over the views.
+    rho
+        Inverse pivot distance, 1/m.
+    rotations, translations_m
+        (V, 3, 3) and (V, 3).
+    wide
+        Whether the perspective within the widest view is so strong that it determines ``rho`` by itself, as in a
+        photograph.
+    """
+
+    scale_factor: float
+    rho: float
+    rotations: Array
+    translations_m: Array
+    wide: bool
+
+
+def _estimate_rho(affines: Sequence[AffineView], rotations: Array, fallback: float) -> float:
+    """Least squares of |depth gradient| = rho * sin(tilt); the views with the largest fields dominate by weight."""
+    gradient = np.array([np.linalg.norm(a.gradient) for a in affines])
+    tilt = np.linalg.norm(rotations[:, 2, :2], axis=1)
+    # Noise of the gradient grows with the scale, since it acts over a smaller field.
+    weight = np.array([a.scale for a in affines]) ** -4.0
+    denominator = float(np.sum(weight * tilt * tilt))
+    if denominator <= 0.0:
+        return fallback
+    return float(np.sum(weight * gradient * tilt) / denominator)
+
+
+def initial_values(
+    views: Sequence[GridView], nominal_px_per_m: Array, centre_px: Array, rho_prior: float
+) -> InitialValues:
+    """Starting values from views (V) and their nominal scales (V,) in px per m."""
+    affines = [view_affine(v.board_xy_m, v.image_xy, centre_px) for v in views]
+    ratios = np.array([a.scale for a in affines]) / nominal_px_per_m
+    factor = float(np.median(ratios))
+    rotations = np.stack([rotation_from_affine(a.matrix, a.gradient) for a in affines])
+    rho = _estimate_rho(affines, rotations, rho_prior)
+    board = np.stack([a.board_xy_m for a in affines])
+    translations = -np.einsum("vij,vj->vi", rotations[:, :, :2], board)
+    # The grid point seen at the image centre lies on the axis: at the reference plane, unless its scale tells more.
+    wide = _is_wide(rho, (2.0 * centre_px[0] + 1.0) / min(a.scale for a in affines))
+    if wide:
+        translations[:, 2] += (factor / ratios - 1.0) / rho
+    return InitialValues(factor, rho, rotations, translations, wide)
+
+
+def _is_wide(rho: float, field_m: float) -> bool:
+    return bool(rho * field_m > _WIDE)
+
+
+def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
+    """Two candidate poses of a view under a known camera.
+
+    Returns
+    -------
+    rotations, translations_m
+        (2, 3, 3) and (2, 3): the pose from the affine part of the undistorted view, and its mirrored tilt.
+
+    Raises
+    ------
+    CalibrationError
+        If the camera can undistort fewer than four corners of the view.
+    """
+    ideal = camera.undistort(view.image_xy)
+    known = np.all(np.isfinite(ideal), axis=1)
+    if known.sum() < 4:
+        raise CalibrationError(
+            f"view {view.name}, of which the calibration can undistort {known.sum()} corners",
+            expected="images of the microscope that was calibrated",
+            do="check the magnification and the display width",
+        )
+    principal = np.array([camera.px, camera.py])
+    centre = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
+    affine = view_affine(view.board_xy_m[known], ideal[known], centre)
+    metric = np.asarray(
+        np.linalg.solve(camera.ideal_from_sem_jacobian, affine.matrix), dtype=np.float64
+    )
+    rotation = rotation_from_affine(metric, affine.gradient)
+    both = np.stack([rotation, mirrored_tilt(rotation[None])[0]])
+    offset = np.linalg.solve(camera.ideal_from_sem_jacobian, centre - principal)
+    # The grid plane passes through the reference plane on the axis of the image centre, unless its scale tells more.
+    depth = 1.0
+    if _is_wide(camera.rho, camera.width / camera.m):
+        depth = 1.0 / float(np.linalg.norm(metric, 2))
+    translations = -both[:, :, :2] @ affine.board_xy_m
+    translations[:, :2] += depth * offset
+    if depth != 1.0:
+        translations[:, 2] += (depth - 1.0) / camera.rho
+    return both, translations

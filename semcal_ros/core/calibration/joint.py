@@ -1,0 +1,399 @@
+"""The default calibration: one adjustment over all images at all magnifications.
+
+Its unknowns are the coefficients of the continuous functions themselves, so a magnification with few views borrows
+from its neighbours and nothing has to be interpolated afterwards (design section 6.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.initial_values import initial_values
+from semcal_ros.core.calibration.model_selection import Summary, select_functions
+from semcal_ros.core.calibration.normal_equations import Problem, State, scaled_solve, theta_system
+from semcal_ros.core.calibration.problem import (
+    Functions,
+    Setup,
+    adjust,
+    build_problem,
+    constant_functions,
+    resolve_mirrored_tilts,
+    theta_of,
+    variance_factor,
+    with_coefficients,
+)
+from semcal_ros.core.calibration.residual_field_fit import (
+    FieldChoice,
+    FieldSystem,
+    blank_field,
+    choose_field,
+    corrected,
+    field_system,
+    solve_field,
+)
+from semcal_ros.core.calibration.scatter import excess_sigma_px, with_excess
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.residual_field import ResidualField
+
+__all__ = [
+    "RESIDUAL_MODES",
+    "FittedField",
+    "JointFit",
+    "fit_joint",
+    "suited_to_views",
+    "without_magnification",
+]
+
+Array = NDArray[np.float64]
+
+RESIDUAL_MODES = ("auto", "off", "on")
+_SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+_MAX_ROUNDS = 5
+_RESERVE, _LEAST_SIZE = 2, 5
+_HEIGHT_UPDATES = 4
+# Spread of heights over its prior: a micrometre is below what any view shows, and nobody has millimetres of depth of
+# field.
+_LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
+_FLAT_RAD = np.radians(5.0)
+# Fewer views than this say nothing about a spread of their own.
+_ENOUGH_HEIGHTS = 4
+# For what only has to be near: signs of tilts, poses, moderately flexible functions.
+_ENOUGH_CORNERS = 60
+# Tolerance of the adjustments on the way; only the last one has to be exact.
+_COARSE = 1e-6
+_MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
+# Change of the corrections of all corners, RMS in px, that is none: a fiftieth of good corners' noise.
+_FIELD_SETTLED_PX = 1e-3
+# The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
+_MAX_START_RHO = 200.0
+
+
+@dataclass(frozen=True)
+class FittedField:
+    """The residual field of a :class:`JointFit`.
+
+    Attributes
+    ----------
+    field
+        The field itself.
+    choice
+        Its strength, and what cross-validation says.
+    system
+        The reduced system at the solution, from which magnifications can be left out.
+    settled
+        Whether camera and field stopped changing.
+    """
+
+    field: ResidualField
+    choice: FieldChoice
+    system: FieldSystem
+    settled: bool
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Outcome of :func:`fit_joint`.
+
+    Attributes
+    ----------
+    functions, result, problem
+        The adjustment with the chosen number of coefficients.
+    padded, covariance
+        The same functions with some coefficients more, which are zero, and the covariance of all of them, followed by
+        the coefficients of the field, for unit variance of the residuals.
+    rounds, settled
+        How the choice came about.
+    field
+        The residual field, or None.
+    excess_px
+        1-sigma per axis, px, by which all corners scatter beyond their own.
+    """
+
+    functions: Functions
+    result: BundleResult
+    problem: Problem
+    padded: Functions
+    covariance: Array
+    rounds: int
+    settled: bool
+    field: FittedField | None
+    excess_px: float
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """An adjustment on the way."""
+
+    functions: Functions
+    problem: Problem
+    result: BundleResult
+    rounds: int
+    settled: bool
+
+
+def _height_sigma(setup: Setup, result: BundleResult) -> Array:
+    """(V,) expectation-maximisation update of the spread of the heights.
+
+    Views without tilt have a spread of their own: nobody turns the stage about the very point that is looked at, so
+    that tilting changes the height, while views from above may all share one.
+    """
+    square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
+    flat = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
+    if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:
+        flat = np.zeros_like(flat)
+    variance = np.empty(len(square))
+    for group in (flat, ~flat):
+        variance[group] = np.mean(square[group]) if np.any(group) else 0.0
+    prior = setup.priors.height_sigma_m
+    return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior))
+
+
+def enriched(
+    functions: Functions, sizes: Mapping[str, tuple[str, int]]
+) -> dict[str, ContinuousFunction]:
+    """Functions of other kinds and sizes through the values of the given ones, by least squares."""
+    out: dict[str, ContinuousFunction] = {}
+    for name, function in functions.items():
+        kind, size = sizes.get(name, (function.kind, function.smooth_size))
+        zeros = np.zeros(size + len(function.breaks))
+        blank = ContinuousFunction(kind, zeros, function.g_range, breaks=function.breaks)
+        grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
+        basis = np.stack([blank.basis(float(g)) for g in grid])
+        values = np.array([function(float(g)) for g in grid])
+        out[name] = replace(blank, coefficients=np.linalg.lstsq(basis, values, rcond=None)[0])
+    return out
+
+
+def _thinned(view: GridView) -> GridView:
+    """The view with a spread of at most so many corners as its pose and a rough camera need."""
+    if len(view.board_xy_m) <= _ENOUGH_CORNERS:
+        return view
+    keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
+    return view.chosen(keep)
+
+
+def suited_to_views(setup: Setup) -> Setup:
+    """The setup with priors for a photographic lens where the views show that strong a perspective."""
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    if not start.wide:
+        return setup
+    return replace(setup, priors=setup.priors.of_wide_views(start.rho))
+
+
+def _started(setup: Setup) -> tuple[Functions, State, Array]:
+    """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    rho = start.rho if start.wide else min(max(start.rho, 0.0), _MAX_START_RHO)
+    functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
+    height = np.full(len(setup.views), setup.priors.height_sigma_m)
+    problem = build_problem(setup, functions, setup.views, height)
+    state = State(theta_of(functions), start.rotations, start.translations_m)
+    state, _ = resolve_mirrored_tilts(problem, state)
+
+    size = min(3, max(1, len(setup.magnifications) - 1))
+    functions = enriched(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
+    problem = build_problem(setup, functions, setup.views, height)
+    result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    for _ in range(_HEIGHT_UPDATES):
+        # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
+        height = _height_sigma(setup, result)
+        problem = replace(problem, height_sigma_m=height)
+        result = refine(problem, result.state, tolerance=_COARSE)
+    return with_coefficients(functions, result.state.theta), result.state, height
+
+
+def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
+    """The functions with some more coefficients than were chosen, all zero."""
+    out = dict(functions)
+    low, high = functions["scale"].g_range
+    for name in _SMOOTH if low < high else ():
+        own = functions[name]
+        size = max(own.smooth_size + _RESERVE, _LEAST_SIZE)
+        smooth, jumps = np.split(own.coefficients, [own.smooth_size])
+        zeros = np.zeros(size - own.smooth_size)
+        out[name] = replace(own, coefficients=np.concatenate([smooth, zeros, jumps]))
+    return out
+
+
+def _covariance_with_reserve(
+    setup: Setup, padded: Functions, stage: _Stage, field: FittedField | None
+) -> Array:
+    """Covariance of the padded functions' coefficients and of the field's.
+
+    A coefficient that was left out is not known to be zero: what the data do not tell about it is as uncertain as its
+    prior says. Nor is zero what the data say: by how much all coefficients would move if those were let free, the
+    estimate may be wrong on top of that.
+    """
+    views = setup.views if field is None else corrected(setup, field.field).views
+    problem = build_problem(setup, padded, views, stage.problem.height_sigma_m)
+    state = replace(stage.result.state, theta=theta_of(padded))
+    result = refine(problem, state, max_iterations=0)
+    factor = variance_factor(stage.problem, stage.result)
+    if field is None:
+        reduced = theta_system(problem, state.theta, result.information, result.gradient)
+        covariance, moved = result.covariance, scaled_solve(*reduced, 0.0)
+    else:
+        system = field_system(setup, problem, result, field.field)
+        # This one is scaled to the variance that the residuals show.
+        covariance = system.covariance(field.choice.prior) / factor
+        theta, freed = solve_field(system, field.choice.prior, field.field)
+        change = freed.coefficients - field.field.coefficients
+        moved = np.concatenate([theta - state.theta, change.ravel()])
+    return covariance + np.outer(moved, moved) / factor
+
+
+def _selected(
+    setup: Setup,
+    functions: Functions,
+    state: State,
+    height_sigma_m: Array,
+    sizes: Mapping[str, tuple[str, int]] | None = None,
+) -> _Stage:
+    """Choose the number of coefficients of every function until the choice no longer changes."""
+    problem = build_problem(setup, functions, setup.views, height_sigma_m)
+    result = refine(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    settled, rounds = len(setup.magnifications) < 3, 0
+    while rounds < _MAX_ROUNDS and not settled:
+        rounds += 1
+        chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
+        settled = chosen == sizes
+        if settled:
+            break
+        sizes = chosen
+        functions = enriched(with_coefficients(functions, result.state.theta), chosen)
+        problem = build_problem(setup, functions, setup.views, _height_sigma(setup, result))
+        result = refine(
+            problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
+        )
+    functions = with_coefficients(functions, result.state.theta)
+    return _Stage(functions, problem, result, rounds, settled)
+
+
+def _finished(setup: Setup, stage: _Stage) -> _Stage:
+    """The exact adjustment with the chosen functions, all tilts having been tried both ways."""
+    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    height = _height_sigma(setup, stage.result)
+    turned, _ = resolve_mirrored_tilts(
+        build_problem(thin, stage.functions, thin.views, height), stage.result.state
+    )
+    problem = build_problem(setup, stage.functions, setup.views, height)
+    result = refine(problem, turned)
+    functions = with_coefficients(stage.functions, result.state.theta)
+    return replace(stage, functions=functions, problem=problem, result=result)
+
+
+def _with_field(setup: Setup, stage: _Stage, always: bool) -> tuple[_Stage, FittedField | None]:
+    """Camera and residual field, or the stage as it is where the field is not worthwhile.
+
+    Each turn solves for both together, and then adjusts poses and camera to observations that the field has corrected.
+    In the first turns the strength of the field and the number of coefficients of the functions are chosen anew.
+    """
+    field = blank = blank_field(setup)
+    start, before = stage, setup
+    for turn in range(_MAX_FIELD_TURNS):
+        system = field_system(setup, stage.problem, stage.result, field)
+        if turn < _CHOOSING_TURNS:
+            choice = choose_field(setup, system, blank)
+            if not (choice.worthwhile or always):
+                return start, None
+        theta, field = solve_field(system, choice.prior, blank)
+        after = corrected(setup, field)
+        stage = _adjusted(after, stage, theta, choosing=turn < _CHOOSING_TURNS)
+        pairs = zip(before.views, after.views, strict=True)
+        change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
+        before = after
+        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
+            return stage, FittedField(field, choice, system, True)
+    return stage, FittedField(field, choice, system, False)
+
+
+def _sizes_of(stage: _Stage) -> dict[str, tuple[str, int]]:
+    own = stage.functions
+    return {name: (own[name].kind, own[name].smooth_size) for name in _SMOOTH}
+
+
+def _adjusted(setup: Setup, stage: _Stage, theta: Array, *, choosing: bool) -> _Stage:
+    """The stage with other views and coefficients; ``choosing`` the number of coefficients again."""
+    functions, height = (
+        with_coefficients(stage.functions, theta),
+        _height_sigma(setup, stage.result),
+    )
+    if choosing:
+        return _selected(setup, functions, stage.result.state, height, _sizes_of(stage))
+    problem = build_problem(setup, functions, setup.views, height)
+    result = refine(problem, replace(stage.result.state, theta=theta), tolerance=_COARSE)
+    functions = with_coefficients(functions, result.state.theta)
+    return replace(stage, functions=functions, problem=problem, result=result)
+
+
+def fit_joint(
+    setup: Setup,
+    residual: str = "off",
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
+) -> JointFit:
+    """Calibrate from nominal values alone.
+
+    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
+    both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
+    one magnification at a time, until the choice no longer changes. With ``residual`` ``"on"``, or ``"auto"`` where
+    cross-validation finds it worthwhile, a residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
+    """
+    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    on_stage("start values", 0.0)
+    start = _started(thin)
+    on_stage("number of coefficients", 0.3)
+    stage, field = _selected(setup, *start), None
+    if residual != "off":
+        on_stage("residual field", 0.5)
+        stage, field = _with_field(setup, stage, residual == "on")
+    excess = excess_sigma_px(setup.views, stage.result.residuals_px, 6 * len(setup.views))
+    if excess > 0.0:
+        setup = replace(setup, views=with_excess(setup.views, excess))
+    final = setup if field is None else corrected(setup, field.field)
+    if excess > 0.0:
+        height = _height_sigma(setup, stage.result)
+        stage = _selected(final, stage.functions, stage.result.state, height, _sizes_of(stage))
+    on_stage("final adjustment", 0.75)
+    stage = _finished(final, stage)
+    if field is not None:
+        system = field_system(setup, stage.problem, stage.result, field.field)
+        field = replace(field, system=system)
+    padded = _with_reserve(stage.functions)
+    covariance = _covariance_with_reserve(setup, padded, stage, field)
+    return JointFit(
+        stage.functions,
+        stage.result,
+        stage.problem,
+        padded,
+        covariance,
+        stage.rounds,
+        stage.settled,
+        field,
+        excess,
+    )
+
+
+def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
+    """The joint solution without one magnification, by one Gauss-Newton step on the reduced equations.
+
+    At the optimum the poses of the other views follow linearly, so that one step is as good as a new adjustment.
+    """
+    if fit.field is not None:
+        fitted = fit.field
+        keep = fitted.system.group != index
+        theta, field = solve_field(fitted.system, fitted.choice.prior, fitted.field, keep)
+        return with_coefficients(fit.functions, theta), field
+    information, gradient = fit.result.information.copy(), fit.result.gradient.copy()
+    information[index] = 0.0
+    gradient[index] = 0.0
+    theta = theta_of(fit.functions)
+    matrix, right = theta_system(fit.problem, theta, information, gradient)
+    return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0)), None

@@ -1,0 +1,74 @@
+"""Views that an adjustment cannot believe, such as one whose magnification was recorded wrongly.
+
+A wrong magnification is a wrong scale, which the height of a view imitates where the projection is perspective, and
+which nothing imitates where it is parallel. So a view is compared with the others in both: its height with those of its
+own magnification, and how well it fits with all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.normal_equations import Problem, whitened_norm
+from semcal_ros.core.calibration.views import GridView
+
+__all__ = ["OutlyingView", "outlying_views"]
+
+Array = NDArray[np.float64]
+
+# Robust standard deviations: heights are a mixture of still and moved stages, with long tails.
+_HEIGHT_SIGMAS = 8.0
+# Spread below which differences of height are nothing, m.
+_LEAST_HEIGHT_M = 5e-6
+_MISFIT_RATIO = 6.0
+# Fewer views at a magnification are compared with those of all others instead.
+_ENOUGH_VIEWS = 3
+# Single views are wrong, not many.
+_FEW = 0.1
+
+
+@dataclass(frozen=True)
+class OutlyingView:
+    """A view that was left out, and why."""
+
+    view: GridView
+    reason: str
+
+
+def outlying_views(problem: Problem, result: BundleResult) -> Mapping[int, str]:
+    """Index and reason of each view that disagrees with the others.
+
+    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification disagree, or many in all,
+    it is not single views that are wrong, and none is named.
+    """
+    height = result.state.translations_m[:, 2]
+    square = np.add.reduceat(
+        whitened_norm(problem, result.residuals_px) ** 2, problem.starts[:-1]
+    ) / np.diff(problem.starts)
+    misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
+    members = [np.flatnonzero(problem.group == k) for k in range(len(problem.designs))]
+    offset = height - np.median(height)
+    for own in members:
+        if len(own) >= _ENOUGH_VIEWS:
+            offset[own] = height[own] - np.median(height[own])
+    # 90 % of normal deviates are below 1.645; the median would only see the stages that stood still.
+    spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
+    odd = (np.abs(offset) > _HEIGHT_SIGMAS * spread) | (misfit > _MISFIT_RATIO)
+    reasons: dict[int, str] = {}
+    if odd.mean() > _FEW:
+        return reasons
+    for own in members:
+        if len(own) >= _ENOUGH_VIEWS and 2 * odd[own].sum() >= len(own):
+            continue
+        for v in own[odd[own]]:
+            reasons[int(v)] = (
+                f"does not agree with the other views at its magnification: {1e6 * offset[v]:.0f} um of height, where "
+                f"{1e6 * spread:.0f} um are usual, and residuals {misfit[v]:.1f} times the usual; wrong magnification, "
+                "or a square named wrongly"
+            )
+    return reasons

@@ -1,0 +1,299 @@
+"""Estimation of the residual field together with the coefficients of the camera.
+
+The field is linear in its coefficients, so that one reduced system over all magnifications holds both: the poses are
+eliminated view by view, and what is left of a view is an information matrix on its camera and its slice of the field.
+How strong the field may be, and whether there is one, is decided by cross-validation: magnifications are left out, or
+views where there are few magnifications.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.normal_equations import (
+    Problem,
+    whiten,
+    whitened_rows,
+    with_height_prior,
+)
+from semcal_ros.core.calibration.problem import Setup, variance_factor
+from semcal_ros.core.camera.residual_field import ResidualField, zero_field
+
+__all__ = [
+    "FieldChoice",
+    "FieldSystem",
+    "blank_field",
+    "choose_field",
+    "corrected",
+    "field_system",
+    "solve_field",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Standard deviations of a coefficient that are tried, px: from less than the noise to a camera lens.
+_STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
+_NO_STRENGTH_PX = 1e-7
+# Second differences of the coefficients are so much smaller than the coefficients: fields are smooth.
+_SMOOTHNESS = 4.0
+# Differences between neighbouring coefficients in log g, likewise.
+_STEADINESS = 3.0
+# Standard deviation of what the field has in common with the rest of the model, px.
+_OVERLAP_PX = 1e-4
+_MAX_COEFFICIENTS_IN_G = 3
+# Fewer magnifications say nothing about one that is left out.
+_ENOUGH_MAGNIFICATIONS = 4
+_MAX_FOLDS = 6
+# A field must gain so many held-out half chi-squares, and standard errors over what is left out.
+_LEAST_GAIN, _CLEARLY = 6.0, 2.5
+
+
+@dataclass(frozen=True)
+class FieldSystem:
+    """Quadratic approximation of the reprojection error with the poses eliminated.
+
+    Its members are what cross-validation leaves out: magnifications, or views where there are few magnifications.
+
+    Attributes
+    ----------
+    information, right
+        (N, 10 + F, 10 + F) and (N, 10 + F): the cost of camera and slice z of a member is
+        ``0.5 z' information z - right' z`` plus a constant, in units of the noise variance.
+    group
+        (N,) index of each member's magnification.
+    designs
+        (M, 10, K): camera of each magnification per unit of theta.
+    weights
+        (M, ng): slice of the field per coefficient in log g.
+    theta_mean, theta_precision
+        (K,) prior of theta.
+    """
+
+    information: Array
+    right: Array
+    group: NDArray[np.intp]
+    designs: Array
+    weights: Array
+    theta_mean: Array
+    theta_precision: Array
+
+    def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
+        """Normal equations of theta and all coefficients of the field, whose prior precision is ``prior``."""
+        count, width = len(self.designs), self.right.shape[1]
+        blocks, rights = np.zeros((count, width, width)), np.zeros((count, width))
+        for v in np.flatnonzero(keep):
+            blocks[self.group[v]] += self.information[v]
+            rights[self.group[v]] += self.right[v]
+        size = self.designs.shape[2]
+        turned = np.swapaxes(self.designs, 1, 2)
+        cross = np.einsum("mka,mg->kga", turned @ blocks[:, :10, 10:], self.weights)
+        ng, slice_size = self.weights.shape[1], width - 10
+        pairs = (self.weights[:, :, None] * self.weights[:, None, :]).reshape(count, -1)
+        own = pairs.T @ blocks[:, 10:, 10:].reshape(count, -1)
+        own = own.reshape(ng, ng, slice_size, slice_size).transpose(0, 2, 1, 3)
+        matrix = np.empty((size + len(prior), size + len(prior)))
+        matrix[:size, :size] = (turned @ blocks[:, :10, :10] @ self.designs).sum(axis=0)
+        matrix[np.diag_indices(size)] += self.theta_precision
+        matrix[:size, size:] = cross.reshape(size, -1)
+        matrix[size:, :size] = matrix[:size, size:].T
+        matrix[size:, size:] = own.reshape(len(prior), -1) + prior
+        camera = np.einsum("mpk,mp->k", self.designs, rights[:, :10])
+        field = np.einsum("mg,ma->ga", self.weights, rights[:, 10:]).ravel()
+        return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
+
+    def solve(self, keep: Mask, prior: Array) -> Array:
+        """Theta followed by the coefficients of the field, from the members that are kept."""
+        matrix, right = self.assembled(keep, prior)
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
+        return np.asarray(scale * cho_solve(factor, scale * right), dtype=np.float64)
+
+    def covariance(self, prior: Array) -> Array:
+        """Covariance of what :meth:`solve` gives from all members."""
+        matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
+        inverse = cho_solve(factor, np.eye(len(scale)))
+        return np.asarray(0.5 * (inverse + inverse.T) * np.outer(scale, scale), dtype=np.float64)
+
+    def costs(self, solution: Array) -> Array:
+        """(N,) cost of each member, but for a constant."""
+        size = self.designs.shape[2]
+        slices = self.weights @ solution[size:].reshape(self.weights.shape[1], -1)
+        z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
+        bent = (self.information @ z[:, :, None])[:, :, 0]
+        return np.asarray(np.sum((0.5 * bent - self.right) * z, axis=1), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """Outcome of the cross-validation.
+
+    Attributes
+    ----------
+    strength_px
+        Prior standard deviation of a coefficient, px.
+    gain, gain_sigma
+        Held-out half chi-squares that the field gains, and their standard error.
+    worthwhile
+        Whether that is clearly a gain.
+    prior
+        Prior precision of the coefficients.
+    """
+
+    strength_px: float
+    gain: float
+    gain_sigma: float
+    worthwhile: bool
+    prior: Array
+
+
+def blank_field(setup: Setup) -> ResidualField:
+    """A field without displacement for the magnifications of these views."""
+    g = setup.magnifications
+    count = min(_MAX_COEFFICIENTS_IN_G, len(g))
+    return zero_field(setup.image_size, (float(g[0]), float(g[-1])), count)
+
+
+def corrected(setup: Setup, field: ResidualField) -> Setup:
+    """The views as the parametric distortion alone would have made them."""
+    slices = {float(g): field.at(float(g)) for g in setup.magnifications}
+    views = []
+    for view in setup.views:
+        q = (view.image_xy - setup.centre_px) / setup.norm_px
+        shift = setup.norm_px * slices[view.magnification].displacement(q)
+        views.append(replace(view, image_xy=view.image_xy + shift))
+    return replace(setup, views=tuple(views))
+
+
+def field_system(
+    setup: Setup, problem: Problem, result: BundleResult, field: ResidualField
+) -> FieldSystem:
+    """The reduced system about an adjustment.
+
+    ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the ones that ``field`` has
+    corrected. Weights are scaled to the variance that the residuals show.
+    """
+    variance = variance_factor(problem, result)
+    scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
+    whitened = whitened_rows(scaled, result.state)
+    size = field.slice_size
+    width = 17 + size
+    augmented = np.empty((len(setup.views), width, width))
+    one = field.at(float(setup.magnifications[0]))
+    for v, view in enumerate(setup.views):
+        part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
+        spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px)
+        rows = np.zeros((2, width, len(spline)))
+        # Observed plus field minus projected: the field counts as a projection that moves the other way.
+        rows[0, 16:-1:2] = rows[1, 17:-1:2] = -setup.norm_px * spline.T
+        whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
+        rows[:, :16] = whitened.rows[:, :16, part]
+        rows[:, -1] = whitened.rows[:, 16, part]
+        augmented[v] = rows[0] @ rows[0].T + rows[1] @ rows[1].T
+    with_height_prior(scaled, result.state, augmented, 15)
+    information, right = _without_poses(augmented)
+    weights = np.stack([field.weights(float(g)) for g in setup.magnifications])
+    slices = weights @ field.coefficients.reshape(len(field.coefficients), -1)
+    z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[problem.group]
+    right += np.einsum("vpq,vq->vp", information, z)
+    group = problem.group
+    if len(setup.magnifications) >= _ENOUGH_MAGNIFICATIONS:
+        first = np.searchsorted(group, np.arange(len(setup.magnifications)))
+        information, right = (np.add.reduceat(a, first, axis=0) for a in (information, right))
+        group = np.arange(len(setup.magnifications), dtype=np.intp)
+    return FieldSystem(
+        information,
+        right,
+        group,
+        problem.designs,
+        weights,
+        problem.prior_mean,
+        problem.prior_sigma**-2.0,
+    )
+
+
+def _without_poses(augmented: Array) -> tuple[Array, Array]:
+    """Schur complement of the pose in augmented normal equations (V, k, k): camera, pose, field, right-hand side."""
+    keep = np.r_[0:10, 16 : augmented.shape[1]]
+    pose = augmented[:, 10:16, 10:16]
+    cross = augmented[:, 10:16][:, :, keep]
+    left = augmented[:, keep[:, None], keep]
+    left -= np.swapaxes(cross, 1, 2) @ np.linalg.solve(pose, cross)
+    return left[:, :-1, :-1], left[:, :-1, -1]
+
+
+def _second_differences(count: int) -> Array:
+    rows = np.diff(np.eye(count), n=2, axis=0)
+    return np.asarray(rows.T @ rows, dtype=np.float64)
+
+
+def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
+    """Prior precision of all coefficients."""
+    ng, ny, nx, _ = field.coefficients.shape
+    bent = np.kron(np.eye(ny), _second_differences(nx)) + np.kron(
+        _second_differences(ny), np.eye(nx)
+    )
+    smooth = (np.eye(ny * nx) + _SMOOTHNESS**2 * bent) * (norm_px / strength_px) ** 2
+    steps = np.diff(np.eye(ng), axis=0)
+    steady = np.eye(ng) + _STEADINESS**2 * steps.T @ steps
+    overlaps = field.overlaps() * (norm_px / _OVERLAP_PX)
+    # The two components are the last axis of the coefficients.
+    whole = np.kron(steady, np.kron(smooth, np.eye(2)))
+    whole += np.kron(np.eye(ng), overlaps.T @ overlaps)
+    return np.asarray(whole, dtype=np.float64)
+
+
+def _folds(system: FieldSystem) -> list[Mask]:
+    """Members that are left out together."""
+    candidates = np.ones(len(system.group), dtype=bool)
+    if len(system.designs) >= _ENOUGH_MAGNIFICATIONS:
+        # The calibration does not claim to hold beyond the outermost magnifications: they are not left out.
+        candidates[[0, -1]] = False
+    order = np.cumsum(candidates) - 1
+    folds = min(_MAX_FOLDS, int(candidates.sum()))
+    return [candidates & (order % folds == k) for k in range(folds)]
+
+
+def choose_field(
+    setup: Setup,
+    system: FieldSystem,
+    blank: ResidualField,
+) -> FieldChoice:
+    """The strength of a field that predicts best what it has not seen, and whether the field is worthwhile at all."""
+    folds = _folds(system)
+
+    def held_out(strength_px: float) -> Array:
+        prior = _prior(blank, strength_px, setup.norm_px)
+        costs = [system.costs(system.solve(~fold, prior))[fold] for fold in folds]
+        return np.concatenate(costs)
+
+    without = held_out(_NO_STRENGTH_PX)
+    gains = {s: without - held_out(s) for s in _STRENGTHS_PX}
+    best = max(gains, key=lambda s: float(gains[s].sum()))
+    gain = float(gains[best].sum())
+    sigma = float(np.std(gains[best]) * np.sqrt(len(without)))
+    prior = _prior(blank, best, setup.norm_px)
+    return FieldChoice(
+        strength_px=best,
+        gain=gain,
+        gain_sigma=sigma,
+        worthwhile=gain > max(_LEAST_GAIN, _CLEARLY * sigma),
+        prior=prior,
+    )
+
+
+def solve_field(
+    system: FieldSystem, prior: Array, blank: ResidualField, keep: Mask | None = None
+) -> tuple[Array, ResidualField]:
+    """Theta and field from all members, or from those that are kept."""
+    every = np.ones(len(system.group), dtype=bool)
+    solution = system.solve(every if keep is None else keep, prior)
+    theta, coefficients = np.split(solution, [system.designs.shape[2]])
+    return theta, replace(blank, coefficients=coefficients.reshape(blank.coefficients.shape))

@@ -1,0 +1,91 @@
+"""What is worth telling of a calibration: statistics for its file, and what the views do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.calibration.evaluate import PoseFit, rms_by_magnification
+from semcal_ros.core.calibration.joint import FittedField
+from semcal_ros.core.calibration.problem import Setup
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+
+__all__ = ["about_field", "data_warnings", "statistics_of"]
+
+Array = NDArray[np.float64]
+
+
+def about_field(fitted: FittedField | None) -> dict[str, Any] | None:
+    """How the residual field was chosen, or None without one."""
+    if fitted is None:
+        return None
+    choice = fitted.choice
+    return {
+        "strength_px": choice.strength_px,
+        "held_out_gain": choice.gain,
+        "held_out_gain_sigma": choice.gain_sigma,
+        "worthwhile": choice.worthwhile,
+        "converged": fitted.settled,
+    }
+
+
+def data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
+    """What the views do not determine beyond the priors."""
+    warnings: list[str] = []
+    covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
+    assert covariance is not None
+    sigma = np.sqrt(np.diag(covariance))
+    for index, name, label in (
+        (3, "px", "principal point"),
+        (5, "rho", "distance of the scan pivot"),
+    ):
+        if sigma[index] > 0.8 * setup.prior_of(name)[1]:
+            warnings.append(f"the views do not determine the {label}; it is held by its prior")
+    counts = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
+    few = [f"{g:g}" for g, n in counts.items() if n < 3]
+    if few:
+        warnings.append(f"fewer than 3 views at magnification {', '.join(few)}")
+    return warnings
+
+
+def statistics_of(
+    setup: Setup,
+    details: Mapping[str, Any],
+    height_sigma_m: Array,
+    poses: PoseFit,
+    held_out: Mapping[float, float],
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """Plain numbers and sentences that the calibration file keeps."""
+    inner = [held_out[float(g)] for g in setup.magnifications[1:-1] if float(g) in held_out]
+    rms = rms_by_magnification(poses)
+    return {
+        "views": len(setup.views),
+        "corners": int(sum(len(v.board_xy_m) for v in setup.views)),
+        "rms_px": poses.rms_px(),
+        "held_out_rms_px": float(np.sqrt(np.mean(np.square(inner)))) if inner else None,
+        "by_magnification": [
+            {
+                "magnification": float(g),
+                "views": int(sum(v.magnification == g for v in setup.views)),
+                "rms_px": rms[float(g)],
+                "held_out_rms_px": held_out.get(float(g)),
+                "held_out_extrapolated": bool(
+                    g in (setup.magnifications[0], setup.magnifications[-1])
+                ),
+            }
+            for g in setup.magnifications
+        ],
+        "gauge": "the heights of the views about the reference plane have zero prior mean",
+        "priors": {
+            **asdict(setup.priors),
+            "height_sigma_m": float(np.max(height_sigma_m)),
+            "least_height_sigma_m": float(np.min(height_sigma_m)),
+        },
+        "fit": dict(details),
+        "warnings": list(warnings),
+    }

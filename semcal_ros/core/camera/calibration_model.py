@@ -1,0 +1,180 @@
+"""A calibration as continuous functions of the magnification, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["FUNCTION_NAMES", "CalibrationModel", "checked_magnification", "design_matrix"]
+
+Array = NDArray[np.float64]
+
+# The scale is kept relative to the nominal one, width g / display width, so that it is a number near 1 at every g.
+FUNCTION_NAMES: tuple[str, ...] = ("scale", *PARAMETER_NAMES[1:])
+
+
+def checked_magnification(magnification: float) -> float:
+    """The magnification as a float, or :class:`InvalidValueError` if it is not finite and positive."""
+    g = float(magnification)
+    if not (np.isfinite(g) and g > 0.0):
+        raise InvalidValueError(
+            f"magnification {magnification}", expected="a finite number greater than 0"
+        )
+    return g
+
+
+def design_matrix(
+    functions: Mapping[str, ContinuousFunction], g: float, nominal_px_per_m: float
+) -> Array:
+    """(10, K) matrix from all coefficients, in the order of ``FUNCTION_NAMES``, to camera parameters at ``g``."""
+    blocks = [functions[name].basis(g) for name in FUNCTION_NAMES]
+    blocks[0] = blocks[0] * nominal_px_per_m
+    matrix = np.zeros((len(blocks), sum(len(b) for b in blocks)))
+    column = 0
+    for row, block in enumerate(blocks):
+        matrix[row, column : column + len(block)] = block
+        column += len(block)
+    return matrix
+
+
+@dataclass(frozen=True)
+class CalibrationModel:
+    """Camera of the microscope at every magnification.
+
+    Attributes
+    ----------
+    functions
+        One :class:`ContinuousFunction` per name in ``FUNCTION_NAMES``.
+    covariance
+        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``, then of the residual field.
+    image_width, image_height
+        Size in px of the calibration images (without databar).
+    display_width_m
+        Width of the display to which "magnification" refers, m.
+    magnifications
+        The calibrated magnifications, ascending.
+    method
+        "joint", "discrete" or "pda".
+    statistics
+        What a reader wants to know of the calibration: views, corners, residuals, held-out errors, priors and gauge,
+        convergence, warnings. Plain numbers, strings, lists and dicts.
+    residual
+        What the distortion parameters do not describe, or None.
+    """
+
+    functions: Mapping[str, ContinuousFunction]
+    covariance: Array
+    image_width: int
+    image_height: int
+    display_width_m: float
+    magnifications: tuple[float, ...]
+    method: str
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+    residual: ResidualField | None = None
+
+    def __post_init__(self) -> None:
+        missing = [name for name in FUNCTION_NAMES if name not in self.functions]
+        if missing:
+            raise InvalidValueError(
+                f"a calibration without {', '.join(missing)}", expected=", ".join(FUNCTION_NAMES)
+            )
+        size = sum(self.functions[name].size for name in FUNCTION_NAMES)
+        size += 0 if self.residual is None else self.residual.size
+        if self.covariance.shape != (size, size):
+            raise InvalidValueError(
+                f"covariance of shape {self.covariance.shape}", expected=f"({size}, {size})"
+            )
+        if not self.magnifications or list(self.magnifications) != sorted(self.magnifications):
+            raise InvalidValueError(
+                f"magnifications {self.magnifications}", expected="an ascending, non-empty list"
+            )
+
+    @property
+    def magnification_range(self) -> tuple[float, float]:
+        """Lowest and highest calibrated magnification."""
+        return self.magnifications[0], self.magnifications[-1]
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) in px."""
+        return self.image_width, self.image_height
+
+    @property
+    def norm_px(self) -> float:
+        """Normalisation of the distortion: half the image width, px."""
+        return 0.5 * self.image_width
+
+    def nominal_px_per_m(self, g: float) -> float:
+        """Scale in px per m that the display width alone predicts."""
+        return g * self.image_width / self.display_width_m
+
+    def at(self, magnification: float) -> ScanCamera:
+        """The camera at a magnification.
+
+        Outside of :attr:`magnification_range` the functions go on along their tangents in log g, ``in_range`` is
+        False, and the covariance grows with the distance from the range.
+
+        Raises
+        ------
+        InvalidValueError
+            If the magnification is not finite and positive, or so far out of range that no camera results.
+        """
+        g = checked_magnification(magnification)
+        low, high = self.magnification_range
+        in_range = bool(low * (1 - 1e-9) <= g <= high * (1 + 1e-9))
+        design = design_matrix(self.functions, g, self.nominal_px_per_m(g))
+        theta = np.concatenate([self.functions[name].coefficients for name in FUNCTION_NAMES])
+        size = len(theta)
+        covariance = design @ self.covariance[:size, :size] @ design.T
+        residual = None
+        if self.residual is not None:
+            spread, cross = self.covariance[size:, size:], design @ self.covariance[:size, size:]
+            residual = self.residual.at(g, spread, cross)
+        if not in_range:
+            covariance = covariance + self._extrapolation_covariance(g)
+        values = dict(zip(PARAMETER_NAMES, (design @ theta).tolist(), strict=True))
+        try:
+            return ScanCamera(
+                magnification=g,
+                **values,
+                norm_px=self.norm_px,
+                width=self.image_width,
+                height=self.image_height,
+                covariance=covariance,
+                in_range=in_range,
+                residual=residual,
+            )
+        except InvalidValueError as error:
+            raise InvalidValueError(
+                f"magnification {g:g}, where the calibration has no meaningful camera",
+                expected=f"a magnification near the calibrated range {low:g} to {high:g}",
+                do="calibrate there",
+            ) from error
+
+    def _extrapolation_covariance(self, g: float) -> Array:
+        """Diagonal (10, 10) allowance for not knowing how the functions go on.
+
+        Each parameter may leave its tangent by as much as it varied over the calibrated range, per unit of
+        log g relative to the range, squared with the distance so that it starts smoothly at the edge.
+        """
+        low, high = self.magnification_range
+        edge = low if g < low else high
+        span = max(float(np.log(high / low)), 1.0)
+        distance = abs(float(np.log(g / edge))) / span
+        grid = np.geomspace(low, high, 33)
+        sigma = np.empty(len(FUNCTION_NAMES))
+        for i, name in enumerate(FUNCTION_NAMES):
+            values = [self.functions[name](x) for x in grid]
+            sigma[i] = 2.0 * (max(values) - min(values)) * distance
+        sigma[0] *= self.nominal_px_per_m(g)
+        return np.diag(sigma**2)

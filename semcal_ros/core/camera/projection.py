@@ -1,0 +1,122 @@
+"""Projection of sem-frame points to raw pixels, with derivatives, for arrays of camera parameters.
+
+The model is that of design section 4, equations (9)-(12) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020,
+rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho`` so that nothing diverges at ``rho = 0``:
+
+    w   = 1 + rho Z
+    x_u = px + m (a X + sigma Y) / w
+    y_u = py + m (Y / a) / w
+
+followed by the distortion of :mod:`semcal_ros.core.camera.distortion`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.distortion import distort_jacobians, distort_normalised
+
+__all__ = [
+    "PARAMETER_NAMES",
+    "ProjectionJacobians",
+    "project_ideal_points",
+    "project_points",
+    "project_points_with_jacobians",
+]
+
+Array = NDArray[np.float64]
+
+PARAMETER_NAMES: tuple[str, ...] = (
+    "m",
+    "aspect",
+    "skew",
+    "px",
+    "py",
+    "rho",
+    "xi_r",
+    "xi_t",
+    "ex",
+    "ey",
+)
+
+
+@dataclass(frozen=True)
+class ProjectionJacobians:
+    """Raw pixels and their derivatives.
+
+    Attributes
+    ----------
+    xy
+        (n, 2) raw pixels.
+    d_xyz
+        (n, 2, 3) derivative with respect to the sem-frame point, px per m.
+    d_parameters
+        (n, 2, 10) derivative with respect to the parameters in the order of :data:`PARAMETER_NAMES`.
+    """
+
+    xy: Array
+    d_xyz: Array
+    d_parameters: Array
+
+
+def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
+    """Undistorted pixels (n, 2); ``parameters`` has shape (10,) or (n, 10). NaN at or behind the pivot."""
+    m, a, skew, px, py, rho = np.moveaxis(parameters[..., :6], -1, 0)
+    w = 1.0 + rho * xyz_m[:, 2]
+    scale = m / np.where(w > 0.0, w, np.nan)
+    x = px + scale * (a * xyz_m[:, 0] + skew * xyz_m[:, 1])
+    y = py + scale * xyz_m[:, 1] / a
+    return np.stack([x, y], axis=1)
+
+
+def project_points(parameters: Array, xyz_m: Array, norm_px: float) -> Array:
+    """Raw (distorted) pixels (n, 2); NaN where the model has no answer."""
+    centre = parameters[..., 8:10]
+    q = (project_ideal_points(parameters, xyz_m) - centre) / norm_px
+    return centre + norm_px * distort_normalised(q, parameters[..., 6], parameters[..., 7])
+
+
+def project_points_with_jacobians(
+    parameters: Array, xyz_m: Array, norm_px: float
+) -> ProjectionJacobians:
+    """Raw pixels with analytic derivatives; shapes as in :class:`ProjectionJacobians`.
+
+    In memory the points come last, so that every derivative of all points lies together.
+    """
+    n = len(xyz_m)
+    table = np.broadcast_to(parameters, (n, 10))
+    m, a, skew, px, py, rho, xi_r, xi_t = table[:, :8].T
+    centre = table[:, 8:10]
+    x, y, z = xyz_m.T
+    w = 1.0 + rho * z
+    inverse_w = 1.0 / np.where(w > 0.0, w, np.nan)
+    scale = m * inverse_w
+    u = a * x + skew * y
+    v = y / a
+    scaled_u, scaled_v = scale * u, scale * v
+    ideal = np.stack([px + scaled_u, py + scaled_v], axis=1)
+
+    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, xi_r, xi_t)
+    d_xyz, d_parameters = np.empty((2, 3, n)), np.empty((2, 10, n))
+    up, tilt = rho * inverse_w, z * inverse_w
+    for row in (0, 1):
+        by_x, by_y = df_dq[:, row, 0], df_dq[:, row, 1]
+        along = by_x * scaled_u + by_y * scaled_v
+        d_xyz[row, 0] = by_x * scale * a
+        d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
+        d_xyz[row, 2] = -along * up
+        d_parameters[row, 0] = along / m
+        d_parameters[row, 1] = by_x * scale * x - by_y * scaled_v / a
+        d_parameters[row, 2] = by_x * scale * y
+        d_parameters[row, 3] = by_x
+        d_parameters[row, 4] = by_y
+        d_parameters[row, 5] = -along * tilt
+        d_parameters[row, 6:8] = norm_px * df_dxi[:, row].T
+        d_parameters[row, 8:10] = -df_dq[:, row].T
+        d_parameters[row, 8 + row] += 1.0
+    return ProjectionJacobians(
+        centre + norm_px * f, np.moveaxis(d_xyz, -1, 0), np.moveaxis(d_parameters, -1, 0)
+    )

@@ -1,0 +1,378 @@
+"""The microscope as a camera at one magnification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.camera.distortion import (
+    Undistortion,
+    distort_normalised,
+    undistort_normalised,
+)
+from semcal_ros.core.camera.projection import (
+    project_ideal_points,
+    project_points_with_jacobians,
+)
+from semcal_ros.core.camera.residual_field import FieldSlice
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["ScanCamera", "as_points"]
+
+Array = NDArray[np.float64]
+
+
+def as_points(values: ArrayLike, dimensions: int) -> Array:
+    """``values`` as an (n, dimensions) float64 array, or :class:`InvalidValueError`."""
+    points = np.asarray(values, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != dimensions:
+        raise InvalidValueError(
+            f"points of shape {points.shape}",
+            expected=f"an array of shape (n, {dimensions})",
+            do="reshape a single point with [None]",
+        )
+    return points
+
+
+@dataclass(frozen=True)
+class ScanCamera:
+    """Projection and distortion of the SEM at one magnification (design section 4).
+
+    Parameters
+    ----------
+    magnification
+        The magnification g that this camera is for, with respect to the calibration's display width.
+    m
+        Scale at the reference plane, px per m.
+    aspect, skew
+        Aspect ratio ``a`` and skew ratio ``sigma``, dimensionless.
+    px, py
+        Principal point, px.
+    rho
+        Inverse distance of the scan pivot from the reference plane, 1/m; 0 is a parallel projection.
+    xi_r, xi_t
+        Radial and tangential distortion in normalised coordinates.
+    ex, ey
+        Centre of the distortion, px.
+    norm_px
+        Normalisation length of the distortion, px (half the image width).
+    width, height
+        Image size, px.
+    covariance
+        (10, 10) covariance of the parameters in the order of
+        :data:`semcal_ros.core.camera.projection.PARAMETER_NAMES`, or None where it is not known.
+    in_range
+        False when ``magnification`` lies outside of the calibrated range.
+    residual
+        What the distortion parameters do not describe (see :mod:`semcal_ros.core.camera.residual_field`), or None.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = ScanCamera(5000.0, 2.1e7, 1.0, 0.0, 255.5, 255.5, 50.0, 0.002, 0.001, 256.0, 256.0, 256.0, 512, 512)
+    >>> raw = camera.project(np.array([[1e-6, 2e-6, 0.0]]))
+    >>> np.allclose(camera.distort(camera.undistort(raw)), raw)
+    True
+    """
+
+    magnification: float
+    m: float
+    aspect: float
+    skew: float
+    px: float
+    py: float
+    rho: float
+    xi_r: float
+    xi_t: float
+    ex: float
+    ey: float
+    norm_px: float
+    width: int
+    height: int
+    covariance: Array | None = None
+    in_range: bool = True
+    residual: FieldSlice | None = None
+
+    def __post_init__(self) -> None:
+        values = np.append(self.parameters, [self.magnification, self.norm_px])
+        if not np.all(np.isfinite(values)):
+            raise InvalidValueError(
+                f"camera parameters {values.tolist()}", expected="finite numbers"
+            )
+        for name in ("magnification", "m", "aspect", "norm_px", "width", "height"):
+            if not getattr(self, name) > 0:
+                raise InvalidValueError(
+                    f"camera with {name} = {getattr(self, name)}", expected="a positive number"
+                )
+
+    @classmethod
+    def nominal(
+        cls, magnification: float, width: int, height: int, display_width_m: float
+    ) -> ScanCamera:
+        """The camera that the display width alone predicts: parallel projection, no distortion.
+
+        Its covariance is that of an instrument that nobody has calibrated: a scale good to 3 %, an
+        axis within 3 % of the width from the middle, an unknown distortion of a few tenths of a
+        per cent (1-sigma).
+        """
+        cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
+        m = magnification * width / display_width_m
+        sigmas = np.array([0.03 * m, 0.01, 0.01, *[0.03 * width] * 2, 50.0, 5e-3, 2e-3])
+        covariance = np.diag(np.append(sigmas, [0.05 * width] * 2) ** 2)
+        return cls(
+            magnification=magnification,
+            m=m,
+            aspect=1.0,
+            skew=0.0,
+            px=cx,
+            py=cy,
+            rho=0.0,
+            xi_r=0.0,
+            xi_t=0.0,
+            ex=cx,
+            ey=cy,
+            norm_px=0.5 * width,
+            width=width,
+            height=height,
+            covariance=covariance,
+            in_range=False,
+        )
+
+    @property
+    def parameters(self) -> Array:
+        """(10,) parameter vector in the order of ``PARAMETER_NAMES``."""
+        return np.array(
+            [self.m, self.aspect, self.skew, self.px, self.py]
+            + [self.rho, self.xi_r, self.xi_t, self.ex, self.ey],
+            dtype=np.float64,
+        )
+
+    # -- projection -------------------------------------------------------------------------------
+
+    def project(self, xyz_m: ArrayLike) -> Array:
+        """Raw (distorted) pixels (n, 2) of sem-frame points (n, 3) in m; NaN where there is none."""
+        return self.distort(self.project_ideal(xyz_m))
+
+    def project_ideal(self, xyz_m: ArrayLike) -> Array:
+        """Undistorted pixels (n, 2) of sem-frame points (n, 3) in m."""
+        return project_ideal_points(self.parameters, as_points(xyz_m, 3))
+
+    def project_sigma(self, xyz_m: ArrayLike) -> Array:
+        """1-sigma (n, 2) in px of :meth:`project`, from the covariance of the calibration.
+
+        Raises
+        ------
+        InvalidValueError
+            If the camera carries no covariance.
+        """
+        covariance = self.joint_covariance
+        if covariance is None:
+            raise InvalidValueError(
+                "a camera without covariance",
+                expected="a camera from Calibration.at(g)",
+                do="take the camera from a calibration",
+            )
+        jacobian = self.project_jacobian(xyz_m)
+        variance = np.einsum("nip,pq,niq->ni", jacobian, covariance, jacobian, optimize=True)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
+
+    def project_jacobian(self, xyz_m: ArrayLike) -> Array:
+        """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field."""
+        points = as_points(xyz_m, 3)
+        jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
+        if self.residual is None:
+            return jacobians.d_parameters
+        known = np.flatnonzero(np.all(np.isfinite(jacobians.xy), axis=1))
+        q = self._normalised(self._with_residual(jacobians.xy[known]))
+        found = np.all(np.isfinite(q), axis=1)
+        known, q = known[found], q[found]
+        size = self.residual.coefficients.size
+        own = np.zeros((len(q), 2, 10 + size))
+        own[:, :, :10] = jacobians.d_parameters[known]
+        own[:, 0, 10::2] = own[:, 1, 11::2] = -self.norm_px * self.residual.basis(q)
+        out = np.full((len(points), 2, 10 + size), np.nan)
+        out[known] = np.linalg.solve(np.eye(2) + self.residual.gradient(q), own)
+        return out
+
+    @property
+    def joint_covariance(self) -> Array | None:
+        """(10 + F, 10 + F) covariance of the parameters and of the coefficients of the residual field."""
+        field = self.residual
+        if self.covariance is None or field is None:
+            return self.covariance
+        if field.covariance is None or field.cross_covariance is None:
+            return None
+        return np.block(
+            [
+                [self.covariance, field.cross_covariance],
+                [field.cross_covariance.T, field.covariance],
+            ]
+        )
+
+    def sem_from_ideal(self, xy: ArrayLike, z_m: float = 0.0) -> Array:
+        """Sem-frame points (n, 3) in m at height ``z_m`` that are seen at undistorted pixels (n, 2)."""
+        points = as_points(xy, 2)
+        w = 1.0 + self.rho * z_m
+        if w <= 0.0:
+            raise InvalidValueError(
+                f"height {z_m} m", expected=f"a point below the scan pivot at {-1.0 / self.rho} m"
+            )
+        y = (points[:, 1] - self.py) * w / self.m * self.aspect
+        x = ((points[:, 0] - self.px) * w / self.m - self.skew * y) / self.aspect
+        return np.stack([x, y, np.full(len(points), float(z_m))], axis=1)
+
+    # -- distortion -------------------------------------------------------------------------------
+
+    @property
+    def _centre(self) -> Array:
+        return np.array([self.ex, self.ey])
+
+    def _normalised(self, xy: Array) -> Array:
+        """Pixels in half image widths from the middle of the image, as the residual field takes them."""
+        return (xy - 0.5 * np.array([self.width - 1.0, self.height - 1.0])) / self.norm_px
+
+    def without_residual(self, xy: ArrayLike) -> Array:
+        """Where raw pixels (n, 2) would lie if there were only the parametric distortion."""
+        points = as_points(xy, 2)
+        if self.residual is None:
+            return points
+        return points + self.norm_px * self.residual.displacement(self._normalised(points))
+
+    def _with_residual(self, xy: Array) -> Array:
+        """Inverse of :meth:`without_residual`."""
+        if self.residual is None:
+            return xy
+        q = self._normalised(xy)
+        return xy + self.norm_px * (self.residual.inverse(q) - q)
+
+    def distort(self, xy: ArrayLike) -> Array:
+        """Raw pixels (n, 2) of undistorted pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
+        q = (as_points(xy, 2) - self._centre) / self.norm_px
+        parametric = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t)
+        return self._with_residual(parametric)
+
+    def undistort(self, xy: ArrayLike) -> Array:
+        """Undistorted pixels (n, 2) of raw pixels (n, 2).
+
+        Rows are NaN where the model has no answer; :meth:`undistort_report` says why.
+        """
+        return self._centre + self.norm_px * self.undistort_report(xy).q
+
+    def undistort_report(self, xy: ArrayLike) -> Undistortion:
+        """As :meth:`undistort`, in normalised coordinates and with convergence flags and residuals."""
+        q_d = (self.without_residual(xy) - self._centre) / self.norm_px
+        return undistort_normalised(q_d, self.xi_r, self.xi_t)
+
+    # -- matrices ---------------------------------------------------------------------------------
+
+    @property
+    def P_affine(self) -> Array:
+        """(3, 4) projection of homogeneous sem-frame points (m), finite for every rho."""
+        m, a = self.m, self.aspect
+        return np.array(
+            [
+                [a * m, self.skew * m, self.rho * self.px, self.px],
+                [0.0, m / a, self.rho * self.py, self.py],
+                [0.0, 0.0, self.rho, 1.0],
+            ]
+        )
+
+    @property
+    def P(self) -> Array:
+        """(3, 4) projection ``K [I | (0, 0, 1/rho)]`` of sem-frame points.
+
+        Raises
+        ------
+        InvalidValueError
+            For a parallel projection (rho <= 0), whose focal length is not finite; use :attr:`P_affine`.
+        """
+        self._require_perspective()
+        return self.P_affine / self.rho
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) intrinsic matrix with ``f = m / rho``; raises as :attr:`P`."""
+        self._require_perspective()
+        return self.P[:, :3].copy()
+
+    def _require_perspective(self) -> None:
+        if not self.rho > 0.0:
+            raise InvalidValueError(
+                f"inverse pivot distance {self.rho} 1/m",
+                expected="a positive one for K and P",
+                do="use P_affine, which also holds for a parallel projection",
+            )
+
+    @property
+    def ideal_from_sem_jacobian(self) -> Array:
+        """(2, 2) derivative of undistorted pixels by sem-frame (X, Y) at the reference plane, px per m."""
+        return self.m * np.array([[self.aspect, self.skew], [0.0, 1.0 / self.aspect]])
+
+    @property
+    def pixel_size_m(self) -> tuple[float, float]:
+        """Size (x, y) in m of an undistorted pixel at the reference plane.
+
+        These are the steps in X and Y of the sem frame that move the image by one pixel along its columns and rows.
+        """
+        return 1.0 / (self.m * self.aspect), self.aspect / self.m
+
+    @property
+    def pixel_size_sigma_m(self) -> tuple[float, float]:
+        """1-sigma of :attr:`pixel_size_m`, m; raises as :meth:`project_sigma`."""
+        if self.covariance is None:
+            raise InvalidValueError(
+                "a camera without covariance", expected="a camera from Calibration.at(g)"
+            )
+        x, y = self.pixel_size_m
+        gradient_x = np.array([-1.0 / self.m, -1.0 / self.aspect])
+        gradient_y = np.array([-1.0 / self.m, 1.0 / self.aspect])
+        block = self.covariance[:2, :2]
+        return (
+            x * float(np.sqrt(max(gradient_x @ block @ gradient_x, 0.0))),
+            y * float(np.sqrt(max(gradient_y @ block @ gradient_y, 0.0))),
+        )
+
+    # -- other image sizes ------------------------------------------------------------------------
+
+    def resized(self, width: int, height: int) -> ScanCamera:
+        """The same field of view sampled with another number of pixels.
+
+        The field width is kept and the pixels stay as they are in shape, so a change of the height-to-width ratio
+        crops or extends the field symmetrically about the image centre.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        if width < 1 or height < 1:
+            raise InvalidValueError(f"image size {width} x {height}", expected="positive numbers")
+        s = width / self.width
+        shift_y = 0.5 * (height - s * self.height)
+
+        def x_resized(x: float) -> float:
+            return (x + 0.5) * s - 0.5
+
+        def y_resized(y: float) -> float:
+            return (y + 0.5) * s - 0.5 + shift_y
+
+        factors = np.array([s, 1.0, 1.0, s, s, 1.0, 1.0, 1.0, s, s])
+        covariance, residual = self.covariance, self.residual
+        if covariance is not None:
+            covariance = covariance * np.outer(factors, factors)
+        if residual is not None and residual.cross_covariance is not None:
+            residual = replace(
+                residual, cross_covariance=residual.cross_covariance * factors[:, None]
+            )
+        return replace(
+            self,
+            m=self.m * s,
+            px=x_resized(self.px),
+            py=y_resized(self.py),
+            ex=x_resized(self.ex),
+            ey=y_resized(self.ey),
+            norm_px=self.norm_px * s,
+            width=int(width),
+            height=int(height),
+            covariance=covariance,
+            residual=residual,
+        )

@@ -1,0 +1,339 @@
+"""Least-squares fit of the edge model to the pixels around each corner, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.edge_model import (
+    ANGLES,
+    BRIGHTNESS,
+    CONTRAST,
+    LINEAR,
+    LOG_BLUR,
+    NONLINEAR,
+    EdgeGeometry,
+    evaluate,
+)
+from semcal_ros.core.corners.priors import Prior
+from semcal_ros.core.corners.symmetry_test import opposite_squares
+from semcal_ros.core.corners.window import PixelWindows
+
+__all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+BLUR_MIN_PX = 0.28
+BAND_MIN_PX = 3.0
+BAND_BLURS = 3.0
+LEAST_OF_FLOOR = 0.25
+# Large enough to hide what a call costs, small enough to keep the arrays in a cache.
+BLOCK_PIXELS = 24000
+# Where pixels say next to nothing, rounding must not decide what is a large pull.
+PULL_LEAST = 0.02
+# For the first pass, which knows no noise yet.
+ASSUMED_VARIANCE = 0.02
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of a pixel: ``floor + slope * (value - dark)`` of its grey value.
+
+    ``dark`` is the mean of the darker pixels, so that half of them lie below it; the variance never
+    falls below a part of the floor.
+    """
+
+    floor: float
+    slope: float
+    dark: float
+
+    def variance(self, value: Single) -> Single:
+        """Variance at the grey values ``value``, same shape."""
+        variance = np.float32(self.slope) * (value - np.float32(self.dark))
+        variance += np.float32(self.floor)
+        least = np.float32(LEAST_OF_FLOOR * self.floor)
+        return np.asarray(np.maximum(variance, least), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class CornerFit:
+    """Fitted corners.
+
+    Attributes
+    ----------
+    xy
+        (n, 2) positions, px.
+    covariance
+        (n, 2, 2) covariance of the positions, px^2, for the noise model given (unit noise without
+        one).
+    nonlinear, linear
+        (n, 7) and (n, 8) parameters of :mod:`semcal_ros.core.corners.edge_model`, positions
+        relative to the window.
+    normal
+        (n, 15, 15) normal matrices, the prior's share included.
+    chi2
+        (n,) weighted squared residuals per degree of freedom.
+    freedom
+        (n,) degrees of freedom.
+    shift_px
+        (n,) size of the last step; large where the fit has not settled.
+    coverage
+        (n,) part of the window in the image.
+    level, variance
+        (n, 2) mean grey value and squared residual of the pixels darker and of those brighter than
+        the middle.
+    imbalance, unlike
+        (n,) score test of opposite squares that differ in grey value, chi-square with two degrees
+        of freedom in units of ``chi2``, and by how much of the contrast they do; zeros where
+        that was not asked for.
+    blur_pull
+        (n,) how far the blur is from its prior, in standard deviations.
+    """
+
+    xy: Array
+    covariance: Array
+    nonlinear: Array
+    linear: Array
+    normal: Array
+    chi2: Array
+    freedom: Array
+    shift_px: Array
+    coverage: Array
+    level: Array
+    variance: Array
+    imbalance: Array
+    unlike: Array
+    blur_pull: Array
+
+    def select(self, keep: NDArray[np.bool_]) -> CornerFit:
+        """The fits of the corners where ``keep`` is true."""
+        return CornerFit(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    @property
+    def parameters(self) -> Array:
+        """(n, 15) nonlinear and linear parameters."""
+        return np.column_stack([self.nonlinear, self.linear])
+
+    @staticmethod
+    def join(parts: Sequence[CornerFit]) -> CornerFit:
+        """All fits of several sets."""
+        return CornerFit(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CornerFit))
+        )
+
+    @property
+    def angles(self) -> Array:
+        """(n, 2) directions of the edges along i and along j, rad."""
+        return self.nonlinear[:, ANGLES]
+
+    @property
+    def blur_px(self) -> Array:
+        """(n,) standard deviation of the blur, px."""
+        return np.asarray(np.exp(self.nonlinear[:, LOG_BLUR]), dtype=np.float64)
+
+    @property
+    def contrast(self) -> Array:
+        """(n,) signed contrast: half the step of grey value between squares."""
+        return self.linear[:, 3]
+
+
+def rough_start(windows: PixelWindows, prior: Prior, sign: Array) -> Array:
+    """(n, 15) parameters to begin with: the prior's, and the mean and scatter of the pixels.
+
+    Parameters
+    ----------
+    sign
+        (n,) expected sign of the contrast.
+    """
+    count = np.maximum(windows.valid.sum(axis=1), 1.0)
+    mean = windows.value.sum(axis=1) / count
+    square = np.einsum("np,np->n", windows.value, windows.value) / count
+    start = prior.mean.copy()
+    start[:, BRIGHTNESS] = mean
+    start[:, CONTRAST] = sign * np.sqrt(np.maximum(square - mean * mean, 1e-6))
+    return start
+
+
+def band_px(blur_px: float) -> float:
+    """Half-width of the band of pixels along an edge that tell where it is."""
+    return max(BAND_MIN_PX, BAND_BLURS * blur_px + 1.0)
+
+
+def fit_corners(
+    windows: PixelWindows,
+    geometry: EdgeGeometry,
+    start: Array | None,
+    prior: Prior,
+    *,
+    noise: NoiseModel | None,
+    iterations: int,
+    judged: bool = False,
+) -> CornerFit:
+    """Gauss-Newton on position, edge directions, blur, grey levels and their gradients.
+
+    Parameters
+    ----------
+    windows
+        Pixels of the corners.
+    geometry
+        What the lattice says about them.
+    start
+        (n, 15) first parameters, or None for the prior's.
+    prior
+        Prior of the parameters.
+    noise
+        Noise for the weights; None for equal weights.
+    iterations
+        Number of steps.
+    judged
+        Whether opposite squares are to be compared.
+    """
+    block = max(1, BLOCK_PIXELS // windows.x.shape[1])
+    parts = []
+    for first in range(0, max(1, len(windows.origin)), block):
+        rows = slice(first, first + block)
+        part, shape = windows.select(rows), geometry.select(rows)
+        expected = Prior(prior.mean[rows], prior.deviation[rows])
+        if start is None:
+            nonlinear = expected.mean[:, :NONLINEAR].copy()
+            linear = _solve_linear(part, shape, nonlinear, expected)
+        else:
+            nonlinear, linear = start[rows, :NONLINEAR].copy(), start[rows, NONLINEAR:].copy()
+        parts.append(
+            _fit_block(part, shape, nonlinear, linear, expected, noise, iterations, judged)
+        )
+    return CornerFit.join(parts)
+
+
+def _fit_block(
+    windows: PixelWindows,
+    geometry: EdgeGeometry,
+    nonlinear: Array,
+    linear: Array,
+    prior: Prior,
+    noise: NoiseModel | None,
+    iterations: int,
+    judged: bool,
+) -> CornerFit:
+    shortest = np.minimum(geometry.spacing_1, geometry.spacing_2)
+    limits = np.tile([0.0, 0.0, 0.15, 0.15, 0.5, 1.0, 1.0], (len(shortest), 1))
+    limits[:, :2] = 0.2 * shortest[:, None]
+    blur_limits = np.log(BLUR_MIN_PX), np.log(np.maximum(0.35 * shortest, 0.5))
+    known = (1.0 if noise is not None else ASSUMED_VARIANCE) / prior.deviation**2
+    axes = np.zeros((len(shortest), NONLINEAR + LINEAR, 3))
+    axes[:, [0, 1, LOG_BLUR], [0, 1, 2]] = 1.0
+    for left in range(iterations - 1, -1, -1):
+        # Levels and variances are those before the last step, which is tiny where the fit has
+        # settled.
+        jacobian, model = evaluate(windows, geometry, nonlinear, linear)
+        weight = windows.valid if noise is None else windows.valid / noise.variance(model)
+        residual = windows.value - model
+        normal, right = _normal_equations(jacobian, residual, weight)
+        np.einsum("nii->ni", normal)[...] += known
+        pull = known * (prior.mean - np.column_stack([nonlinear, linear]))
+        right += pull
+        # Covariances are those of the last step.
+        sides = [right[:, :, None]] if left else [right[:, :, None], axes]
+        solution = np.linalg.solve(normal, np.concatenate(sides, axis=2)).astype(
+            np.float64, copy=False
+        )
+        step = solution[:, :, 0]
+        nonlinear = nonlinear + np.clip(step[:, :NONLINEAR], -limits, limits)
+        nonlinear[:, LOG_BLUR] = np.clip(nonlinear[:, LOG_BLUR], *blur_limits)
+        linear = linear + step[:, NONLINEAR:]
+    # A parameter that the prior holds costs no degree of freedom.
+    fitted = np.sum(1.0 - known / np.einsum("nii->ni", normal), axis=1)
+    freedom = np.maximum(windows.valid.sum(axis=1, dtype=np.float64) - fitted, 1.0)
+    chi2 = np.einsum("np,np,np->n", weight, residual, residual).astype(np.float64)
+    # The last step changes it as the normal equations, without the prior's share, promise.
+    change = np.einsum("na,na->n", step, right - 2.0 * pull + known * step)
+    chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
+    level, variance = _statistics(windows, residual, model, freedom)
+    balance = (
+        opposite_squares(windows, nonlinear, jacobian, residual, weight, normal, step)
+        if judged
+        else np.zeros((2, len(shortest)))
+    )
+    return CornerFit(
+        windows.origin + nonlinear[:, :2],
+        solution[:, :2, 1:3],
+        nonlinear,
+        linear,
+        normal,
+        chi2,
+        freedom,
+        np.linalg.norm(step[:, :2], axis=1),
+        windows.coverage,
+        level,
+        variance,
+        balance[0],
+        balance[1] / np.maximum(np.abs(linear[:, CONTRAST - NONLINEAR]), 1e-9),
+        _pull(nonlinear[:, LOG_BLUR], solution[:, LOG_BLUR, 3], prior),
+    )
+
+
+def _pull(log_blur: Array, variance: Array, prior: Prior) -> Array:
+    """(n,) how far the blur is from its prior, in standard deviations of what a fit makes of it."""
+    deviation = prior.deviation[:, LOG_BLUR]
+    # A fit under a prior scatters by the prior's variance less its own.
+    spread = np.maximum(deviation**2 - variance, PULL_LEAST * deviation**2)
+    return np.asarray((log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread))
+
+
+def fit_noise(fit: CornerFit) -> NoiseModel:
+    """Noise as a function of the grey value, from the residuals of unweighted fits.
+
+    It is a line through the noise of the dark and that of the bright pixels; medians over the
+    corners keep some corners under debris from mattering.
+    """
+    dark, bright = (float(v) for v in np.median(fit.level, axis=0))
+    low, high = (float(v) for v in np.median(fit.variance, axis=0))
+    spread = max(bright - dark, 1e-6)
+    # Rounding to grey levels is never without noise.
+    tiny = 1e-6 * spread**2
+    low, high = max(low, tiny), max(high, tiny)
+    if high < low:
+        return NoiseModel(0.5 * (low + high), 0.0, dark)
+    return NoiseModel(low, (high - low) / spread, dark)
+
+
+def _statistics(
+    windows: PixelWindows, residual: Single, model: Single, freedom: Array
+) -> tuple[Array, Array]:
+    """Levels and variances of the pixels darker and brighter than the middle, both (n, 2)."""
+    valid = windows.valid
+    total = np.maximum(valid.sum(axis=1, keepdims=True), 1.0)
+    middle = (model * valid).sum(axis=1, keepdims=True) / total
+    square = residual * residual
+    scale = total[:, 0] / freedom
+    level, variance = np.empty((len(model), 2)), np.empty((len(model), 2))
+    for side, part in enumerate((valid * (model <= middle), valid * (model > middle))):
+        count = np.maximum(part.sum(axis=1), 1.0)
+        level[:, side] = np.einsum("np,np->n", part, model) / count
+        variance[:, side] = np.einsum("np,np->n", part, square) / count * scale
+    return level, variance
+
+
+def _normal_equations(jacobian: Single, residual: Single, weight: Single) -> tuple[Array, Array]:
+    weighted = jacobian * weight[:, None, :]
+    normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+    right = (weighted @ residual[:, :, None])[:, :, 0].astype(np.float64)
+    diagonal = np.einsum("nii->ni", normal)
+    diagonal *= 1.0 + 1e-6
+    diagonal += 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12
+    return normal, right
+
+
+def _solve_linear(
+    windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, prior: Prior
+) -> Array:
+    jacobian, _ = evaluate(windows, geometry, nonlinear, None)
+    normal, right = _normal_equations(jacobian, windows.value, windows.valid)
+    known = ASSUMED_VARIANCE / prior.deviation[:, NONLINEAR:] ** 2
+    np.einsum("nii->ni", normal)[...] += known
+    right += known * prior.mean[:, NONLINEAR:]
+    return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)

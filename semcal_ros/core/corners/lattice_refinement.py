@@ -1,0 +1,301 @@
+"""From a grown lattice to every corner in view at sub-pixel accuracy: fill in, fit, reject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.corners.checks import (
+    CORNERS_MIN,
+    MARGIN_PX,
+    Fitted,
+    credible,
+    inflation,
+    parity_of,
+    undisturbed,
+)
+from semcal_ros.core.corners.corner_fit import (
+    ASSUMED_VARIANCE,
+    NoiseModel,
+    band_px,
+    fit_corners,
+    fit_noise,
+    rough_start,
+)
+from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
+from semcal_ros.core.corners.lattice import STEPS, Lattice
+from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.neighbour_consistency import smooth
+from semcal_ros.core.corners.parts import one_board
+from semcal_ros.core.corners.priors import (
+    Learnt,
+    learn,
+    loose_prior,
+    smooth_levels,
+)
+from semcal_ros.core.corners.window import gather_windows
+
+__all__ = ["RefinedCorners", "refine_lattice"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Single = NDArray[np.float32]
+
+FIRST_BLUR_PX = 1.0
+GROW_ROUNDS = 4
+# Corners that teach what the image is like, and the part of them that must look like corners.
+SAMPLE = 40
+HOPELESS = 0.25
+# Corners that teach again, when noise and blur are known.
+SECOND_SAMPLE = 160
+# Corners nearer to the frame than this part of a square, besides the margin, may fail.
+RIM_PART = 0.1
+
+
+@dataclass(frozen=True)
+class RefinedCorners:
+    """Corners that passed all checks.
+
+    Attributes
+    ----------
+    ij, xy
+        (n, 2) indices and positions.
+    covariance
+        (n, 2, 2), px^2.
+    blur_px
+        Median blur.
+    quality
+        Part of the corners expected inside the lattice's extent that passed.
+    rejected_xy
+        (k, 2) where lattice points in the image that did not pass were expected, px.
+    foreign
+        Number of corners that are good, but do not continue this lattice.
+    """
+
+    ij: Indices
+    xy: Array
+    covariance: Array
+    blur_px: float
+    quality: float
+    rejected_xy: Array
+    foreign: int = 0
+
+
+@dataclass(frozen=True)
+class _Knowledge:
+    """What the first fits taught about the image."""
+
+    noise: NoiseModel
+    learnt: Learnt
+    sign: float
+
+    @property
+    def blur_px(self) -> float:
+        return float(np.exp(self.learnt.common[LOG_BLUR]))
+
+
+def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
+    """Fit all corners of a lattice, drop bad ones, look for missed ones; None if under six remain.
+
+    A sample of the corners teaches noise, blur and what varies how much over the image; with this
+    all corners are fitted, then missed ones beside them, then all again with the shading and the
+    bends that the neighbours show.
+
+    Parameters
+    ----------
+    image
+        (h, w) float32 with a contrast of about 1.
+    lattice
+        Grown from saddle points.
+    """
+    grown = _plausible(_shuffled(lattice))
+    if len(grown.ij) < CORNERS_MIN:
+        return None
+    maps = fit_local_maps(grown.ij, grown.ij, grown.xy, leave_out_self=False)
+    grown, maps = grown.select(maps.usable), maps.select(maps.usable)
+    if len(grown.ij) < CORNERS_MIN:
+        return None
+    few = np.arange(len(grown.ij)) < SAMPLE
+    first = _first_fit(image, grown.ij[few], maps.select(few))
+    if first.good.sum() < CORNERS_MIN:
+        return None
+    part = _quality(first, image)
+    if part < HOPELESS:
+        return _result(first, first.good, part, first.maps.xy[~first.good])
+    knowledge = _learn(first)
+    maps = _better_maps(grown, first)
+    grown, maps = grown.select(maps.usable), maps.select(maps.usable)
+    if len(grown.ij) < CORNERS_MIN:
+        return None
+    second = _fit(image, grown.ij, maps, knowledge, iterations=2)
+    part = _quality(second, image)
+    if second.good.sum() < CORNERS_MIN:
+        return None
+    known = _fill(image, second.select(second.good), knowledge)
+    last = _last_fit(image, known, knowledge)
+    if last is None:
+        return None
+    keep = last.good & undisturbed(last)
+    keep &= smooth(replace(last, good=keep))
+    if keep.sum() < CORNERS_MIN:
+        return None
+    agreeing, keep = int(keep.sum()), one_board(last, keep)
+    passed = last.cells[keep]
+    doubtful = np.concatenate([second.cells[~second.good], last.cells[~keep]])
+    expected = np.concatenate([second.maps.xy[~second.good], last.maps.xy[~keep]])
+    result = _result(last, keep, part, _failed(doubtful, expected, passed, image))
+    return replace(result, foreign=agreeing - len(passed))
+
+
+def _quality(fitted: Fitted, image: Single) -> float:
+    """Part of the corners that passed, of those expected well inside of the image."""
+    size = np.array([image.shape[1], image.shape[0]])
+    slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
+    expected = np.all((fitted.maps.xy >= slack) & (fitted.maps.xy <= size - 1 - slack), axis=1)
+    return float(fitted.good[expected].mean()) if np.any(expected) else 0.0
+
+
+def _better_maps(grown: Lattice, first: Fitted) -> LocalMaps:
+    """Local maps with what was fitted in place of the saddle points."""
+    count = len(first.cells)
+    xy = np.concatenate([first.fit.xy, grown.xy[count:]])
+    known = np.concatenate([first.good, np.ones(len(xy) - count, dtype=bool)])
+    return fit_local_maps(grown.ij, grown.ij[known], xy[known], leave_out_self=False)
+
+
+def _shuffled(lattice: Lattice) -> Lattice:
+    """The lattice in random but fixed order, so that its first corners are a fair sample."""
+    order = np.random.default_rng(0).permutation(len(lattice.ij))
+    return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
+
+
+def _failed(cells: Indices, xy: Array, passed: Indices, image: Single) -> Array:
+    """(k, 2) positions in the image of the cells, each once, that are not among those passed."""
+    keys, first = np.unique(_keys(cells), return_index=True)
+    size = np.array([image.shape[1], image.shape[0]])
+    inside = np.all((xy[first] >= 0) & (xy[first] <= size - 1), axis=1)
+    return np.asarray(xy[first][inside & ~np.isin(keys, _keys(passed))])
+
+
+def _result(fitted: Fitted, keep: Mask, quality: float, rejected_xy: Array) -> RefinedCorners:
+    fit = fitted.fit
+    order = np.lexsort(fitted.cells[keep].T[::-1])
+    covariance = fit.covariance[keep] * inflation(fit, keep)[keep, None, None]
+    return RefinedCorners(
+        fitted.cells[keep][order],
+        fit.xy[keep][order],
+        covariance[order],
+        float(np.median(fit.blur_px[keep])),
+        quality,
+        rejected_xy,
+    )
+
+
+def _plausible(lattice: Lattice) -> Lattice:
+    """The lattice without points that do not fit their neighbours."""
+    maps = fit_local_maps(lattice.ij, lattice.ij, lattice.xy)
+    miss = np.linalg.norm(maps.xy - lattice.xy, axis=1)
+    spacing = np.linalg.norm(lattice.axes, axis=2).min(axis=1)
+    keep = (miss < 0.3 * spacing) & maps.usable
+    return lattice.select(keep)
+
+
+def _first_fit(image: Single, cells: Indices, maps: LocalMaps) -> Fitted:
+    """Fit with equal weights and loose priors."""
+    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = loose_prior(maps, geometry, FIRST_BLUR_PX)
+    fit = fit_corners(windows, geometry, None, prior, noise=None, iterations=3)
+    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
+
+
+def _learn(first: Fitted) -> _Knowledge:
+    good = first.select(first.good)
+    geometry = EdgeGeometry.from_map(good.maps.axes, good.maps.bend)
+    learnt = learn(
+        good.fit.parameters,
+        good.fit.normal,
+        loose_prior(good.maps, geometry, FIRST_BLUR_PX),
+        ASSUMED_VARIANCE,
+        float(np.median(good.fit.chi2)),
+    )
+    sign = float(np.sign(np.median(good.fit.contrast * parity_of(good.cells))))
+    return _Knowledge(fit_noise(good.fit), learnt, sign)
+
+
+def _relearn(known: Fitted, knowledge: _Knowledge) -> _Knowledge:
+    """What the second fits teach beyond the first, which knew neither blur nor noise."""
+    few = known.select(np.arange(len(known.cells)) < SECOND_SAMPLE)
+    geometry = EdgeGeometry.from_map(few.maps.axes, few.maps.bend)
+    prior = knowledge.learnt.prior(few.maps, geometry)
+    noise = float(np.median(few.fit.chi2))
+    again = learn(few.fit.parameters, few.fit.normal, prior, 1.0, noise)
+    return replace(knowledge, learnt=replace(again, spread=again.spread * knowledge.learnt.spread))
+
+
+def _fit(
+    image: Single, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
+) -> Fitted:
+    """Fit all cells from their local maps and judge each fit on its own."""
+    band = band_px(knowledge.blur_px)
+    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band)
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = knowledge.learnt.prior(maps, geometry)
+    start = rough_start(windows, prior, knowledge.sign * parity_of(cells))
+    fit = fit_corners(windows, geometry, start, prior, noise=knowledge.noise, iterations=iterations)
+    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
+
+
+def _last_fit(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted | None:
+    """Fit once more, with maps and levels through the corners themselves."""
+    maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
+    known, maps = known.select(maps.usable), maps.select(maps.usable)
+    if len(known.cells) < CORNERS_MIN:
+        return None
+    knowledge = _relearn(known, knowledge)
+    geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
+    prior = smooth_levels(
+        knowledge.learnt.prior(maps, geometry), known.cells, known.fit.linear, maps
+    )
+    fit = fit_corners(
+        known.windows,
+        geometry,
+        known.fit.parameters,
+        prior.near(known.fit.parameters),
+        noise=knowledge.noise,
+        iterations=1,
+        judged=True,
+    )
+    good = credible(known.cells, maps, fit, image)
+    return Fitted(known.cells, maps, known.windows, fit, good)
+
+
+def _fill(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted:
+    """Fit free cells next to good corners, round by round, as long as that finds more."""
+    limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
+    tried = _keys(known.cells)
+    for _ in range(GROW_ROUNDS):
+        near = np.unique((known.cells[:, None] + STEPS[None]).reshape(-1, 2), axis=0)
+        near = near[~np.isin(_keys(near), tried)]
+        if not len(near):
+            break
+        maps = fit_local_maps(near, known.cells, known.fit.xy)
+        inside = np.all((maps.xy >= MARGIN_PX) & (maps.xy <= limit), axis=1)
+        inside &= maps.usable
+        near = near[inside]
+        if not len(near):
+            break
+        tried = np.concatenate([tried, _keys(near)])
+        fitted = _fit(image, near, maps.select(inside), knowledge, iterations=4)
+        if not np.any(fitted.good):
+            break
+        known = Fitted.join(known, fitted.select(fitted.good))
+    return known
+
+
+def _keys(cells: Indices) -> Indices:
+    """One number per cell; indices stay far below 2^20."""
+    return np.asarray(cells[:, 0] * (1 << 21) + cells[:, 1], dtype=np.int64)

@@ -1,0 +1,86 @@
+"""What the calibration does not know, in the drift."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+
+__all__ = [
+    "carry_covariance",
+    "centre_covariance",
+    "relative_scale_sigma",
+    "scale_covariance",
+    "zoom_of",
+]
+
+Array = NDArray[np.float64]
+
+# Places of the parameters in ScanCamera.covariance.
+_SCALES, _CENTRE = slice(0, 3), slice(3, 5)
+
+
+def _scale_jacobian(camera: ScanCamera, *vectors: Array) -> Array:
+    """(2 n, 3) derivative by m, aspect and skew of n lengths in the sem frame that span given
+    pixels.
+    """
+    m, a, s = camera.m, camera.aspect, camera.skew
+    u: list[float] = []
+    v: list[float] = []
+    for x, y in (vector.tolist() for vector in vectors):
+        u += (a * x + s * y, m * x, m * y)
+        v += (y / a, -m * y / a**2, 0.0)
+    by = -np.linalg.solve(camera.ideal_from_sem_jacobian, np.array([u, v]))
+    return np.asarray(by.reshape(2, -1, 3).swapaxes(0, 1).reshape(-1, 3))
+
+
+def scale_covariance(camera: ScanCamera | None, drift: Array, velocity: Array) -> Array:
+    """(4, 4) covariance of drift and velocity from that of the camera's scale, aspect and skew.
+
+    Zero without a camera (the drift is in pixels) and for a camera that is known exactly.
+    """
+    if camera is None or camera.covariance is None:
+        return np.zeros((4, 4))
+    jacobian = _scale_jacobian(camera, drift, velocity)
+    return np.asarray(jacobian @ camera.covariance[_SCALES, _SCALES] @ jacobian.T)
+
+
+def relative_scale_sigma(camera: ScanCamera | None) -> float:
+    """1-sigma of the camera's scale as a fraction of it; 0 where it is known exactly."""
+    if camera is None or camera.covariance is None:
+        return 0.0
+    return float(np.sqrt(max(camera.covariance[0, 0], 0.0))) / camera.m
+
+
+def centre_covariance(camera: ScanCamera | None) -> Array:
+    """(2, 2) covariance in px^2 of the camera's principal point; zero where it is known exactly."""
+    if camera is None or camera.covariance is None:
+        return np.zeros((2, 2))
+    return np.asarray(camera.covariance[_CENTRE, _CENTRE])
+
+
+def zoom_of(before: ScanCamera, after: ScanCamera) -> Array:
+    """(2, 2) metres that a change of magnification seems to move the specimen by, the other way, per
+    px of error of the principal point that both cameras share.
+    """
+    return np.asarray(
+        np.linalg.inv(after.ideal_from_sem_jacobian) - np.linalg.inv(before.ideal_from_sem_jacobian)
+    )
+
+
+def carry_covariance(before: ScanCamera, after: ScanCamera) -> Array:
+    """(2, 2) covariance in m^2 of the step that a change of magnification seems to make because of
+    errors of the two scales.
+
+    They move the specimen in proportion to the distance of the image's middle from the principal
+    point, about which the zoom is.
+    """
+    covariance = np.zeros((2, 2))
+    for camera in (before, after):
+        middle = 0.5 * np.array([camera.width - 1.0, camera.height - 1.0])
+        from_centre = np.linalg.solve(
+            camera.ideal_from_sem_jacobian, middle - np.array([camera.px, camera.py])
+        )
+        covariance += scale_covariance(camera, from_centre, np.zeros(2))[:2, :2]
+    return covariance

@@ -1,0 +1,72 @@
+"""A recording while it is tracked, for a second look with hindsight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.filter import DriftFilter
+from semcal_ros.core.drift.path import DriftPath, path_of_updates
+from semcal_ros.core.drift.smoother import likely_restlessness, smoothed
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["DriftHistory"]
+
+Array = NDArray[np.float64]
+
+
+class DriftHistory:
+    """What a tracker did, in stretches that each begin with zero drift."""
+
+    def __init__(self) -> None:
+        self._stretches: list[tuple[DriftFilter, list[DriftUpdate]]] = []
+        self._cameras: list[ScanCamera | None] = []
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def begin(self, drift: DriftFilter) -> None:
+        """A new stretch."""
+        self._stretches.append((drift, []))
+
+    def add(self, update: DriftUpdate, camera: ScanCamera | None) -> None:
+        """A frame."""
+        self._stretches[-1][1].append(update)
+        self._cameras.append(camera)
+
+    def smoothed(self) -> DriftPath:
+        """The drift of all frames so far, each with the knowledge of all of its stretch.
+
+        How restless it is, is what makes the measurements most likely.
+
+        Raises
+        ------
+        InvalidValueError
+            If there was no frame.
+        """
+        if not self._cameras:
+            raise InvalidValueError("no frames", expected="at least one", do="track some first")
+        updates: list[DriftUpdate] = []
+        for drift, stretch in self._stretches:
+            restlessness = drift.restlessness
+            if restlessness.psd > 0.0:
+                restlessness = likely_restlessness(drift.start, drift.events, restlessness)
+            states = smoothed(drift.start, drift.events, restlessness)
+            for update, state in zip(stretch, states, strict=True):
+                camera = self._cameras[len(updates)]
+                scale = scale_covariance(camera, state.position, state.velocity)
+                updates.append(
+                    replace(
+                        update,
+                        drift_m=state.position,
+                        velocity_m_s=state.velocity,
+                        acceleration_m_s2=state.acceleration,
+                        covariance=state.own + scale,
+                    )
+                )
+        return path_of_updates(updates)

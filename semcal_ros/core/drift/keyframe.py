@@ -1,0 +1,158 @@
+"""The pictures that drift is measured against.
+
+The noise of a reference limits every registration against it, above all in noisy pictures. So each
+frame that was registered well is added to its keyframe, shifted to where the keyframe lies, until
+the noise of the mean no longer matters; then it stays as it is, so that it cannot wander.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.drift.frame import Shot
+from semcal_ros.core.registration.fractional_delay import FINE, sampled
+from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
+from semcal_ros.core.registration.register import Registration, gray_of, prepare_reference
+
+__all__ = [
+    "Keyframe",
+    "carried",
+    "keyframe_of",
+    "scale_ratio",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A reference picture.
+
+    Attributes
+    ----------
+    shot
+        The frame it began with.
+    removed
+        (4,) drift velocity and acceleration (unit per s and s^2) that were removed from that frame.
+    mean
+        (h, w) float32 mean of the frames, in ideal pixels of the camera.
+    region
+        The part of it that was scanned.
+    time_s
+        Time of the first frame.
+    averaged
+        Number of frames in the mean.
+    """
+
+    shot: Shot
+    removed: Array
+    mean: NDArray[np.float32]
+    region: Region
+    time_s: float
+    averaged: int = 1
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of its pictures."""
+        return self.mean.nbytes + self.shot.image.nbytes
+
+    def reference(self, settings: RegistrationSettings) -> Reference:
+        """Everything that a registration needs of it."""
+        return prepare_reference(
+            self.mean, region=self.region, settings=settings, averaged=float(self.averaged)
+        )
+
+    def with_frame(
+        self, picture: NDArray[np.generic], region: Region, registration: Registration
+    ) -> Keyframe:
+        """The keyframe with another frame in its mean, where the two overlap."""
+        gray = np.asarray(gray_of(picture), dtype=np.float32)
+        shift = registration.shift_px
+        whole = np.floor(shift).astype(int)
+        spans = []
+        for axis in (0, 1):
+            # What the interpolation reaches beyond the region was not scanned; beyond the picture it
+            # is mirrored.
+            edges = 0, gray.shape[1 - axis]
+            low = FINE.reach if region[axis] > edges[0] else 0
+            high = FINE.reach if region[axis + 2] < edges[1] else 1
+            first = max(self.region[axis], region[axis] + low - int(whole[axis]))
+            last = min(self.region[axis + 2], region[axis + 2] - high - int(whole[axis]))
+            spans.append((first, last))
+        (left, right), (top, bottom) = spans
+        if right - left < 8 or bottom - top < 8:
+            return self
+        plain = np.array([1.0])
+        corner = left + int(whole[0]), top + int(whole[1])
+        size = right - left, bottom - top
+        moved = sampled(gray, corner, size, shift - whole, plain, FINE, -registration.offset)
+        mean = self.mean.copy()
+        part = mean[top:bottom, left:right]
+        share = np.float32(1.0 / (self.averaged + 1))
+        part += (moved * np.float32(1.0 / registration.gain) - part) * share
+        return replace(self, mean=mean, averaged=self.averaged + 1)
+
+
+def keyframe_of(
+    shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
+) -> Keyframe:
+    """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
+    return Keyframe(
+        shot, removed.copy(), np.array(gray_of(picture), dtype=np.float32), region, time_s
+    )
+
+
+def scale_ratio(before: Shot, now: Shot) -> float:
+    """By which factor the px per unit differ, at least 1; infinite where they cannot be
+    compared.
+    """
+    if (before.camera is None) != (now.camera is None):
+        return float("inf")
+    if before.camera is None:
+        return 1.0 if before.size == now.size else float("inf")
+    stretch = np.linalg.svd(now.px_from_unit @ np.linalg.inv(before.px_from_unit), compute_uv=False)
+    return float(max(stretch.max(), 1.0 / stretch.min()))
+
+
+def carried(key: Keyframe, now: Shot) -> Keyframe:
+    """The keyframe as the camera of ``now`` would show it.
+
+    Both cameras must be known. Ideal pixels of two magnifications are related by the affine map of
+    the reference plane.
+    """
+    before, after = key.shot.camera, now.camera
+    if before is None or after is None:
+        return key
+    matrix = now.px_from_unit @ np.linalg.inv(key.shot.px_from_unit)
+    offset = np.array([after.px, after.py]) - matrix @ np.array([before.px, before.py])
+    shrink = float(np.sqrt(abs(np.linalg.det(matrix))))
+    gray = key.mean
+    if shrink < 0.95:
+        # Structure finer than the new pixels would alias.
+        sigma = 0.45 * float(np.sqrt(1.0 / shrink**2 - 1.0))
+        gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma), dtype=np.float32)
+    warp = np.column_stack([matrix, offset])
+    width, height = now.size
+    new = cv2.warpAffine(gray, warp, (width, height), flags=cv2.INTER_CUBIC)
+    region = _image_of(key.region, matrix, offset, now.size)
+    mean = np.asarray(new, dtype=np.float32)
+    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged)
+
+
+def _image_of(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:
+    """Upright rectangle inside of the affine image of a rectangle and inside of the picture."""
+    left, top, right, bottom = region[0] + 2, region[1] + 2, region[2] - 3, region[3] - 3
+    corners = np.array(
+        [[left, top], [right, top], [left, bottom], [right, bottom]], dtype=np.float64
+    )
+    moved = corners @ matrix.T + offset
+    x0, x1 = max(moved[0, 0], moved[2, 0], 0.0), min(moved[1, 0], moved[3, 0], size[0] - 1.0)
+    y0, y1 = max(moved[0, 1], moved[1, 1], 0.0), min(moved[2, 1], moved[3, 1], size[1] - 1.0)
+    inside = (int(np.ceil(x0)), int(np.ceil(y0)), int(np.floor(x1)) + 1, int(np.floor(y1)) + 1)
+    if inside[2] <= inside[0] or inside[3] <= inside[1]:
+        return 0, 0, 1, 1
+    return inside

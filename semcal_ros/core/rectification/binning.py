@@ -1,0 +1,57 @@
+"""Pictures averaged down by whole factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["binned"]
+
+Picture = NDArray[np.generic]
+
+
+def binned(image: Picture, camera: ScanCamera, largest_px: int) -> tuple[Picture, ScanCamera]:
+    """A picture with no side longer than ``largest_px``, and the camera that takes it.
+
+    Square blocks of pixels are averaged. Rows and columns that fill no block, at the bottom and on
+    the right, are left out.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3) of uint8, uint16 or float32.
+    camera
+        Its camera, of any size.
+    largest_px
+        Longest side wanted, px.
+
+    Returns
+    -------
+    The very same image where it is not longer, and the camera for the size of what is returned.
+
+    Raises
+    ------
+    InvalidValueError
+        If ``largest_px`` is less than 1.
+    """
+    if largest_px < 1:
+        raise InvalidValueError(f"a longest side of {largest_px} px", expected="at least 1 px")
+    height, width = image.shape[:2]
+    fitted = camera.resized(width, height)
+    factor = -(-max(width, height) // largest_px)
+    small = width // factor, height // factor
+    if factor == 1 or min(small) < 1:
+        return image, fitted
+    kept = small[0] * factor, small[1] * factor
+    blocks = cast("NDArray[np.uint8]", image[: kept[1], : kept[0]])
+    picture = cv2.resize(blocks, small, interpolation=cv2.INTER_AREA)
+    # Left out at the far ends, they move no other pixel.
+    cropped = replace(fitted, width=kept[0], height=kept[1])
+    return np.asarray(picture), cropped.resized(*small)

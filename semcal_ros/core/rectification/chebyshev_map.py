@@ -1,0 +1,211 @@
+"""Maps of raw positions that are smooth, from a few exact values.
+
+A map is evaluated exactly at Chebyshev nodes only and interpolated by polynomials in x and y
+(Trefethen 2019, doi:10.1137/1.9781611975949), in bands of rows: a small matrix product per band, of
+which only the values at the nodes depend on the frame.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+
+__all__ = ["RawMap", "SmoothMaps", "keep"]
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+_TESTS = 9
+# The last ones are for residual fields, whose splines are less smooth than the distortion.
+_DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+# The promise is 0.002 px; between the points where the maps are compared they may differ more.
+_MAX_MAP_ERROR_PX = 0.001
+_KEPT = 16
+# Where there is nothing to be seen: such pixels come out as 0.
+_OUTSIDE_PX = -1e4
+
+
+@dataclass(frozen=True)
+class _Interpolant:
+    """Polynomial interpolation from a lattice of nodes to the pixels of an image and to a few test
+    points.
+
+    Attributes
+    ----------
+    points_xy
+        (nodes^2 + tests^2, 2) nodes, then test points, row by row.
+    nodes
+        Number of nodes along each axis.
+    rows
+        (h, nodes + 2): node rows to pixel rows; then 1 and the row index, by which the interpolated
+        departure becomes a position in the same product.
+    cols
+        (nodes, w): node columns to pixel columns.
+    test_rows, test_cols
+        (tests, nodes) and (nodes, tests): to the test points.
+    """
+
+    points_xy: Array
+    nodes: int
+    rows: Map
+    cols: Map
+    test_rows: Array
+    test_cols: Array
+
+
+def _basis(n_pixels: int, degree: int, at: Array) -> tuple[Array, Array]:
+    """Node positions in px, and the (n_at, degree + 1) matrix that interpolates node values
+    (barycentric formula).
+    """
+    k = np.arange(degree + 1)
+    half = 0.5 * max(n_pixels - 1, 1)
+    nodes = half * (1.0 - np.cos(np.pi * k / degree))
+    weights = np.where(k % 2 == 0, 1.0, -1.0)
+    weights[[0, -1]] *= 0.5
+    difference = at[:, None] - nodes[None, :]
+    hit = np.abs(difference) < 1e-9
+    terms = weights / np.where(hit, 1.0, difference)
+    matrix = terms / terms.sum(axis=1, keepdims=True)
+    exact = hit.any(axis=1)
+    matrix[exact] = hit[exact]
+    return nodes, matrix
+
+
+def _interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
+    """Nodes of one polynomial degree; the test points lie where none of the degrees has a node."""
+    tests, bases = [], []
+    for n_pixels in size:
+        # Denser at the edges, as the nodes are and as the beam settles at the start of a line.
+        angles = np.pi * (np.arange(_TESTS) + 0.37) / _TESTS
+        test = 0.5 * (n_pixels - 1) * (1.0 - np.cos(angles))
+        tests.append(test)
+        nodes, at_pixels = _basis(n_pixels, degree, np.arange(n_pixels, dtype=np.float64))
+        bases.append((nodes, at_pixels, _basis(n_pixels, degree, test)[1]))
+    lattices = [np.meshgrid(bases[0][0], bases[1][0]), np.meshgrid(*tests)]
+    points = [np.stack([x.ravel(), y.ravel()], axis=1) for x, y in lattices]
+    height = size[1]
+    rows = np.column_stack([bases[1][1], np.ones(height), np.arange(height)])
+    return _Interpolant(
+        # One axis after the other in memory, as they are worked on.
+        points_xy=np.asfortranarray(np.vstack(points)),
+        nodes=degree + 1,
+        rows=rows.astype(np.float32),
+        cols=np.ascontiguousarray(bases[0][1].T, dtype=np.float32),
+        test_rows=bases[1][2],
+        test_cols=np.ascontiguousarray(bases[0][2].T),
+    )
+
+
+@dataclass(frozen=True)
+class RawMap:
+    """Raw positions of all output pixels of one frame, to be worked out in bands of rows.
+
+    Attributes
+    ----------
+    size
+        (width, height), px.
+    """
+
+    size: tuple[int, int]
+    _rows: Map | None
+    _columns: Map | None
+    _exact: tuple[ScanCamera | None, RasterDrift | None, ScanTiming | None]
+
+    def band(self, top: int, bottom: int, out: Map) -> None:
+        """Write raw x and raw y of the rows ``top`` to ``bottom`` side by side: (rows, 2 w)."""
+        if self._rows is not None and self._columns is not None:
+            np.matmul(self._rows[top:bottom], self._columns, out=out)
+            return
+        width = self.size[0]
+        x, y = np.meshgrid(np.arange(width), np.arange(top, bottom))
+        xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+        raw = raw_from_output(xy, self.size, *self._exact)
+        raw[~np.all(np.isfinite(raw), axis=1)] = _OUTSIDE_PX
+        out[:, :width] = raw[:, 0].reshape(x.shape)
+        out[:, width:] = raw[:, 1].reshape(x.shape)
+
+
+class SmoothMaps:
+    """Makes :class:`RawMap`, keeping what does not change from frame to frame.
+
+    The degree of the polynomials is the lowest whose map agrees with the exact one to 0.001 px at
+    81 points between the nodes of every single frame. A map that no polynomial follows, or that
+    has holes, is worked out exactly at every pixel, which is slow.
+    """
+
+    def __init__(self) -> None:
+        self._degrees: OrderedDict[tuple[int, int, bool], int] = OrderedDict()
+        self._interpolants: OrderedDict[tuple[int, int, int], _Interpolant] = OrderedDict()
+
+    def of(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera | None,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> RawMap:
+        """The map of one frame; the arguments are those of
+        :func:`~semcal_ros.core.rectification.raw_positions.raw_from_output`.
+        """
+        exact = camera, drift, timing
+        found = self._departure(size, *exact)
+        if found is None:
+            return RawMap(size, None, None, exact)
+        interpolant, departure = found
+        width, nodes = size[0], interpolant.nodes
+        # What single precision has to carry through the product is the small departure from the
+        # identity; the identity comes last, when nothing is added any more.
+        columns = np.zeros((nodes + 2, 2 * width), dtype=np.float32)
+        columns[:nodes, :width] = departure[0].astype(np.float32) @ interpolant.cols
+        columns[:nodes, width:] = departure[1].astype(np.float32) @ interpolant.cols
+        columns[nodes, :width] = np.arange(width)
+        columns[nodes + 1, width:] = 1.0
+        return RawMap(size, interpolant.rows, columns, exact)
+
+    def _departure(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera | None,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> tuple[_Interpolant, Array] | None:
+        """The map minus the identity, (2, nodes, nodes) of x and y, at the nodes of the lowest
+        degree that is accurate, or None where none is.
+        """
+        # Neighbouring magnifications need the same degree.
+        key = (*size, camera is not None and camera.residual is not None)
+        for degree in [d for d in _DEGREES if d >= self._degrees.get(key, 0)]:
+            interpolant = self._interpolants.get((*size, degree))
+            if interpolant is None:
+                interpolant = _interpolant(size, degree)
+            keep(self._interpolants, (*size, degree), interpolant, _KEPT)
+            points, nodes = interpolant.points_xy, interpolant.nodes
+            departure = (raw_from_output(points, size, camera, drift, timing) - points).T
+            at_nodes = departure[:, : nodes * nodes].reshape(2, nodes, nodes)
+            truth = departure[:, nodes * nodes :].reshape(2, _TESTS, _TESTS)
+            error = interpolant.test_rows @ at_nodes @ interpolant.test_cols - truth
+            largest = float(np.max(np.abs(error)))
+            if not np.isfinite(largest):
+                return None
+            if largest <= _MAX_MAP_ERROR_PX:
+                keep(self._degrees, key, degree, _KEPT)
+                return interpolant, at_nodes
+        return None
+
+
+def keep(store: OrderedDict[_Key, _Value], key: _Key, value: _Value, at_most: int) -> None:
+    """Store as the latest and forget the oldest beyond ``at_most``."""
+    store[key] = value
+    store.move_to_end(key)
+    while len(store) > at_most:
+        store.popitem(last=False)

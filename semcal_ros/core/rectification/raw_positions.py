@@ -1,0 +1,132 @@
+"""Where in the raw frame each pixel of a rectified one is found, exactly.
+
+The specimen drifts before it is projected and distorted, so an output pixel u, which is an ideal
+pixel of the camera with the specimen at zero drift, is found in the raw frame at
+
+    raw = distort(u + J d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
+
+with ``J`` the derivative of ideal pixels by sem-frame coordinates and ``t(raw)`` the time at which
+that raw pixel was scanned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
+
+Array = NDArray[np.float64]
+
+_MAX_STEPS = 50
+_SETTLED_PX = 1e-5
+
+
+@dataclass(frozen=True)
+class RasterDrift:
+    """Drift over one frame.
+
+    Attributes
+    ----------
+    position
+        (2,) drift at the centre of the acquisition: m in the sem frame, or px of the image where
+        there is no camera.
+    velocity
+        (2,) drift velocity at that moment, the same unit per s.
+    acceleration
+        (2,) its rate of change, the same unit per s^2.
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array = field(default_factory=lambda: np.zeros(2))
+
+
+def raw_from_output(
+    xy: Array,
+    size: tuple[int, int],
+    camera: ScanCamera | None,
+    drift: RasterDrift | None,
+    timing: ScanTiming | None,
+) -> Array:
+    """Raw pixels (n, 2) of output pixels (n, 2), exactly; NaN where the distortion has no answer.
+
+    Parameters
+    ----------
+    xy
+        Output pixels.
+    size
+        (width, height) of the raw frame.
+    camera
+        Camera of that size, or None for no distortion; drift is then in px.
+    drift
+        Drift to remove, or None.
+    timing
+        Raster timing; None takes the frame as an instant, so that the velocity has no effect.
+    """
+    jacobian = np.eye(2) if camera is None else camera.ideal_from_sem_jacobian
+    if drift is None:
+        return xy.copy() if camera is None else camera.distort(xy)
+    at_centre = xy + jacobian @ np.asarray(drift.position, dtype=np.float64)
+    raw = at_centre if camera is None else camera.distort(at_centre)
+    velocity = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
+    acceleration = 0.5 * (jacobian @ np.asarray(drift.acceleration, dtype=np.float64))
+    turns = bool(acceleration.any())
+    if timing is None or not (turns or velocity.any()):
+        return raw
+    width, height = size
+    for _ in range(_MAX_STEPS):
+        # A contraction as long as the drift moves by much less than a row while a row is scanned.
+        offset_s = timing.pixel_offset_s(raw[:, 1], raw[:, 0], height, width)
+        since_s = offset_s - timing.centre_offset_s
+        moved = at_centre + np.multiply.outer(velocity, since_s).T
+        if turns:
+            # The mean over the passes of the square of the time.
+            square_s2 = since_s**2 + timing.pass_variance_s2
+            moved += np.multiply.outer(acceleration, square_s2).T
+        new = moved if camera is None else camera.distort(moved)
+        change_px = np.abs(new - raw)
+        raw = new
+        # What is left after a step is smaller than it by the same factor again.
+        if not (change_px > _SETTLED_PX).any():
+            return raw
+    raise InvalidValueError(
+        f"drift of {np.hypot(*velocity):.3g} px/s with {timing.frame_time_s} s per pass",
+        expected="a drift that is slow against the scan of a row",
+        do="check the frame time and the unit of the velocity",
+    )
+
+
+def camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object, ...]:
+    """What maps of (width, height) depend on, for looking them up."""
+    if camera is None:
+        return size
+    field = b"" if camera.residual is None else camera.residual.coefficients.tobytes()
+    return (*size, camera.norm_px, *camera.parameters.tolist(), field)
+
+
+def drift_key(drift: RasterDrift | None, timing: ScanTiming | None) -> tuple[object, ...]:
+    """What the drift adds to :func:`camera_key`."""
+    if drift is None:
+        return ()
+    parts = (drift.position, drift.velocity, drift.acceleration)
+    return (timing, *(float(value) for part in parts for value in part))
+
+
+def check_drift(drift: RasterDrift | None) -> None:
+    """Raise :class:`InvalidValueError` where a drift is not made of finite pairs."""
+    if drift is None:
+        return
+    parts = (drift.position, drift.velocity, drift.acceleration)
+    values = np.concatenate([np.ravel(part) for part in parts])
+    if values.shape != (6,) or not np.all(np.isfinite(values)):
+        raise InvalidValueError(
+            f"drift {values.tolist()}",
+            expected="two finite positions, velocities and accelerations each",
+        )

@@ -1,0 +1,1 @@
+"""The sub-pixel shift between two images, or the reason why there is none."""

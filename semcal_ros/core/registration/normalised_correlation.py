@@ -1,0 +1,297 @@
+"""Coarse search: normalised cross-correlation over the overlap, for every shift at once.
+
+The correlation coefficient of what overlaps is exact at every shift (Padfield 2012,
+doi:10.1109/TIP.2011.2181402): the cross term comes from one FFT product, means and energies of
+rectangular overlaps from integral images. It does not favour small shifts, as a windowed phase
+correlation does, and its heights can be compared with each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from semcal_ros.core.registration.tiles import Pyramid
+
+__all__ = ["CoarsePeak", "CoarseReference", "coarse_peaks"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+_LEVELS_PX = (128, 256, 512)
+# A maximum over some 10^4 shifts of unrelated pictures stays below about 5 robust deviations.
+_SIGNIFICANT = 7.0
+# On a lattice the whole surface oscillates, so that its spread says nothing; its height does.
+_HIGH = 0.5
+_MAX_PEAKS = 8
+
+
+@dataclass(frozen=True)
+class CoarsePeak:
+    """A local maximum of the correlation surface.
+
+    Attributes
+    ----------
+    shift_px
+        (x, y) shift in full-resolution px.
+    correlation
+        Correlation coefficient over the overlap.
+    significance
+        Height in robust standard deviations of the surface.
+    step_px
+        Full-resolution px per sample of the surface.
+    """
+
+    shift_px: tuple[float, float]
+    correlation: float
+    significance: float
+    step_px: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether unrelated pictures are unlikely to give such a peak."""
+        return self.significance >= _SIGNIFICANT or self.correlation >= _HIGH
+
+
+@dataclass(frozen=True)
+class _Half:
+    """All that one picture contributes to the surface of a pair of sizes."""
+
+    reduced: Image
+    spectrum: NDArray[np.complex64]
+    sums: Image
+    deviation: Image
+
+
+@dataclass(frozen=True)
+class _Geometry:
+    """What a surface looks like for two sizes.
+
+    ``there`` and ``here`` are the first and last-plus-one samples of reference and image that
+    overlap at each shift, ``count`` (rows, cols) the overlapping samples, ``root`` their square root,
+    ``allowed`` whether they are enough, ``size`` that of the Fourier transforms.
+    """
+
+    shift_x: NDArray[np.intp]
+    shift_y: NDArray[np.intp]
+    here: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
+    there: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
+    count: Image
+    root: Image
+    allowed: NDArray[np.bool_]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class CoarseReference:
+    """A reference picture for :func:`coarse_peaks`.
+
+    Parameters
+    ----------
+    pyramid
+        The grey picture.
+    min_overlap
+        Shifts are searched whose overlap is at least this fraction of the smaller picture, per axis
+        and in area.
+    """
+
+    pyramid: Pyramid
+    min_overlap: float
+    # Everything about the reference for one reduction and one size of image.
+    _known: dict[tuple[int, tuple[int, ...]], _Half] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def half(self, factor: int, image_shape: tuple[int, ...]) -> _Half | None:
+        """The reference's part of the surface, computed once."""
+        key = factor, image_shape
+        if key not in self._known:
+            small = _flat(self.pyramid.at(factor))
+            geometry = _geometry(small.shape, image_shape, self.min_overlap)
+            if geometry is None:
+                return None
+            self._known[key] = _half(small, geometry, *geometry.here)
+        return self._known[key]
+
+
+def coarse_peaks(
+    reference: CoarseReference, image: Pyramid, guess_px: Array, *, finest: bool = False
+) -> list[CoarsePeak]:
+    """Local maxima of the correlation, best first, down to half of the height of the best.
+
+    Parameters
+    ----------
+    reference, image
+        Pictures of the same scale; sizes may differ.
+    guess_px
+        (2,) predicted shift, near which peaks are listed even if many others are higher.
+    finest
+        Search at the finest resolution at once, for textures of which reduced pictures show little.
+
+    Returns
+    -------
+    list
+        Empty where no shift stands out, not even at half of the full resolution.
+    """
+    longest = max(*reference.pyramid.full.shape, *image.full.shape)
+    best: list[CoarsePeak] = []
+    for level in _LEVELS_PX[-1:] if finest else _LEVELS_PX:
+        factor = 1 << max(0, int(np.ceil(np.log2(longest / level))))
+        peaks = _peaks_at(reference, image, factor, guess_px)
+        if peaks and (not best or peaks[0].significance > best[0].significance):
+            best = peaks
+        if (peaks and peaks[0].significant) or factor == 1:
+            break
+    return best if best and best[0].significant else []
+
+
+def _flat(picture: NDArray[np.generic]) -> Image:
+    """Shading removed: only structure below an eighth of the field is compared."""
+    small = np.asarray(picture, dtype=np.float32)
+    sigma = max(small.shape) / 16.0
+    # The shading is smooth: a quarter of the pixels tell it.
+    tiny = cv2.resize(small, (0, 0), fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(tiny, (0, 0), 0.25 * sigma)
+    background = cv2.resize(smooth, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(small - background, dtype=np.float32)
+
+
+def _peaks_at(
+    reference: CoarseReference, image: Pyramid, factor: int, guess_px: Array
+) -> list[CoarsePeak]:
+    small = _flat(image.at(factor))
+    before = reference.half(factor, small.shape)
+    if before is None:
+        return []
+    geometry = _geometry(before.reduced.shape, small.shape, reference.min_overlap)
+    assert geometry is not None
+    now = _half(small, geometry, *geometry.there)
+    ncc = _surface(before, now, geometry)
+    # The spread of a chance correlation grows as the overlap shrinks.
+    score = ncc * geometry.root
+    top = float(score.max())
+    if not top > 0.0:
+        return []
+    searched = score[::4, ::2][geometry.allowed[::4, ::2]]
+    spread = 1.4826 * float(np.median(np.abs(searched - np.median(searched))))
+    local = cv2.dilate(score, np.ones((5, 5), np.uint8)) <= score
+    rows, cols = np.nonzero(local & (score >= np.float32(0.5 * top)))
+    highest = np.argsort(-score[rows, cols], kind="stable")
+    origin = int(geometry.shift_x[0]), int(geometry.shift_y[0])
+    away = np.hypot(
+        cols + origin[0] - guess_px[0] / factor, rows + origin[1] - guess_px[1] / factor
+    )
+    nearest = np.argsort(away, kind="stable")[:_MAX_PEAKS]
+    # On a lattice the one near the prediction need not be among the highest.
+    keep = [k for rank, k in enumerate(highest) if rank < _MAX_PEAKS or k in nearest]
+    peaks = []
+    for row, col in zip(rows[keep], cols[keep], strict=True):
+        fine_row, fine_col = _vertex(score, int(row), int(col))
+        shift = ((fine_col + origin[0]) * factor, (fine_row + origin[1]) * factor)
+        height = float(score[row, col]) / max(spread, 1e-12)
+        peaks.append(CoarsePeak(shift, float(ncc[row, col]), height, float(factor)))
+    return peaks
+
+
+def _vertex(score: Image, row: int, col: int) -> tuple[float, float]:
+    """Vertex of the parabolas through the maximum and its neighbours along each axis."""
+
+    def along(before: float, centre: float, after: float) -> float:
+        curvature = before - 2.0 * centre + after
+        return (
+            0.0
+            if curvature >= 0.0
+            else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+        )
+
+    height, width = score.shape
+    d_row = d_col = 0.0
+    if 0 < row < height - 1:
+        d_row = along(score[row - 1, col], score[row, col], score[row + 1, col])
+    if 0 < col < width - 1:
+        d_col = along(score[row, col - 1], score[row, col], score[row, col + 1])
+    return row + d_row, col + d_col
+
+
+def _axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[NDArray[np.intp], ...]:
+    """Shifts along one axis, and the first and last-plus-one reference sample that overlaps."""
+    shifts = np.arange(-(n_reference - 1), n_image)
+    first = np.maximum(0, -shifts)
+    last = np.minimum(n_reference, n_image - shifts)
+    keep = last - first >= max(4.0, min_overlap * min(n_reference, n_image))
+    return shifts[keep], first[keep], last[keep]
+
+
+@lru_cache(maxsize=8)
+def _geometry(
+    reference: tuple[int, ...], image: tuple[int, ...], min_overlap: float
+) -> _Geometry | None:
+    shift_y, first_y, last_y = _axis(reference[0], image[0], min_overlap)
+    shift_x, first_x, last_x = _axis(reference[1], image[1], min_overlap)
+    if shift_x.size == 0 or shift_y.size == 0:
+        return None
+    # Shifts that are not looked at may wrap around.
+    size = [
+        scipy.fft.next_fast_len(max(a + int(s[-1]), b - int(s[0])), real=True)
+        for a, b, s in zip(reference, image, (shift_y, shift_x), strict=True)
+    ]
+    count = np.outer(last_y - first_y, last_x - first_x).astype(np.float64)
+    smaller = float(min(reference[0] * reference[1], image[0] * image[1]))
+    return _Geometry(
+        shift_x=shift_x,
+        shift_y=shift_y,
+        here=((first_y, last_y), (first_x, last_x)),
+        there=((first_y + shift_y, last_y + shift_y), (first_x + shift_x, last_x + shift_x)),
+        count=count.astype(np.float32),
+        root=np.sqrt(count).astype(np.float32),
+        allowed=count >= min_overlap * smaller,
+        size=(size[0], size[1]),
+    )
+
+
+def _half(
+    picture: Image,
+    geometry: _Geometry,
+    rows: tuple[NDArray[np.intp], ...],
+    cols: tuple[NDArray[np.intp], ...],
+) -> _Half:
+    table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    # Shading was removed, so that single precision is enough for differences of the sums.
+    sums = _box_sums(np.asarray(table, dtype=np.float32), rows, cols)
+    energies = _box_sums(np.asarray(squares, dtype=np.float32), rows, cols)
+    variance = energies - sums**2 / geometry.count
+    floor = 1e-9 * max(float(variance.max()), 1e-30)
+    return _Half(
+        picture,
+        scipy.fft.rfft2(picture, geometry.size),
+        sums,
+        np.sqrt(np.maximum(variance, np.float32(floor))),
+    )
+
+
+def _box_sums(
+    table: Image,
+    rows: tuple[NDArray[np.intp], ...],
+    cols: tuple[NDArray[np.intp], ...],
+) -> Image:
+    strips = np.take(table, rows[1], axis=0) - np.take(table, rows[0], axis=0)
+    # Columns are gathered as rows, which lie together in memory.
+    strips = np.ascontiguousarray(strips.T)
+    sums = np.take(strips, cols[1], axis=0) - np.take(strips, cols[0], axis=0)
+    return np.asarray(sums.T)
+
+
+def _surface(reference: _Half, image: _Half, geometry: _Geometry) -> Image:
+    """Correlation coefficients at all shifts; 0 where too little overlaps."""
+    size = geometry.size
+    wrapped = scipy.fft.irfft2(image.spectrum * np.conj(reference.spectrum), size)
+    cross = wrapped[geometry.shift_y % size[0]][:, geometry.shift_x % size[1]]
+    cross -= reference.sums * image.sums / geometry.count
+    cross /= reference.deviation * image.deviation
+    cross[~geometry.allowed] = 0.0
+    return np.asarray(cross, dtype=np.float32)
