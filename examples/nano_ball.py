@@ -26,9 +26,9 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 from semcal_ros import Calibration
+from semcal_ros.applications.reconstruction import Keyframe, SequenceTracker
 from semcal_ros.bridge.config import load_config
 from semcal_ros.cli import main as semcal
-from semcal_ros.core.structure import Keyframe, SequenceTracker
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.report.ball_figures import small_png

@@ -27,8 +27,8 @@ from joblib import Parallel, cpu_count, delayed
 from visual_servo_loop import Case, Run, Task, servo_run
 
 from semcal_ros import Calibration
+from semcal_ros.applications.servoing import PlanePose, ServoSettings
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.servoing import PlanePose, ServoSettings
 from semcal_ros.pipeline import calibrate_found, find_views
 from semcal_ros.synthetic import (
     DRIFTS,

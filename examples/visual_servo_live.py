@@ -22,10 +22,16 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from visual_servo_loop import Run
 
+from semcal_ros.applications.servoing import (
+    NestedTarget,
+    PlaneCamera,
+    PlanePose,
+    find_target,
+    fit_pose,
+)
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.core.servoing import NestedTarget, PlaneCamera, PlanePose, find_target, fit_pose
 from semcal_ros.synthetic import VirtualMicroscope
 
 NODES = ("parameter_server", "stream_corrector", "visual_servo", "virtual_sem")

@@ -8,10 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.core.servoing import (
+from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,
     PlanePose,
@@ -19,6 +16,9 @@ from semcal_ros.core.servoing import (
     ServoSettings,
     find_target,
 )
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import LiveScene, Pose, VirtualMicroscope, drift_preset
 
 # Between the end of a frame and the moment from which the stage obeys: transport and work.

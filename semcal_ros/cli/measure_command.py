@@ -10,6 +10,15 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.cantilever import (
+    SHAPES,
+    Repeatability,
+    Series,
+    SeriesSettings,
+    frames_of_poses,
+    measure_series,
+    repeatability,
+)
 from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
@@ -30,15 +39,6 @@ from semcal_ros.cli.drift_common import (
     with_frame_time,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.cantilever import (
-    SHAPES,
-    Repeatability,
-    Series,
-    SeriesSettings,
-    frames_of_poses,
-    measure_series,
-    repeatability,
-)
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.tables import write_csv

@@ -14,8 +14,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.reconstruction import SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.structure import SurfaceMesh
 from semcal_ros.files.atomic import atomic_write_bytes
 
 __all__ = ["MESH_SUFFIXES", "UNITS_PER_M", "mesh_bytes", "save_cloud", "save_mesh"]

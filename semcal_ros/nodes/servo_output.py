@@ -10,9 +10,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 
+from semcal_ros.applications.servoing import ServoStep
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import copy_header
-from semcal_ros.core.servoing import ServoStep
 from semcal_ros.nodes.base import SemNode
 
 __all__ = ["ErrorOutput", "StageOutput"]

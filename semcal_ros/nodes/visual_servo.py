@@ -11,8 +11,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
-from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.core.servoing import (
+from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,
     Servo,
@@ -20,6 +19,7 @@ from semcal_ros.core.servoing import (
     find_target,
     projection_of_frame,
 )
+from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.nodes.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.magnification import MagnificationInput
 from semcal_ros.nodes.orderly_end import OrderlyEnd

@@ -12,7 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
-from semcal_ros.core.structure import Ball, Structure
+from semcal_ros.applications.reconstruction import Ball, Structure
 from semcal_ros.report.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
 
 __all__ = ["ball_figure", "ball_picture", "small_png"]

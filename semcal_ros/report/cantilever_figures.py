@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
-from semcal_ros.core.cantilever import Repeatability, Series
+from semcal_ros.applications.cantilever import Repeatability, Series
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.style import (
     ACCENT,

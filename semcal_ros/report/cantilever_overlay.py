@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.cantilever import Deflection
+from semcal_ros.applications.cantilever import Deflection
 
 __all__ = ["drawn"]
 

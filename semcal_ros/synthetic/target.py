@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
+from semcal_ros.applications.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
 
 __all__ = ["TargetSpecimen"]
 
@@ -24,7 +24,7 @@ _CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
 
 @dataclass(frozen=True)
 class TargetSpecimen:
-    """A :class:`~semcal_ros.core.servoing.target.NestedTarget` with its origin at that of the specimen.
+    """A :class:`~semcal_ros.applications.servoing.target.NestedTarget` with its origin at that of the specimen.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from semcal_runs import run
 
+from semcal_ros.applications.reconstruction import SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.structure import SurfaceMesh
 from semcal_ros.files.meshes import mesh_bytes, save_cloud, save_mesh
 from semcal_ros.files.simulated import write_simulated
 from semcal_ros.synthetic import Detector

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction import Tracks
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.structure import Tracks
 from semcal_ros.synthetic import preset
 
 RADIUS_M = 450e-9

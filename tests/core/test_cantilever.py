@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.cantilever import (
+from semcal_ros.applications.cantilever import (
     SeriesSettings,
     find_strip,
     frames_of_poses,
     measure_series,
     repeatability,
 )
-from semcal_ros.core.cantilever.bending import end_along_axis, fit_bending, shape_of
-from semcal_ros.core.cantilever.edges import EdgeModel, fit_edges
+from semcal_ros.applications.cantilever.bending import end_along_axis, fit_bending, shape_of
+from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
 from semcal_ros.synthetic.cantilever import CantileverScene, cantilever_plan

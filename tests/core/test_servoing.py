@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.servoing import (
+from semcal_ros.applications.servoing import (
     CommandHistory,
     NestedTarget,
     PlaneCamera,
@@ -23,6 +22,7 @@ from semcal_ros.core.servoing import (
     interaction_matrix,
     projection_of_frame,
 )
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 
 SCOPE = preset("jsm820")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from structure_scenes import RADIUS_M, aligned_rms_m, ball_scene
 
-from semcal_ros.core.errors import StructureError
-from semcal_ros.core.structure import (
+from semcal_ros.applications.reconstruction import (
     Observations,
     Tracks,
     adjust,
@@ -16,8 +15,9 @@ from semcal_ros.core.structure import (
     mirrored,
     upgrade_to_metric,
 )
-from semcal_ros.core.structure.epipolar import epipolar_of, robust_epipolar
-from semcal_ros.core.structure.reconstruct import mirror_of
+from semcal_ros.applications.reconstruction.epipolar import epipolar_of, robust_epipolar
+from semcal_ros.applications.reconstruction.reconstruct import mirror_of
+from semcal_ros.core.errors import StructureError
 
 PIXEL_M = 0.12 / 9500.0 / 2048.0
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.errors import InvalidValueError, StructureError
-from semcal_ros.core.structure import (
+from semcal_ros.applications.reconstruction import (
     SequenceTracker,
     TrackerSettings,
     measure_ball,
     reconstruct,
 )
+from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semcal_ros.applications.reconstruction import fit_sphere, mesh_of_cloud
+from semcal_ros.applications.reconstruction.mls import local_surface
 from semcal_ros.core.errors import StructureError
-from semcal_ros.core.structure import fit_sphere, mesh_of_cloud
-from semcal_ros.core.structure.mls import local_surface
 
 RADIUS_M = 450e-9
 

@@ -8,9 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.applications.servoing import (
+    NestedTarget,
+    PlaneCamera,
+    PlanePose,
+    find_target,
+    fit_pose,
+)
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.core.servoing import NestedTarget, PlaneCamera, PlanePose, find_target, fit_pose
 from semcal_ros.synthetic import NOISE_FREE, Detector, LiveScene, Pose, preset, render_frame
 from semcal_ros.synthetic.target import TargetSpecimen
 

@@ -100,7 +100,7 @@ def projection_of_frame(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array
 
     A parallel projection (rho = 0) has no K, and neither has a frame without calibration. The latest P_g is then
     taken if it is parallel itself; that it is of the frame's magnification, the size of the target has to tell
-    (:attr:`~semcal_ros.core.servoing.settings.ServoSettings.scale_tolerance`).
+    (:attr:`~semcal_ros.applications.servoing.settings.ServoSettings.scale_tolerance`).
 
     Parameters
     ----------

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.types import Observations, camera_table
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.structure.types import Observations, camera_table
 
 __all__ = ["Adjustment", "adjust"]
 

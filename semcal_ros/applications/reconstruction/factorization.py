@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.errors import StructureError
-from semcal_ros.core.structure.types import Tracks
 
 __all__ = ["AffineStructure", "factorize"]
 

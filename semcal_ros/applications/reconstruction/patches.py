@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.appearance import Appearance
+from semcal_ros.applications.reconstruction.keyframes import Keyframe
+from semcal_ros.applications.reconstruction.raster_motion import displacement_m, plane_at_centre
+from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.structure.appearance import Appearance
-from semcal_ros.core.structure.keyframes import Keyframe
-from semcal_ros.core.structure.raster_motion import displacement_m, plane_at_centre
-from semcal_ros.core.structure.types import Observations
 
 __all__ = ["WINDOW", "PatchSettings", "Posed", "measure_patches"]
 

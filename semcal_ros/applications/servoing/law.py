@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.servoing.axis import AxisObserver
+from semcal_ros.applications.servoing.detection import TargetView
+from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
+from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
+from semcal_ros.applications.servoing.settings import ServoSettings
+from semcal_ros.applications.servoing.watch import FollowWatch
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.servoing.axis import AxisObserver
-from semcal_ros.core.servoing.detection import TargetView
-from semcal_ros.core.servoing.motion import CommandHistory, DisturbanceObserver
-from semcal_ros.core.servoing.plane_camera import PlaneCamera
-from semcal_ros.core.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
-from semcal_ros.core.servoing.settings import ServoSettings
-from semcal_ros.core.servoing.watch import FollowWatch
 
 __all__ = ["Servo", "ServoStep"]
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
-from semcal_ros.core.structure.adjustment import adjust
-from semcal_ros.core.structure.mesh import SurfaceMesh, mesh_of_cloud
-from semcal_ros.core.structure.mls import local_surface, typical_spacing_m
-from semcal_ros.core.structure.reconstruct import Structure
-from semcal_ros.core.structure.sphere import SphereFit, fit_sphere
+from semcal_ros.applications.reconstruction.adjustment import adjust
+from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.applications.reconstruction.mls import local_surface, typical_spacing_m
+from semcal_ros.applications.reconstruction.reconstruct import Structure
+from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 
 __all__ = ["Ball", "measure_ball"]
 

@@ -10,18 +10,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
+from semcal_ros.applications.reconstruction.appearance import Appearance, appearance_of
+from semcal_ros.applications.reconstruction.factorization import factorize
+from semcal_ros.applications.reconstruction.keyframes import Keyframe
+from semcal_ros.applications.reconstruction.mls import local_surface, typical_spacing_m
+from semcal_ros.applications.reconstruction.patches import (
+    WINDOW,
+    PatchSettings,
+    Posed,
+    measure_patches,
+)
+from semcal_ros.applications.reconstruction.raster_motion import plane_at_centre
+from semcal_ros.applications.reconstruction.types import Observations, Tracks
+from semcal_ros.applications.reconstruction.upgrade import mirrored, upgrade_to_metric
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
-from semcal_ros.core.structure.adjustment import Adjustment, adjust
-from semcal_ros.core.structure.appearance import Appearance, appearance_of
-from semcal_ros.core.structure.factorization import factorize
-from semcal_ros.core.structure.keyframes import Keyframe
-from semcal_ros.core.structure.mls import local_surface, typical_spacing_m
-from semcal_ros.core.structure.patches import WINDOW, PatchSettings, Posed, measure_patches
-from semcal_ros.core.structure.raster_motion import plane_at_centre
-from semcal_ros.core.structure.types import Observations, Tracks
-from semcal_ros.core.structure.upgrade import mirrored, upgrade_to_metric
 
 __all__ = ["Structure", "StructureSettings", "mirror_of", "reconstruct", "tracks_of"]
 
@@ -88,7 +93,7 @@ class Structure:
     unplaced
         Keyframes that could not be linked to the others.
     relief_condition
-        Of the metric upgrade, see :class:`~semcal_ros.core.structure.upgrade.MetricUpgrade`.
+        Of the metric upgrade, see :class:`~semcal_ros.applications.reconstruction.upgrade.MetricUpgrade`.
     relief_sigma
         1-sigma of a stretch of the depth of the reference view, relative: what is left of the bas-relief
         ambiguity.
@@ -137,7 +142,7 @@ def reconstruct(
     *,
     on_step: Callable[[str], object] = lambda _: None,
 ) -> Structure:
-    """Points and poses from the keyframes of a :class:`~semcal_ros.core.structure.keyframes.SequenceTracker`.
+    """Points and poses from the keyframes of a :class:`~semcal_ros.applications.reconstruction.keyframes.SequenceTracker`.
 
     Parameters
     ----------

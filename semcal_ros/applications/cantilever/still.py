@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.drift.tracker import DriftTracker

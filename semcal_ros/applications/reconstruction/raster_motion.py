@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.keyframes import Keyframe, to_plane
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.structure.keyframes import Keyframe, to_plane
 
 __all__ = ["displacement_m", "plane_at_centre"]
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.servoing.sides import refine_quads
+from semcal_ros.applications.servoing.target import NestedTarget, dictionary
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.servoing.sides import refine_quads
-from semcal_ros.core.servoing.target import NestedTarget, dictionary
 
 __all__ = ["TargetView", "find_target"]
 

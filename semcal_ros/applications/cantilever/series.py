@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.cantilever.bending import (
+from semcal_ros.applications.cantilever.bending import (
     Bending,
     Shape,
     common_shape,
@@ -19,11 +17,13 @@ from semcal_ros.core.cantilever.bending import (
     fit_bending,
     shape_of,
 )
-from semcal_ros.core.cantilever.edges import EdgeFit, fit_edges, same_width
-from semcal_ros.core.cantilever.finding import Strip, find_strip
-from semcal_ros.core.cantilever.plane import Axis, PlaneMap
-from semcal_ros.core.cantilever.rest import REACH_PX, Rest, View, beam_at_rest
-from semcal_ros.core.cantilever.still import follow_background
+from semcal_ros.applications.cantilever.edges import EdgeFit, fit_edges, same_width
+from semcal_ros.applications.cantilever.finding import Strip, find_strip
+from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.rest import REACH_PX, Rest, View, beam_at_rest
+from semcal_ros.applications.cantilever.still import follow_background
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
@@ -52,7 +52,7 @@ class SeriesSettings:
     length_m
         Its length, from its maker.
     shape
-        One of :data:`~semcal_ros.core.cantilever.bending.SHAPES`; ``"free"`` is fitted, the same
+        One of :data:`~semcal_ros.applications.cantilever.bending.SHAPES`; ``"free"`` is fitted, the same
         for all frames.
     base_px, tip_px
         (2,) raw pixels of both ends of the centre line in the first frame; None finds them.
@@ -124,7 +124,7 @@ class Series:
     frames
         One result for each frame.
     shape
-        Shape of the bending (see :mod:`~semcal_ros.core.cantilever.bending`).
+        Shape of the bending (see :mod:`~semcal_ros.applications.cantilever.bending`).
     drift
         Drift of the background.
     notes

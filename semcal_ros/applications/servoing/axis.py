@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.servoing.plane_camera import PlaneCamera
+from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 
 __all__ = ["AxisObserver"]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.servoing.detection import TargetView
+from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.servoing.detection import TargetView
-from semcal_ros.core.servoing.plane_camera import PlaneCamera
 
 __all__ = ["PlanePose", "PoseFit", "fit_pose", "interaction_matrix"]
 

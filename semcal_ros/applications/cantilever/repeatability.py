@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.cantilever.series import Series
+from semcal_ros.applications.cantilever.series import Series
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Repeatability", "frames_of_poses", "repeatability"]

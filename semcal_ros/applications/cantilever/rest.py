@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.cantilever.edges import (
+from semcal_ros.applications.cantilever.edges import (
     EdgeFit,
     EdgeModel,
     StepFit,
@@ -15,7 +15,7 @@ from semcal_ros.core.cantilever.edges import (
     fit_edges,
     fit_step,
 )
-from semcal_ros.core.cantilever.plane import Axis
+from semcal_ros.applications.cantilever.plane import Axis
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["REACH_PX", "Rest", "View", "beam_at_rest"]

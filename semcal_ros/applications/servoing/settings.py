@@ -11,7 +11,7 @@ __all__ = ["ServoSettings"]
 
 @dataclass(frozen=True)
 class ServoSettings:
-    """Settings of :class:`~semcal_ros.core.servoing.law.Servo`.
+    """Settings of :class:`~semcal_ros.applications.servoing.law.Servo`.
 
     Attributes
     ----------

@@ -14,10 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.appearance import (
+    Appearance,
+    appearance_of,
+    bytes_for_tracking,
+)
+from semcal_ros.applications.reconstruction.epipolar import robust_epipolar
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.structure.appearance import Appearance, appearance_of, bytes_for_tracking
-from semcal_ros.core.structure.epipolar import robust_epipolar
 
 __all__ = ["Keyframe", "SequenceTracker", "TrackerSettings", "to_plane"]
 

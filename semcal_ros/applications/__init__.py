@@ -1,0 +1,1 @@
+"""Uses of the method: bending of a cantilever, shape from views, visual servoing."""

@@ -1,0 +1,53 @@
+"""Shape of a specimen from many calibrated views of it: tracks, factorization, adjustment, surface.
+
+After section 4.4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, with the calibrated camera of every
+view at its own magnification. Nothing in here knows that the specimen is a ball, except :mod:`.sphere`.
+"""
+
+from __future__ import annotations
+
+from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
+from semcal_ros.applications.reconstruction.ball import Ball, measure_ball
+from semcal_ros.applications.reconstruction.factorization import AffineStructure, factorize
+from semcal_ros.applications.reconstruction.keyframes import (
+    Keyframe,
+    SequenceTracker,
+    TrackerSettings,
+)
+from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.applications.reconstruction.reconstruct import (
+    Structure,
+    StructureSettings,
+    reconstruct,
+)
+from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
+from semcal_ros.applications.reconstruction.types import Observations, Tracks
+from semcal_ros.applications.reconstruction.upgrade import (
+    MetricUpgrade,
+    mirrored,
+    upgrade_to_metric,
+)
+
+__all__ = [
+    "Adjustment",
+    "AffineStructure",
+    "Ball",
+    "Keyframe",
+    "MetricUpgrade",
+    "Observations",
+    "SequenceTracker",
+    "SphereFit",
+    "Structure",
+    "StructureSettings",
+    "SurfaceMesh",
+    "TrackerSettings",
+    "Tracks",
+    "adjust",
+    "factorize",
+    "fit_sphere",
+    "measure_ball",
+    "mesh_of_cloud",
+    "mirrored",
+    "reconstruct",
+    "upgrade_to_metric",
+]

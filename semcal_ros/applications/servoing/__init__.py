@@ -1,0 +1,30 @@
+"""Visual servoing of the stage: a target that can be found at any magnification, its pose, the control law."""
+
+from __future__ import annotations
+
+from semcal_ros.applications.servoing.axis import AxisObserver
+from semcal_ros.applications.servoing.detection import TargetView, find_target
+from semcal_ros.applications.servoing.law import Servo, ServoStep
+from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
+from semcal_ros.applications.servoing.plane_camera import PlaneCamera, projection_of_frame
+from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
+from semcal_ros.applications.servoing.settings import ServoSettings
+from semcal_ros.applications.servoing.target import NestedTarget
+
+__all__ = [
+    "AxisObserver",
+    "CommandHistory",
+    "DisturbanceObserver",
+    "NestedTarget",
+    "PlaneCamera",
+    "PlanePose",
+    "PoseFit",
+    "Servo",
+    "ServoSettings",
+    "ServoStep",
+    "TargetView",
+    "find_target",
+    "fit_pose",
+    "interaction_matrix",
+    "projection_of_frame",
+]
