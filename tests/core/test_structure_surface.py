@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.applications.reconstruction import fit_sphere, mesh_of_cloud
-from semcal_ros.applications.reconstruction.mls import local_surface
+from semcal_ros.applications.reconstruction.moving_least_squares import local_surface
 from semcal_ros.core.errors import StructureError
 
 RADIUS_M = 450e-9

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.cantilever.background_drift import follow_background
 from semcal_ros.applications.cantilever.bending import (
     Bending,
     Shape,
@@ -20,8 +21,7 @@ from semcal_ros.applications.cantilever.bending import (
 from semcal_ros.applications.cantilever.edges import EdgeFit, fit_edges, same_width
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
-from semcal_ros.applications.cantilever.rest import REACH_PX, Rest, View, beam_at_rest
-from semcal_ros.applications.cantilever.still import follow_background
+from semcal_ros.applications.cantilever.undeformed import REACH_PX, Rest, View, beam_at_rest
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance

@@ -9,12 +9,17 @@ from __future__ import annotations
 from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
 from semcal_ros.applications.reconstruction.ball import Ball, measure_ball
 from semcal_ros.applications.reconstruction.factorization import AffineStructure, factorize
-from semcal_ros.applications.reconstruction.keyframes import (
+from semcal_ros.applications.reconstruction.feature_tracks import (
     Keyframe,
     SequenceTracker,
     TrackerSettings,
 )
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.applications.reconstruction.metric_upgrade import (
+    MetricUpgrade,
+    mirrored,
+    upgrade_to_metric,
+)
 from semcal_ros.applications.reconstruction.reconstruct import (
     Structure,
     StructureSettings,
@@ -22,11 +27,6 @@ from semcal_ros.applications.reconstruction.reconstruct import (
 )
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
-from semcal_ros.applications.reconstruction.upgrade import (
-    MetricUpgrade,
-    mirrored,
-    upgrade_to_metric,
-)
 
 __all__ = [
     "Adjustment",

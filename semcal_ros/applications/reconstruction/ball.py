@@ -17,7 +17,10 @@ from scipy.stats import t as student
 
 from semcal_ros.applications.reconstruction.adjustment import adjust
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
-from semcal_ros.applications.reconstruction.mls import local_surface, typical_spacing_m
+from semcal_ros.applications.reconstruction.moving_least_squares import (
+    local_surface,
+    typical_spacing_m,
+)
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.applications.reconstruction.appearance import Appearance
-from semcal_ros.applications.reconstruction.keyframes import Keyframe
+from semcal_ros.applications.reconstruction.feature_tracks import Keyframe
 from semcal_ros.applications.reconstruction.raster_motion import displacement_m, plane_at_centre
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.camera.scan_timing import ScanTiming

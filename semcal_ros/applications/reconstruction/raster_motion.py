@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.applications.reconstruction.keyframes import Keyframe, to_plane
+from semcal_ros.applications.reconstruction.feature_tracks import Keyframe, to_plane
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
 __all__ = ["displacement_m", "plane_at_centre"]

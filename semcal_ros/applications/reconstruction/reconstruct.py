@@ -13,8 +13,12 @@ from scipy.spatial.transform import Rotation
 from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
 from semcal_ros.applications.reconstruction.appearance import Appearance, appearance_of
 from semcal_ros.applications.reconstruction.factorization import factorize
-from semcal_ros.applications.reconstruction.keyframes import Keyframe
-from semcal_ros.applications.reconstruction.mls import local_surface, typical_spacing_m
+from semcal_ros.applications.reconstruction.feature_tracks import Keyframe
+from semcal_ros.applications.reconstruction.metric_upgrade import mirrored, upgrade_to_metric
+from semcal_ros.applications.reconstruction.moving_least_squares import (
+    local_surface,
+    typical_spacing_m,
+)
 from semcal_ros.applications.reconstruction.patches import (
     WINDOW,
     PatchSettings,
@@ -23,7 +27,6 @@ from semcal_ros.applications.reconstruction.patches import (
 )
 from semcal_ros.applications.reconstruction.raster_motion import plane_at_centre
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
-from semcal_ros.applications.reconstruction.upgrade import mirrored, upgrade_to_metric
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
@@ -93,7 +96,7 @@ class Structure:
     unplaced
         Keyframes that could not be linked to the others.
     relief_condition
-        Of the metric upgrade, see :class:`~semcal_ros.applications.reconstruction.upgrade.MetricUpgrade`.
+        Of the metric upgrade, see :class:`~semcal_ros.applications.reconstruction.metric_upgrade.MetricUpgrade`.
     relief_sigma
         1-sigma of a stretch of the depth of the reference view, relative: what is left of the bas-relief
         ambiguity.
@@ -142,7 +145,7 @@ def reconstruct(
     *,
     on_step: Callable[[str], object] = lambda _: None,
 ) -> Structure:
-    """Points and poses from the keyframes of a :class:`~semcal_ros.applications.reconstruction.keyframes.SequenceTracker`.
+    """Points and poses from the keyframes of a :class:`~semcal_ros.applications.reconstruction.feature_tracks.SequenceTracker`.
 
     Parameters
     ----------
