@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera

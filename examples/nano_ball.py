@@ -27,8 +27,8 @@ from tqdm import tqdm
 
 from semcal_ros import Calibration
 from semcal_ros.applications.reconstruction import Keyframe, SequenceTracker
-from semcal_ros.bridge.config import load_config
 from semcal_ros.cli import main as semcal
+from semcal_ros.config.config import load_config
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.report.ball_figures import small_png

@@ -15,9 +15,9 @@ import numpy as np
 from joblib import Parallel, cpu_count, delayed
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
 from semcal_ros.core.calibration.views import GridView, SquareAssignment, views_from_detections
 from semcal_ros.core.camera.calibration_model import checked_magnification

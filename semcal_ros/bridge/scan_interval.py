@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 
 __all__ = ["scan_interval_ns"]
 

@@ -11,8 +11,8 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [

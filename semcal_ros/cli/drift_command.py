@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
@@ -31,6 +30,7 @@ from semcal_ros.cli.drift_common import (
     timing_seen,
     with_frame_time,
 )
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.recordings import Recording, open_recording

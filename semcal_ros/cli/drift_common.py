@@ -11,8 +11,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftUpdate

@@ -19,7 +19,6 @@ from semcal_ros.applications.cantilever import (
     measure_series,
     repeatability,
 )
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
@@ -38,6 +37,7 @@ from semcal_ros.cli.drift_common import (
     start_time_s,
     with_frame_time,
 )
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording

@@ -10,7 +10,6 @@ import click
 
 from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.camera_info import fill_camera_info
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
@@ -27,6 +26,7 @@ from semcal_ros.cli.drift_common import (
     timing_seen,
     with_frame_time,
 )
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.rectification.rectifier import Rectifier

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.calibration_checks import (
     calibration_seen,

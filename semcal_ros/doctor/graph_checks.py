@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 

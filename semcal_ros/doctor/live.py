@@ -18,10 +18,10 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import (
@@ -32,7 +32,7 @@ from semcal_ros.doctor.observations import (
     Session,
     Status,
 )
-from semcal_ros.nodes.message_types import message_class
+from semcal_ros.middleware.message_types import message_class
 
 __all__ = ["observe"]
 

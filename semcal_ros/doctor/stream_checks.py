@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 
-from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import Arrival, Session
-from semcal_ros.nodes.transport import transport_advice
+from semcal_ros.middleware.transport_advice import transport_advice
 
 __all__ = [
     "MagnificationSeen",

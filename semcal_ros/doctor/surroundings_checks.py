@@ -9,7 +9,12 @@ from pathlib import Path
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Surroundings
-from semcal_ros.nodes.dds_profile import SharedMemory, local_only, profile_file, shared_memory
+from semcal_ros.middleware.fastdds_profile import (
+    SharedMemory,
+    local_only,
+    profile_file,
+    shared_memory,
+)
 
 __all__ = [
     "SURROUNDINGS_CHECKS",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from semcal_ros.bridge.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
+from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
 from semcal_ros.files.bags import BagTopic
 from semcal_ros.files.topics import find_topic, topic_matches
 

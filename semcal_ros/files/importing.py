@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semcal_ros.bridge.config import IMAGE_TYPE, MicroscopeConfig, load_config
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
+from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, load_config
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
 from semcal_ros.files.bag_writer import BagWriter, check_replaceable
 from semcal_ros.files.messages import blank_message

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.headers import optional_stamp_ns
-from semcal_ros.bridge.history import ZeroOrderHold
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.bags import BagReader, RawMessage
 

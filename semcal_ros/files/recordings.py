@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.bridge.fields import require_fields
 from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
 from semcal_ros.files.bag_errors import reading

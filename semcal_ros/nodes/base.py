@@ -15,13 +15,13 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from semcal_ros.bridge.config import load_config
 from semcal_ros.bridge.diagnostics import (
     DiagnosticLevel,
     DiagnosticSummary,
     StreamStatistics,
     fill_diagnostic_status,
 )
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.qos import latched, overridable, stream_output
 from semcal_ros.nodes.settings import CONFIG, Setting, Settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from semcal_ros.bridge.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.calibration_input import CalibrationInput

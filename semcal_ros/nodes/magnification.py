@@ -6,14 +6,14 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from semcal_ros.bridge.config import MicroscopeConfig
 from semcal_ros.bridge.headers import optional_stamp_ns
-from semcal_ros.bridge.history import ZeroOrderHold
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.scan_interval import scan_interval_ns
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.message_types import message_class
 from semcal_ros.nodes.qos import value_input
 from semcal_ros.nodes.subscription import MessageInfo, published_ns
 

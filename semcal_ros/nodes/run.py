@@ -24,7 +24,7 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 
 from semcal_ros.core.errors import ConfigError, SemcalError
-from semcal_ros.nodes.security import check_security
+from semcal_ros.middleware.security import check_security
 
 __all__ = ["run_node"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 from collections import OrderedDict
 
-from semcal_ros.bridge.config import ImageConfig
+from semcal_ros.config.config import ImageConfig
+from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.message_types import message_class
 from semcal_ros.nodes.qos import stream_output
 from semcal_ros.nodes.subscription import MessageInfo, published_ns
 

@@ -14,18 +14,18 @@ import rclpy
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.config import IMAGE_TYPE
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
+from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.middleware.message_types import message_class
+from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.magnification import MagnificationInput
-from semcal_ros.nodes.message_types import message_class
 from semcal_ros.nodes.qos import image_input
 from semcal_ros.nodes.sending_times import SendingTimes
 from semcal_ros.nodes.settings import Setting
 from semcal_ros.nodes.subscription import MessageInfo, published_ns
-from semcal_ros.nodes.transport import transport_advice
 
 __all__ = ["Frame", "FrameInput", "StreamNode", "nominal_camera"]
 

@@ -11,10 +11,10 @@ from geometry_msgs.msg import Twist
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64, Header
 
-from semcal_ros.bridge.config import IMAGE_TYPE
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
+from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.qos import stream_output

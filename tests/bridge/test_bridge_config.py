@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from semcal_ros.bridge.config import (
+from semcal_ros.config.config import (
     COMPRESSED_IMAGE_TYPE,
     IMAGE_TYPE,
     IMAGE_TYPES,
@@ -18,7 +18,7 @@ from semcal_ros.bridge.config import (
     load_config,
     parse_config,
 )
-from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
+from semcal_ros.config.schema import CONFIG_SCHEMA
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.history import ZeroOrderHold
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.core.errors import InvalidValueError
 
 STAMPS = st.lists(st.integers(0, 60), max_size=30)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.bridge.magnification import magnification_from_message, read_magnification
+from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.messages import blank_message
 

@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from semcal_ros.bridge.config import MicroscopeConfig, parse_config
-from semcal_ros.bridge.history import ZeroOrderHold
 from semcal_ros.bridge.pace import TrackingPace
 from semcal_ros.bridge.scan_interval import scan_interval_ns
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.config.config import MicroscopeConfig, parse_config
 from semcal_ros.core.errors import InvalidValueError
 
 MS = 1_000_000

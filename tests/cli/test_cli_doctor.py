@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from node_scenes import make_calibration
 
-from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.doctor import surroundings_checks as checks
 from semcal_ros.doctor.calibration_checks import calibration_seen, check_calibration
 from semcal_ros.doctor.examination import judge
@@ -48,7 +48,7 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     magnification_seen,
 )
-from semcal_ros.nodes.dds_profile import PROFILE_VARIABLES
+from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
 
 ROOT = Path(__file__).resolve().parents[2]
 OK, NOTE, PROBLEM = Level.OK, Level.NOTE, Level.PROBLEM

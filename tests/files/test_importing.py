@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.errors import BagError, TiffError
 from semcal_ros.files.bags import open_bag
 from semcal_ros.files.importing import SIDECAR, import_folder

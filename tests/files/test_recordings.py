@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.config import ImageConfig, MagnificationConfig, MicroscopeConfig
+from semcal_ros.config.config import ImageConfig, MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
 from semcal_ros.files.bags import BagTopic, BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording

@@ -11,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import fill_compressed
-from semcal_ros.bridge.config import (
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import ENCODINGS, fill_image
+from semcal_ros.cli.main import main
+from semcal_ros.config.config import (
     COMPRESSED_IMAGE_TYPE,
     IMAGE_TYPE,
     ImageConfig,
     MicroscopeConfig,
 )
-from semcal_ros.bridge.headers import fill_header
-from semcal_ros.bridge.images import ENCODINGS, fill_image
-from semcal_ros.cli.main import main
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags import BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording

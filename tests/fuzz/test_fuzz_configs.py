@@ -16,9 +16,9 @@ from fuzz_support import attempt, check_refusal, fuzz, run_semcal
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.config import MicroscopeConfig, load_config, parse_config
-from semcal_ros.bridge.config_files import config_directories, find_config_file
 from semcal_ros.bridge.magnification import read_magnification
+from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
+from semcal_ros.config.files import config_directories, find_config_file
 from semcal_ros.core.errors import SemcalError
 
 _SHIPPED = [

@@ -20,7 +20,6 @@ from semcal_ros.bridge.calibration_text import (
     fill_calibration_text,
 )
 from semcal_ros.bridge.camera_info import fill_camera_info
-from semcal_ros.bridge.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.bridge.images import (
@@ -32,6 +31,7 @@ from semcal_ros.bridge.images import (
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
 from semcal_ros.bridge.projection import fill_projection, projection_from_message
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message

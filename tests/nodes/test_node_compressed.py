@@ -18,9 +18,9 @@ from ros_process import PATIENT, RELIABLE, TIMEOUT_S, NodeProcess, Peer, running
 from sensor_msgs.msg import CompressedImage, Image
 
 from semcal_ros.bridge.compressed import fill_compressed, image_from_compressed
-from semcal_ros.bridge.config import COMPRESSED_IMAGE_TYPE, load_config
 from semcal_ros.bridge.diagnostics import StreamStatistics
 from semcal_ros.bridge.images import image_from_message
+from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, load_config
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.compressed import CompressedOutput, compressed_settings
 

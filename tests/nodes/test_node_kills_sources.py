@@ -34,8 +34,8 @@ from stream_bench import (
     restartable,
 )
 
-from semcal_ros.bridge.config import load_config
 from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.config.config import load_config
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 
 # -- the sources -------------------------------------------------------------------------------------

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.nodes.dds_profile import (
+from semcal_ros.middleware.fastdds_profile import (
     DEFAULT_SEGMENT_BYTES,
     PROFILE_VARIABLES,
     profile_file,
     shared_memory,
 )
-from semcal_ros.nodes.transport import MALLOC_VARIABLES, transport_advice
+from semcal_ros.middleware.transport_advice import MALLOC_VARIABLES, transport_advice
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "dds" / "fastdds_large_images.xml"

@@ -21,8 +21,8 @@ with warnings.catch_warnings():
 
 from node_scenes import make_calibration
 
-from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
 from semcal_ros.bridge.parameters import PARAMETER_KINDS
+from semcal_ros.config.schema import CONFIG_SCHEMA
 from semcal_ros.nodes import base
 from semcal_ros.nodes.settings import Setting
 

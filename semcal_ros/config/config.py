@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from semcal_ros.bridge.config_files import config_names, find_config_file, read_config_text
-from semcal_ros.bridge.config_parse import parse_mapping
-from semcal_ros.bridge.config_schema import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, IMAGE_TYPES
+from semcal_ros.config.files import config_names, find_config_file, read_config_text
+from semcal_ros.config.parse import parse_mapping
+from semcal_ros.config.schema import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, IMAGE_TYPES
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 

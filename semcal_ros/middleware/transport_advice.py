@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.nodes.dds_profile import DEFAULT_SEGMENT_BYTES, shared_memory
+from semcal_ros.middleware.fastdds_profile import DEFAULT_SEGMENT_BYTES, shared_memory
 
 __all__ = ["MALLOC_VARIABLES", "transport_advice"]
 

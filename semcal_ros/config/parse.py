@@ -9,7 +9,7 @@ from typing import Any, cast
 import jsonschema
 import yaml
 
-from semcal_ros.bridge.config_schema import CONFIG_SCHEMA
+from semcal_ros.config.schema import CONFIG_SCHEMA
 from semcal_ros.core.errors import ConfigError
 
 __all__ = ["parse_mapping"]
