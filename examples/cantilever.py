@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
     Drift,
     RecordingPlan,

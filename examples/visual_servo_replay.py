@@ -21,7 +21,7 @@ from visual_servo_loop import LATENCY_S, Run
 
 from semcal_ros.applications.servoing import PlanePose
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.files.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import VirtualMicroscope
 
 SILENCE_S = 5.0

@@ -16,13 +16,13 @@ from joblib import Parallel, cpu_count, delayed
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
-from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
 from semcal_ros.core.calibration.views import GridView, SquareAssignment, views_from_detections
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import CalibrationError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Recording, open_recording
 
 __all__ = [

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcal_ros.files.simulated import SIMULATED_START_NS
+from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 
 # They make their recordings and calibrations themselves.
 pytestmark = pytest.mark.timeout(400)

@@ -11,9 +11,9 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.calibration_file import Calibration
 
 __all__ = [
     "config_option",

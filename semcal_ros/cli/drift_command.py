@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -33,6 +32,7 @@ from semcal_ros.cli.drift_common import (
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
 

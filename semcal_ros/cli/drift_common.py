@@ -11,7 +11,6 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -21,6 +20,7 @@ from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.outlook import DriftForecast
 from semcal_ros.core.drift.path import DriftPath, path_of_updates
 from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Frame
 
 __all__ = [

@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -19,6 +18,7 @@ from semcal_ros.cli.common import (
     progress,
 )
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.pipeline import collect_views, find_views, named_frames
 

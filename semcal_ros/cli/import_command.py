@@ -33,7 +33,7 @@ def command(
     Example:
       semcal import tiffs/ recordings/from_tiff
     """
-    from semcal_ros.files.importing import import_folder
+    from semcal_ros.files.tiff.to_bag import import_folder
 
     with progress(None, "importing") as bar:
         done = import_folder(

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from semcal_ros.cli.common import overwrite_option, progress
-from semcal_ros.files.simulated import write_simulated
+from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
     DRIFTS,

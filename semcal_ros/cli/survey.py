@@ -10,13 +10,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import progress
 from semcal_ros.cli.drift_common import Follower, camera_of, start_time_s, timing_seen
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import BagError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Frame, Recording
 
 __all__ = ["Job", "Survey", "surveyed"]

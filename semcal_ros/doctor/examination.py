@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.calibration_checks import (
@@ -35,6 +34,7 @@ from semcal_ros.doctor.stream_checks import (
 )
 from semcal_ros.doctor.surroundings import look_around
 from semcal_ros.doctor.surroundings_checks import SURROUNDINGS_CHECKS, check_domain, check_rclpy
+from semcal_ros.files.calibration_file import Calibration
 
 __all__ = ["examine", "judge"]
 

@@ -17,14 +17,14 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
-from semcal_ros.files.bag_errors import reading
-from semcal_ros.files.bags import BagTopic, RawMessage, is_bag, open_bag
-from semcal_ros.files.image_topics import find_image_topic
-from semcal_ros.files.magnifications import MagnificationTrack
+from semcal_ros.files.bags.errors import reading
+from semcal_ros.files.bags.image_topics import find_image_topic
+from semcal_ros.files.bags.magnifications import MagnificationTrack
+from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
+from semcal_ros.files.bags.topics import find_topic
 from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
 from semcal_ros.files.tiff import is_tiff
-from semcal_ros.files.tiff_folder import TiffFolder, scan_tiff_folder
-from semcal_ros.files.topics import find_topic
+from semcal_ros.files.tiff.folder import TiffFolder, scan_tiff_folder
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool
 
 from semcal_ros.bridge.headers import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, SemcalError
-from semcal_ros.files.bags import BagTopic, RawMessage, open_bag
+from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.base import SemNode
 from semcal_ros.nodes.pacing import Pacer

@@ -16,10 +16,10 @@ from semcal_ros.bridge.calibration_text import (
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.confined import read_plain_text
 from semcal_ros.nodes.background import NewestWork
 from semcal_ros.nodes.base import SemNode

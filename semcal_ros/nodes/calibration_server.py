@@ -16,10 +16,10 @@ from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.bridge.overlay import corner_overlay
-from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.nodes.calibration_input import calibration_digest
 from semcal_ros.nodes.calibration_process import CalibrationProcess
 from semcal_ros.nodes.calibration_worker import CalibrationJob, Stage, without_images

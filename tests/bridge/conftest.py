@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.files.messages import blank_message
+from semcal_ros.files.bags.messages import blank_message
 
 
 def _rclpy_message(type_name: str) -> Any:

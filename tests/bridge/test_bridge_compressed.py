@@ -26,7 +26,7 @@ from semcal_ros.bridge.fields import assign_bytes
 from semcal_ros.bridge.images import ENCODINGS, fill_image
 from semcal_ros.bridge.picture_headers import MAX_PIXELS
 from semcal_ros.core.errors import InvalidValueError, MessageError
-from semcal_ros.files.messages import blank_message
+from semcal_ros.files.bags.messages import blank_message
 
 New = Callable[[str], Any]
 COMPRESSED = "sensor_msgs/msg/CompressedImage"

@@ -22,7 +22,7 @@ from semcal_ros.bridge.images import (
     without_databar,
 )
 from semcal_ros.core.errors import InvalidValueError, MessageError
-from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message
+from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
 
 New = Callable[[str], Any]
 IMAGE = "sensor_msgs/msg/Image"

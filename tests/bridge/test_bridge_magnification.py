@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from semcal_ros.bridge.magnification import magnification_from_message, read_magnification
 from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError, MessageError
-from semcal_ros.files.messages import blank_message
+from semcal_ros.files.bags.messages import blank_message
 
 New = Callable[[str], Any]
 FLOAT64 = "std_msgs/msg/Float64"

@@ -29,7 +29,7 @@ from semcal_ros.bridge.headers import (
 from semcal_ros.bridge.projection import fill_projection, projection_from_message
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError, MessageError
-from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message
+from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
 
 New = Callable[[str], Any]
 INFO = "sensor_msgs/msg/CameraInfo"

@@ -14,7 +14,7 @@ import yaml
 from semcal_runs import refused, run
 
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.files.bags import open_bag
+from semcal_ros.files.bags.reader import open_bag
 
 COMMANDS = ["at", "calibrate", "drift", "evaluate", "import", "info", "play", "rectify", "simulate"]
 

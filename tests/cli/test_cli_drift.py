@@ -21,7 +21,7 @@ from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.path import DriftPath
-from semcal_ros.files.bags import BagWriter, blank_message, open_bag
+from semcal_ros.files.bags.reader import BagWriter, blank_message, open_bag
 from semcal_ros.synthetic import Drift, drift_plan, preset
 
 FRAMES, SIZE, G = 9, 160, 20000.0

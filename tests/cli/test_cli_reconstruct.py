@@ -11,8 +11,8 @@ from semcal_runs import run
 
 from semcal_ros.applications.reconstruction import SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.files.meshes import mesh_bytes, save_cloud, save_mesh
-from semcal_ros.files.simulated import write_simulated
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import drift_preset

@@ -12,7 +12,7 @@ from semcal_ros import Calibration
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.cli import main
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.files.bags import open_bag
+from semcal_ros.files.bags.reader import open_bag
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from grid_views import grid_views
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.synthetic import preset
 
 CALIBRATED = [100.0, 300.0, 700.0, 1500.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0]

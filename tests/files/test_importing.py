@@ -13,9 +13,9 @@ import tifffile
 
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.errors import BagError, TiffError
-from semcal_ros.files.bags import open_bag
-from semcal_ros.files.importing import SIDECAR, import_folder
+from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording
+from semcal_ros.files.tiff.to_bag import SIDECAR, import_folder
 
 
 def write_tescan(

@@ -13,9 +13,9 @@ import pytest
 
 from semcal_ros.config.config import ImageConfig, MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
-from semcal_ros.files.bags import BagTopic, BagWriter, blank_message
+from semcal_ros.files.bags.reader import BagTopic, BagWriter, blank_message
+from semcal_ros.files.bags.topics import find_topic, topic_matches
 from semcal_ros.files.recordings import Frame, open_recording
-from semcal_ros.files.topics import find_topic, topic_matches
 
 FLOAT = "std_msgs/msg/Float64"
 IMAGE = "sensor_msgs/msg/Image"

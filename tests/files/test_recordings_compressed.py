@@ -21,7 +21,7 @@ from semcal_ros.config.config import (
     MicroscopeConfig,
 )
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bags import BagWriter, blank_message
+from semcal_ros.files.bags.reader import BagWriter, blank_message
 from semcal_ros.files.recordings import Frame, open_recording
 
 T0 = 1_700_000_000 * 10**9

@@ -33,8 +33,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.core.errors import BagError, SemcalError
-from semcal_ros.files.bags import BagReader, RawMessage, blank_message, open_bag
-from semcal_ros.files.messages import jazzy_types, serialize_message
+from semcal_ros.files.bags.messages import jazzy_types, serialize_message
+from semcal_ros.files.bags.reader import BagReader, RawMessage, blank_message, open_bag
 from semcal_ros.files.recordings import open_recording
 
 IMAGE, FLOAT, STRING = "sensor_msgs/msg/Image", "std_msgs/msg/Float64", "std_msgs/msg/String"

@@ -34,7 +34,7 @@ from semcal_ros.bridge.projection import fill_projection, projection_from_messag
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.files.messages import blank_message, jazzy_types, serialize_message
+from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
 
 _UINT32 = st.integers(0, 2**32 - 1)
 _SMALL = st.integers(0, 12)

@@ -17,10 +17,10 @@ from fuzz_support import attempt, fuzz, run_semcal
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from semcal_ros.files.bags import open_bag
-from semcal_ros.files.importing import METADATA_TOPIC, import_folder
+from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.plain_images import read_plain_image
 from semcal_ros.files.tiff import SemImage, read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.to_bag import METADATA_TOPIC, import_folder
 from semcal_ros.files.tiff.values import PIXEL_SIZE_RANGE_M, plain_number, quantity
 
 _WIDTH, _HEIGHT = 12, 10

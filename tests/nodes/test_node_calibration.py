@@ -21,7 +21,7 @@ from calibration_session import (
 from node_scenes import make_calibration
 from ros_process import running
 
-from semcal_ros.calibration import Calibration
+from semcal_ros.files.calibration_file import Calibration
 
 PARAMETERS = "/sem/parameter_server"
 

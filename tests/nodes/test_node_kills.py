@@ -33,7 +33,7 @@ from stream_bench import (
     shifted_texture,
 )
 
-from semcal_ros.calibration import Calibration
+from semcal_ros.files.calibration_file import Calibration
 
 SERVER = "/sem/parameter_server"
 

@@ -22,8 +22,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.files.calibration_file import Calibration
 
 MAGNIFICATIONS = [float(g) for g in np.geomspace(600.0, 6000.0, 15).round(1)]
 CALIBRATION = make_calibration()

@@ -27,9 +27,9 @@ from ros_process import LATCHED, PATIENT, RELIABLE, NodeProcess, Peer, running
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
-from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.nodes.calibration_input import calibration_digest
 
 MAGNIFICATION = 2000.0

@@ -24,9 +24,9 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from semcal_ros.core.errors import BagError, CalibrationFileError
-from semcal_ros.files.bag_errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
-from semcal_ros.files.bag_writer import BagWriter
-from semcal_ros.files.messages import blank_message, jazzy_types
+from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
+from semcal_ros.files.bags.messages import blank_message, jazzy_types
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.plain_yaml import check_plain_yaml
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
-from semcal_ros.files.bags import BagTopic
-from semcal_ros.files.topics import find_topic, topic_matches
+from semcal_ros.files.bags.reader import BagTopic
+from semcal_ros.files.bags.topics import find_topic, topic_matches
 
 __all__ = ["find_image_topic"]
 
@@ -26,7 +26,7 @@ def find_image_topic(
     Raises
     ------
     BagError
-        As :func:`~semcal_ros.files.topics.find_topic`.
+        As :func:`~semcal_ros.files.bags.topics.find_topic`.
     """
     wanted, type_name = _source(image, [topic for topic in topics if topic.count])
     found, note = find_topic(path, topics, what="image", wanted=wanted, type_name=type_name)

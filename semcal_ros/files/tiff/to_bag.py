@@ -13,10 +13,10 @@ from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, load_config
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
-from semcal_ros.files.bag_writer import BagWriter, check_replaceable
-from semcal_ros.files.messages import blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter, check_replaceable
 from semcal_ros.files.tiff import SemImage
-from semcal_ros.files.tiff_folder import (
+from semcal_ros.files.tiff.folder import (
     MIN_SPACING_NS,
     Skipped,
     TiffEntry,

@@ -23,8 +23,8 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bag_errors import LIBRARY_ERRORS, one_line
-from semcal_ros.files.messages import jazzy_types, message_type_name, serialize_message
+from semcal_ros.files.bags.errors import LIBRARY_ERRORS, one_line
+from semcal_ros.files.bags.messages import jazzy_types, message_type_name, serialize_message
 
 if TYPE_CHECKING:
     from typing_extensions import Self

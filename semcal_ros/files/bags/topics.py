@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bags import BagTopic
+from semcal_ros.files.bags.reader import BagTopic
 
 __all__ = ["find_topic", "topic_matches"]
 

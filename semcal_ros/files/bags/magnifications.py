@@ -9,7 +9,7 @@ from semcal_ros.bridge.magnification import MagnificationReading, read_magnifica
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.files.bags import BagReader, RawMessage
+from semcal_ros.files.bags.reader import BagReader, RawMessage
 
 __all__ = ["MagnificationTrack"]
 
