@@ -18,7 +18,6 @@ from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.pipeline import CollectedViews, collect_views, find_views, named_frames
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
     RecordingPlan,
@@ -27,6 +26,7 @@ from semcal_ros.synthetic import (
     drift_preset,
     preset,
 )
+from semcal_ros.workflows.calibrate import CollectedViews, collect_views, find_views, named_frames
 
 Array = NDArray[np.float64]
 PixelSize = tuple[float, float]

@@ -32,7 +32,7 @@ from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.ball_figures import small_png
-from semcal_ros.report.style import INK, OURS, SECOND, new_figure, tidy
+from semcal_ros.report.html.style import INK, OURS, SECOND, new_figure, tidy
 from semcal_ros.synthetic.ball import BallPlan, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
 

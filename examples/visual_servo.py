@@ -29,7 +29,6 @@ from visual_servo_loop import Case, Run, Task, servo_run
 from semcal_ros import Calibration
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.pipeline import calibrate_found, find_views
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
@@ -39,6 +38,7 @@ from semcal_ros.synthetic import (
     calibration_plan,
     preset,
 )
+from semcal_ros.workflows.calibrate import calibrate_found, find_views
 
 CONTINUOUS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0, 7500.0, 10000.0)
 DISCRETE = (500.0, 1000.0, 2000.0, 5000.0)

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from semcal_ros.core.camera.scan_camera import ScanCamera
     from semcal_ros.core.errors import SemcalError
     from semcal_ros.files.calibration_file import Calibration
-    from semcal_ros.pipeline import calibrate
+    from semcal_ros.workflows.calibrate import calibrate
 
 __all__ = ["Calibration", "ScanCamera", "SemcalError", "__version__", "calibrate"]
 
@@ -19,7 +19,7 @@ _HOMES = {
     "Calibration": "semcal_ros.files.calibration_file",
     "ScanCamera": "semcal_ros.core.camera.scan_camera",
     "SemcalError": "semcal_ros.core.errors",
-    "calibrate": "semcal_ros.pipeline",
+    "calibrate": "semcal_ros.workflows.calibrate",
 }
 
 

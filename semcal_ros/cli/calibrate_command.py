@@ -16,7 +16,12 @@ from semcal_ros.cli.common import (
 )
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.pipeline import RecordingCalibration, calibrate_found, find_views, named_frames
+from semcal_ros.workflows.calibrate import (
+    RecordingCalibration,
+    calibrate_found,
+    find_views,
+    named_frames,
+)
 
 __all__ = ["command"]
 

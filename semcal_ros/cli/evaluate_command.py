@@ -20,7 +20,7 @@ from semcal_ros.cli.common import (
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.pipeline import collect_views, find_views, named_frames
+from semcal_ros.workflows.calibrate import collect_views, find_views, named_frames
 
 __all__ = ["command"]
 

@@ -28,7 +28,6 @@ from semcal_ros.cli.drift_common import (
     frame_time_option,
     with_frame_time,
 )
-from semcal_ros.cli.survey import Job, Survey, surveyed
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
@@ -36,6 +35,7 @@ from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Frame, Recording, open_recording
 from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
+from semcal_ros.workflows.select_frames import Job, Survey, surveyed
 
 __all__ = ["command"]
 

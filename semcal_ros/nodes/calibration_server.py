@@ -27,7 +27,7 @@ from semcal_ros.nodes.run import run_node
 from semcal_ros.nodes.services import trigger_service
 from semcal_ros.nodes.settings import Setting
 from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode
-from semcal_ros.pipeline import FoundView
+from semcal_ros.workflows.calibrate import FoundView
 
 __all__ = ["CalibrationServer", "main"]
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from semcal_ros.core.errors import CalibrationError, SemcalError
-from semcal_ros.pipeline import FoundView, calibrate_found
+from semcal_ros.workflows.calibrate import FoundView, calibrate_found
 
 __all__ = ["CalibrationJob", "JobResult", "Stage", "serve", "without_images"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.applications.reconstruction import Ball, Structure
-from semcal_ros.report.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
+from semcal_ros.report.html.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
 
 __all__ = ["ball_figure", "ball_picture", "small_png"]
 

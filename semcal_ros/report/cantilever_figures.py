@@ -16,7 +16,7 @@ from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.applications.cantilever import Repeatability, Series
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.report.style import (
+from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     MUTED,

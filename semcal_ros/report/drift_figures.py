@@ -20,7 +20,7 @@ from semcal_ros.core.drift.estimates import kind_of
 from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.report.style import (
+from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     MUTED,

@@ -29,17 +29,21 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report import calibration_report
-from semcal_ros.report.examples import best_per_magnification, overlay_of, rejected_pictures
-from semcal_ros.report.geometry import rms_without_distortion
-from semcal_ros.report.numbers import (
+from semcal_ros.report.calibration.examples import (
+    best_per_magnification,
+    overlay_of,
+    rejected_pictures,
+)
+from semcal_ros.report.calibration.geometry import rms_without_distortion
+from semcal_ros.report.calibration.numbers import (
     fitted_inner_px,
     format_px,
     held_out_px,
     magnification_rows,
     view_rows,
 )
-from semcal_ros.report.page import write_page
-from semcal_ros.report.paper import paper_rows
+from semcal_ros.report.calibration.paper import paper_rows
+from semcal_ros.report.html.page import write_page
 
 SECTIONS = [
     "warnings",

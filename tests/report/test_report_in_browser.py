@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.report import DemoRow, correction_report
-from semcal_ros.report.page import render
+from semcal_ros.report.html.page import render
 
 BROWSER = next(
     (

@@ -15,12 +15,12 @@ from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.cells import empty_share, filled_shares
-from semcal_ros.report.coverage_figures import tilts_deg
-from semcal_ros.report.error_figures import rms_picture
-from semcal_ros.report.field_figures import residual_field_pictures
-from semcal_ros.report.findings import findings, pattern_px
-from semcal_ros.report.geometry import (
+from semcal_ros.report.calibration.cells import empty_share, filled_shares
+from semcal_ros.report.calibration.coverage_figures import tilts_deg
+from semcal_ros.report.calibration.error_figures import rms_picture
+from semcal_ros.report.calibration.field_figures import residual_field_pictures
+from semcal_ros.report.calibration.findings import findings, pattern_px
+from semcal_ros.report.calibration.geometry import (
     aligned_sigma_px,
     displacement_field,
     field_lattice,
@@ -28,7 +28,7 @@ from semcal_ros.report.geometry import (
     shape_sigma_px,
     without_residual_field,
 )
-from semcal_ros.report.numbers import (
+from semcal_ros.report.calibration.numbers import (
     fitted_inner_px,
     format_length,
     format_magnification,
@@ -38,9 +38,9 @@ from semcal_ros.report.numbers import (
     plain,
     view_rows,
 )
-from semcal_ros.report.paper import paper_rows, typical_px
-from semcal_ros.report.parameter_figures import focal_length_px, parameter_groups
-from semcal_ros.report.prediction_figures import prediction_pictures
+from semcal_ros.report.calibration.paper import paper_rows, typical_px
+from semcal_ros.report.calibration.parameter_figures import focal_length_px, parameter_groups
+from semcal_ros.report.calibration.prediction_figures import prediction_pictures
 
 
 def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResult) -> None:

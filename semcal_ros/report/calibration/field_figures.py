@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.cells import all_corners, cells_of
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.geometry import displacement_field, without_residual_field
-from semcal_ros.report.numbers import format_magnification
-from semcal_ros.report.style import (
+from semcal_ros.report.calibration.cells import all_corners, cells_of
+from semcal_ros.report.calibration.geometry import displacement_field, without_residual_field
+from semcal_ros.report.calibration.numbers import format_magnification
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import (
     OURS,
     SECOND,
     field_axes,

@@ -11,9 +11,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.report.cells import all_corners, cells_of, filled_shares
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.style import (
+from semcal_ros.report.calibration.cells import all_corners, cells_of, filled_shares
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     MUTED,

@@ -14,29 +14,29 @@ from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.coverage_figures import (
+from semcal_ros.report.calibration.coverage_figures import (
     coverage_picture,
     filled_picture,
     pose_picture,
     tilt_picture,
 )
-from semcal_ros.report.error_figures import residual_histogram, rms_picture
-from semcal_ros.report.examples import (
+from semcal_ros.report.calibration.error_figures import residual_histogram, rms_picture
+from semcal_ros.report.calibration.examples import (
     ExampleView,
     UnusedView,
     best_per_magnification,
     overlay_of,
     rejected_pictures,
 )
-from semcal_ros.report.field_figures import (
+from semcal_ros.report.calibration.field_figures import (
     distortion_picture,
     mean_residual_picture,
     residual_field_pictures,
     residual_picture,
 )
-from semcal_ros.report.findings import findings
-from semcal_ros.report.geometry import rms_without_distortion
-from semcal_ros.report.numbers import (
+from semcal_ros.report.calibration.findings import findings
+from semcal_ros.report.calibration.geometry import rms_without_distortion
+from semcal_ros.report.calibration.numbers import (
     PAPER_RMS_PX,
     facts,
     fitted_inner_px,
@@ -47,12 +47,12 @@ from semcal_ros.report.numbers import (
     plain,
     view_rows,
 )
-from semcal_ros.report.page import render, write_page
-from semcal_ros.report.paper import paper_rows
-from semcal_ros.report.parameter_figures import parameter_groups
-from semcal_ros.report.pictures import captioned_pictures
-from semcal_ros.report.pixel_size_figures import pixel_size_pictures
-from semcal_ros.report.prediction_figures import prediction_pictures
+from semcal_ros.report.calibration.paper import paper_rows
+from semcal_ros.report.calibration.parameter_figures import parameter_groups
+from semcal_ros.report.calibration.pixel_size_figures import pixel_size_pictures
+from semcal_ros.report.calibration.prediction_figures import prediction_pictures
+from semcal_ros.report.html.page import render, write_page
+from semcal_ros.report.html.pictures import captioned_pictures
 
 __all__ = ["calibration_report"]
 

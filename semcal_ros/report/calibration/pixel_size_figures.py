@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.curves import (
+from semcal_ros.report.calibration.curves import (
     curve,
     marks_of_magnifications,
     sampled_cameras,
     wide_enough,
 )
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.numbers import format_length
-from semcal_ros.report.style import (
+from semcal_ros.report.calibration.numbers import format_length
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import (
     OURS,
     SECOND,
     legend,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.report.numbers import PAPER_RMS_PX, format_px, held_out_px
+from semcal_ros.report.calibration.numbers import PAPER_RMS_PX, format_px, held_out_px
 
 __all__ = ["PaperRow", "paper_rows", "typical_px"]
 

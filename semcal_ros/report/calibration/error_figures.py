@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.numbers import PAPER_RMS_PX
-from semcal_ros.report.style import (
+from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     MUTED,

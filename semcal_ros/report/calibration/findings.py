@@ -10,12 +10,12 @@ import numpy as np
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.cells import all_corners, cells_of, empty_share, filled_shares
-from semcal_ros.report.coverage_figures import tilts_deg
-from semcal_ros.report.error_figures import normalised_residuals
-from semcal_ros.report.examples import UnusedView
-from semcal_ros.report.geometry import field_lattice, shape_sigma_px
-from semcal_ros.report.numbers import format_magnification, plain, view_rows
+from semcal_ros.report.calibration.cells import all_corners, cells_of, empty_share, filled_shares
+from semcal_ros.report.calibration.coverage_figures import tilts_deg
+from semcal_ros.report.calibration.error_figures import normalised_residuals
+from semcal_ros.report.calibration.examples import UnusedView
+from semcal_ros.report.calibration.geometry import field_lattice, shape_sigma_px
+from semcal_ros.report.calibration.numbers import format_magnification, plain, view_rows
 
 __all__ = ["findings", "pattern_px"]
 

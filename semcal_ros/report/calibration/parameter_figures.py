@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.curves import (
+from semcal_ros.report.calibration.curves import (
     curve,
     marks_of_magnifications,
     sampled_cameras,
     wide_enough,
 )
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
 
 __all__ = ["ParameterGroup", "focal_length_px", "parameter_groups"]
 

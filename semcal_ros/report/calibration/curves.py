@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.style import SECOND
+from semcal_ros.report.html.style import SECOND
 
 __all__ = ["cameras_around", "curve", "marks_of_magnifications", "sampled_cameras", "wide_enough"]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from semcal_ros.report.encode import Picture, as_bytes_image, data_uri, jpeg_of, shrunk
-from semcal_ros.report.numbers import plain
+from semcal_ros.report.calibration.numbers import plain
+from semcal_ros.report.html.encode import Picture, as_bytes_image, data_uri, jpeg_of, shrunk
 
 __all__ = ["captioned_pictures"]
 

@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.curves import cameras_around, marks_of_magnifications, sampled_cameras
-from semcal_ros.report.encode import Picture, picture_of_figure
-from semcal_ros.report.geometry import aligned_sigma_px, field_lattice, shape_sigma_px
-from semcal_ros.report.numbers import format_magnification
-from semcal_ros.report.style import (
+from semcal_ros.report.calibration.curves import (
+    cameras_around,
+    marks_of_magnifications,
+    sampled_cameras,
+)
+from semcal_ros.report.calibration.geometry import aligned_sigma_px, field_lattice, shape_sigma_px
+from semcal_ros.report.calibration.numbers import format_magnification
+from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     LIGHT_MAP,

@@ -1,0 +1,1 @@
+"""HTML pages that hold their own pictures and styles."""
