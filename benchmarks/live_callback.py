@@ -77,7 +77,7 @@ class KnownDrift:
     """In the place of the tracker, whose time is measured by itself."""
 
     def __init__(self, tracker: Any, update: Any, camera: Any) -> None:
-        from semcal_ros.nodes.drift_tracking import FrameDrift
+        from semcal_ros.nodes.frames.live_drift import FrameDrift
 
         covariance = np.eye(4) * 1e-18
         self._tracker = tracker

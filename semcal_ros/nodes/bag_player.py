@@ -16,12 +16,12 @@ from semcal_ros.bridge.headers import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, SemcalError
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.qos import overridable, stream_output, value_input
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.services import service_queue
 from semcal_ros.nodes.pacing import Pacer
-from semcal_ros.nodes.qos import overridable, stream_output, value_input
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.services import service_queue
-from semcal_ros.nodes.settings import Setting
 
 __all__ = ["BagPlayer", "main"]
 

@@ -15,18 +15,18 @@ from std_msgs.msg import String
 from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
-from semcal_ros.bridge.overlay import corner_overlay
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.nodes.calibration_input import calibration_digest
-from semcal_ros.nodes.calibration_process import CalibrationProcess
-from semcal_ros.nodes.calibration_worker import CalibrationJob, Stage, without_images
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.services import trigger_service
-from semcal_ros.nodes.settings import Setting
-from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.services import trigger_service
+from semcal_ros.nodes.frames.calibration_input import calibration_digest
+from semcal_ros.nodes.frames.overlay import corner_overlay
+from semcal_ros.nodes.frames.stream import Frame, FrameInput, StreamNode
+from semcal_ros.nodes.workers.calibration_process import CalibrationProcess
+from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, Stage, without_images
 from semcal_ros.workflows.calibrate import FoundView
 
 __all__ = ["CalibrationServer", "main"]

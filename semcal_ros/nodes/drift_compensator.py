@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.nodes.compressed import compressed_settings
-from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
-from semcal_ros.nodes.outputs import DriftOutput, ImageOutput
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.settings import INTERPOLATION
-from semcal_ros.nodes.stream import Frame, FrameInput, StreamNode, nominal_camera
+from semcal_ros.nodes.common.parameters import INTERPOLATION
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.frames.compressed import compressed_settings
+from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.frames.outputs import DriftOutput, ImageOutput
+from semcal_ros.nodes.frames.stream import Frame, FrameInput, StreamNode, nominal_camera
 
 __all__ = ["DriftCompensator", "main"]
 

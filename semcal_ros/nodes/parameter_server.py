@@ -17,12 +17,12 @@ from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.bridge.parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.calibration_input import CalibrationInput
-from semcal_ros.nodes.magnification import MagnificationInput
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.services import trigger_service
-from semcal_ros.nodes.settings import CALIBRATION, Setting
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.parameters import CALIBRATION, Setting
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.services import trigger_service
+from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.magnification import MagnificationInput
 
 __all__ = ["ParameterServer", "main"]
 

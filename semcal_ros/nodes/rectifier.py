@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.nodes.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.settings import Setting
-from semcal_ros.nodes.stream import Frame, FrameInput
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
+from semcal_ros.nodes.frames.stream import Frame, FrameInput
 
 __all__ = ["RectifierNode", "main"]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.nodes.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.drift_tracking import DRIFT_SETTINGS, LiveDrift
-from semcal_ros.nodes.outputs import DriftOutput
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.stream import Frame, FrameInput, nominal_camera
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
+from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.frames.outputs import DriftOutput
+from semcal_ros.nodes.frames.stream import Frame, FrameInput, nominal_camera
 
 __all__ = ["StreamCorrector", "main"]
 

@@ -16,10 +16,10 @@ from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
 from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, SemcalError
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.qos import stream_output
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.settings import CONFIG, Setting
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.parameters import CONFIG, Setting
+from semcal_ros.nodes.common.qos import stream_output
+from semcal_ros.nodes.common.run import run_node
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,

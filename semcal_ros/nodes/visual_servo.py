@@ -20,14 +20,14 @@ from semcal_ros.applications.servoing import (
     projection_of_frame,
 )
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.nodes.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.magnification import MagnificationInput
-from semcal_ros.nodes.orderly_end import OrderlyEnd
-from semcal_ros.nodes.run import run_node
-from semcal_ros.nodes.services import trigger_service
-from semcal_ros.nodes.servo_input import ServoFrame, ServoInput
-from semcal_ros.nodes.servo_output import ErrorOutput, StageOutput
-from semcal_ros.nodes.servo_settings import SERVO_SETTINGS, goal_of, servo_settings_of
+from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.orderly_end import OrderlyEnd
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.services import trigger_service
+from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
+from semcal_ros.nodes.servo.output import ErrorOutput, StageOutput
+from semcal_ros.nodes.servo.settings import SERVO_SETTINGS, goal_of, servo_settings_of
 
 __all__ = ["VisualServo", "main"]
 

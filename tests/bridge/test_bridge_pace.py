@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from semcal_ros.bridge.pace import TrackingPace
 from semcal_ros.bridge.scan_interval import scan_interval_ns
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig, parse_config
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.nodes.frames.pace import TrackingPace
 
 MS = 1_000_000
 CONFIG = """

@@ -22,7 +22,7 @@ from semcal_ros.bridge.diagnostics import StreamStatistics
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, load_config
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.compressed import CompressedOutput, compressed_settings
+from semcal_ros.nodes.frames.compressed import CompressedOutput, compressed_settings
 
 NODE = "/sem/rectifier"
 TOPIC = "image_rect/compressed"

@@ -9,7 +9,7 @@ from node_scenes import make_calibration
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from ros_process import Peer, ended, running
 
-from semcal_ros.nodes.calibration_input import calibration_digest
+from semcal_ros.nodes.frames.calibration_input import calibration_digest
 
 SERVER = "/sem/parameter_server"
 CALIBRATION = make_calibration()

@@ -30,7 +30,7 @@ from std_msgs.msg import Float64, String
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.nodes.calibration_input import calibration_digest
+from semcal_ros.nodes.frames.calibration_input import calibration_digest
 
 MAGNIFICATION = 2000.0
 SERVER, RECTIFIER, CORRECTOR = "/sem/parameter_server", "/sem/rectifier", "/sem/stream_corrector"

@@ -24,7 +24,7 @@ from node_scenes import make_calibration
 from semcal_ros.bridge.parameters import PARAMETER_KINDS
 from semcal_ros.config.schema import CONFIG_SCHEMA
 from semcal_ros.nodes import base
-from semcal_ros.nodes.settings import Setting
+from semcal_ros.nodes.common.parameters import Setting
 
 ROOT = Path(__file__).resolve().parents[2]
 DOC = ROOT / "doc"

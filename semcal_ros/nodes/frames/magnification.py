@@ -13,9 +13,9 @@ from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.qos import value_input
-from semcal_ros.nodes.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.qos import value_input
+from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["MagnificationInput"]
 

@@ -21,10 +21,10 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.confined import read_plain_text
-from semcal_ros.nodes.background import NewestWork
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.qos import value_input
-from semcal_ros.nodes.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.latest_worker import NewestWork
+from semcal_ros.nodes.common.qos import value_input
+from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["CalibrationInput", "calibration_digest"]
 

@@ -7,9 +7,9 @@ from collections import OrderedDict
 
 from semcal_ros.config.config import ImageConfig
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.qos import stream_output
-from semcal_ros.nodes.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.qos import stream_output
+from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["SendingTimes"]
 

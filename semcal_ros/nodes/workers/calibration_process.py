@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from semcal_ros.core.errors import CalibrationError
-from semcal_ros.nodes.calibration_worker import CalibrationJob, JobResult, Stage
+from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, JobResult, Stage
 
 __all__ = ["CalibrationProcess"]
 
@@ -29,7 +29,7 @@ _NICE = 5
 # The matrices are small; threads would only take the other processors from the live nodes.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
 # By name and not as a script, so that both sides pickle the same classes.
-_COMMAND = "from semcal_ros.nodes.calibration_worker import serve; serve()"
+_COMMAND = "from semcal_ros.nodes.workers.calibration_worker import serve; serve()"
 
 
 class CalibrationProcess:

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.pace import TrackingPace
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import binned
 from semcal_ros.core.rectification.raw_positions import RasterDrift
-from semcal_ros.nodes.base import NODE_ERRORS
-from semcal_ros.nodes.drift_process import DriftProcess, Measured, measured
-from semcal_ros.nodes.services import trigger_service
-from semcal_ros.nodes.settings import Setting
-from semcal_ros.nodes.stream import Frame, StreamNode
+from semcal_ros.nodes.common.base import NODE_ERRORS
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.services import trigger_service
+from semcal_ros.nodes.frames.pace import TrackingPace
+from semcal_ros.nodes.frames.stream import Frame, StreamNode
+from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measured, measured
 
 __all__ = ["DRIFT_SETTINGS", "FrameDrift", "LiveDrift"]
 

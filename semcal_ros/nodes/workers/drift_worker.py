@@ -28,7 +28,7 @@ from semcal_ros.core.errors import SemcalError
 __all__ = ["DriftProcess", "Measured", "measured", "serve"]
 
 # By name and not as a script, so that both sides pickle the same classes; this imports no ROS.
-_COMMAND = "from semcal_ros.nodes.drift_process import serve; serve()"
+_COMMAND = "from semcal_ros.nodes.workers.drift_worker import serve; serve()"
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
 _NICE = 10
 _END_S = 2.0

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.nodes.calibration_input import CalibrationInput
-from semcal_ros.nodes.compressed import compressed_settings
-from semcal_ros.nodes.outputs import RectifiedOutput
-from semcal_ros.nodes.settings import CALIBRATION, INTERPOLATION, Setting
-from semcal_ros.nodes.stream import Frame, StreamNode
+from semcal_ros.nodes.common.parameters import CALIBRATION, INTERPOLATION, Setting
+from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.compressed import compressed_settings
+from semcal_ros.nodes.frames.outputs import RectifiedOutput
+from semcal_ros.nodes.frames.stream import Frame, StreamNode
 
 __all__ = ["CalibratedStreamNode"]
 

@@ -13,10 +13,10 @@ from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.nodes.base import SemNode
-from semcal_ros.nodes.compressed import CompressedOutput
-from semcal_ros.nodes.drift_tracking import FrameDrift
-from semcal_ros.nodes.stream import Frame
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.frames.compressed import CompressedOutput
+from semcal_ros.nodes.frames.live_drift import FrameDrift
+from semcal_ros.nodes.frames.stream import Frame
 
 __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 
@@ -24,7 +24,7 @@ __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 class ImageOutput:
     """Publishes images on one topic, from memory that is used again for each, and compressed beside it.
 
-    The node declares the parameters of :func:`~semcal_ros.nodes.compressed.compressed_settings`.
+    The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_settings`.
     """
 
     def __init__(self, node: SemNode, topic: str) -> None:

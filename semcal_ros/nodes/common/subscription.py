@@ -11,7 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 
-from semcal_ros.nodes.qos import overridable, relaxed
+from semcal_ros.nodes.common.qos import overridable, relaxed
 
 __all__ = ["AdaptiveSubscription", "MessageInfo", "published_ns"]
 

@@ -17,9 +17,9 @@ from std_msgs.msg import Float64MultiArray
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.projection import projection_from_message
-from semcal_ros.nodes.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.qos import image_input, stream_output, value_input
-from semcal_ros.nodes.subscription import MessageInfo
+from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
+from semcal_ros.nodes.common.subscription import MessageInfo
 
 __all__ = ["ServoFrame", "ServoInput"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
-from semcal_ros.nodes.settings import Setting, Settings
+from semcal_ros.nodes.common.parameters import Setting, Settings
 
 __all__ = ["SERVO_SETTINGS", "goal_of", "servo_settings_of"]
 

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from semcal_ros.nodes.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
 
 __all__ = ["service_queue", "trigger_service"]
 

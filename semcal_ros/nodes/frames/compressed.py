@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage
 
 from semcal_ros.bridge.compressed import CODECS, fill_compressed
-from semcal_ros.nodes.background import NewestWork
-from semcal_ros.nodes.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.settings import Setting
-from semcal_ros.nodes.stream import Frame
+from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.latest_worker import NewestWork
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.frames.stream import Frame
 
 __all__ = ["CompressedOutput", "compressed_settings"]
 

@@ -23,9 +23,9 @@ from semcal_ros.bridge.diagnostics import (
 )
 from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.nodes.qos import latched, overridable, stream_output
-from semcal_ros.nodes.settings import CONFIG, Setting, Settings
-from semcal_ros.nodes.subscription import AdaptiveSubscription
+from semcal_ros.nodes.common.parameters import CONFIG, Setting, Settings
+from semcal_ros.nodes.common.qos import latched, overridable, stream_output
+from semcal_ros.nodes.common.subscription import AdaptiveSubscription
 
 __all__ = ["NODE_ERRORS", "SemNode"]
 

@@ -29,7 +29,7 @@ def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 def image_input() -> QoSProfile:
     """A few images wait while one is being processed, so that a hiccup loses none.
 
-    Those that have waited for too long are passed over by :class:`~semcal_ros.nodes.stream.FrameInput`.
+    Those that have waited for too long are passed over by :class:`~semcal_ros.nodes.frames.stream.FrameInput`.
     """
     return _profile(10, DurabilityPolicy.VOLATILE)
 

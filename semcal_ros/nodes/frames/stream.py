@@ -20,12 +20,12 @@ from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
-from semcal_ros.nodes.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.magnification import MagnificationInput
-from semcal_ros.nodes.qos import image_input
-from semcal_ros.nodes.sending_times import SendingTimes
-from semcal_ros.nodes.settings import Setting
-from semcal_ros.nodes.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.qos import image_input
+from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.publication_times import SendingTimes
 
 __all__ = ["Frame", "FrameInput", "StreamNode", "nominal_camera"]
 

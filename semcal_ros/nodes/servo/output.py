@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 from semcal_ros.applications.servoing import ServoStep
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import copy_header
-from semcal_ros.nodes.base import SemNode
+from semcal_ros.nodes.common.base import SemNode
 
 __all__ = ["ErrorOutput", "StageOutput"]
 

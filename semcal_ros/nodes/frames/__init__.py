@@ -1,0 +1,1 @@
+"""Frames in, with their magnification and calibration; images and drift out."""

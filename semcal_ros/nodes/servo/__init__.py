@@ -1,0 +1,1 @@
+"""Inputs, outputs and parameters of the visual servo."""
