@@ -30,7 +30,7 @@ from semcal_ros.cli.drift_common import (
     with_frame_time,
 )
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Recording, open_recording

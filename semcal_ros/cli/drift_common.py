@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.estimates import DriftForecast, DriftPath, DriftUpdate, path_of_updates
 from semcal_ros.core.drift.frame_time import LEFT_IN, REMOVED, estimate_frame_time
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.outlook import DriftForecast
-from semcal_ros.core.drift.path import DriftPath, path_of_updates
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Frame

@@ -349,7 +349,7 @@ def _film(
     some = np.concatenate([s.images[0][::4, ::4].ravel() for s in shots])
     low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
     frames = sum(len(s.images) for s in shots)
-    from semcal_ros.report.cantilever_overlay import drawn
+    from semcal_ros.report.cantilever_figures import drawn
 
     with film_of(video, (width, height), frames, fps, (low, high)) as film:
         assert film is not None

@@ -22,8 +22,7 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_text
-from semcal_ros.files.confined import read_plain_text
-from semcal_ros.files.plain_yaml import check_plain_yaml
+from semcal_ros.files.confined import check_plain_yaml, read_plain_text
 
 __all__ = ["FILE_VERSION", "Calibration"]
 
@@ -190,7 +189,7 @@ def _check_kind(data: Any, source: str) -> None:
 
 @lru_cache(maxsize=1)
 def _validator() -> Any:
-    schema = resources.files("semcal_ros.schemas").joinpath("calibration.schema.json")
+    schema = resources.files("semcal_ros.files").joinpath("calibration.schema.json")
     return jsonschema.Draft202012Validator(json.loads(schema.read_text(encoding="utf-8")))
 
 

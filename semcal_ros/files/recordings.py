@@ -18,10 +18,9 @@ from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import BagError, MessageError, SemcalError
 from semcal_ros.files.bags.errors import reading
-from semcal_ros.files.bags.image_topics import find_image_topic
 from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
-from semcal_ros.files.bags.topics import find_topic
+from semcal_ros.files.bags.topics import find_image_topic, find_topic
 from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
 from semcal_ros.files.tiff import is_tiff
 from semcal_ros.files.tiff.folder import TiffFolder, scan_tiff_folder

@@ -21,9 +21,45 @@ from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.qos import overridable, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.common.services import service_queue
-from semcal_ros.nodes.pacing import Pacer
 
-__all__ = ["BagPlayer", "main"]
+__all__ = ["BagPlayer", "Pacer", "main"]
+
+
+class Pacer:
+    """Position in a recording that advances with a wall clock, which is an argument.
+
+    Parameters
+    ----------
+    rate
+        Seconds of recording per second.
+    paused
+        Whether it stands still at first.
+    """
+
+    def __init__(self, rate: float = 1.0, *, paused: bool = False) -> None:
+        self.rate = rate
+        self.paused = paused
+        self.position_ns = 0
+        self._wall_s: float | None = None
+
+    def seek(self, position_ns: int) -> None:
+        """Go to a position, ns."""
+        self.position_ns = position_ns
+        self._wall_s = None
+
+    def advance(self, wall_s: float) -> int:
+        """Position at a wall time that does not go back, ns."""
+        if self._wall_s is not None and not self.paused:
+            self.position_ns += round((wall_s - self._wall_s) * self.rate * 1e9)
+        self._wall_s = wall_s
+        return self.position_ns
+
+    def wait_s(self, target_ns: int, at_most_s: float) -> float:
+        """Seconds of wall time until a position is reached, limited; the limit itself while paused."""
+        if self.paused:
+            return at_most_s
+        return min(max(target_ns - self.position_ns, 0) * 1e-9 / self.rate, at_most_s)
+
 
 _SETTINGS = (
     Setting("bag", "", "Recording: a rosbag2 folder, or an .mcap or .db3 file.", fixed=True),

@@ -21,8 +21,7 @@ from semcal_ros.applications.servoing import (
 )
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.common.orderly_end import OrderlyEnd
-from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.run import OrderlyEnd, run_node
 from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
-from semcal_ros.applications.cantilever import Repeatability, Series
+from semcal_ros.applications.cantilever import Deflection, Repeatability, Series
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -28,7 +29,7 @@ from semcal_ros.report.html.style import (
     tidy,
 )
 
-__all__ = ["poses_figure", "strip_figure", "write_poses_figure", "write_strip_figure"]
+__all__ = ["drawn", "poses_figure", "strip_figure", "write_poses_figure", "write_strip_figure"]
 
 _DPI = 90.0
 _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
@@ -154,3 +155,31 @@ def _frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) 
     nm, sigma = 1e9 * found.deflection_m, 1e9 * found.sigma_m
     title = f"{one.magnification:g}×, pose {pose + 1}: {nm:.1f} ± {sigma:.1f} nm"
     axes.set_title(title, fontsize=7, color=INK)
+
+
+_FRACTION_BITS = 4
+
+
+def drawn(image: NDArray[Any], frame: Deflection, grey: tuple[float, float]) -> NDArray[np.float32]:
+    """The picture with the centre line and the end of the beam, in black and white.
+
+    Parameters
+    ----------
+    image
+        (h, w) raw grey picture.
+    frame
+        What was measured in it.
+    grey
+        Grey levels of black and white.
+    """
+    out = np.array(image, dtype=np.float32)
+    scale = max(1, round(max(image.shape) / 512))
+    points = frame.line_px[np.isfinite(frame.line_px).all(axis=1)]
+    fixed = np.round(points * 2**_FRACTION_BITS).astype(np.int32)
+    for level, width in ((grey[0], 3 * scale), (grey[1], scale)):
+        cv2.polylines(out, [fixed[:, None]], False, float(level), width, cv2.LINE_8, _FRACTION_BITS)
+        tip = frame.tip_px
+        if np.isfinite(tip).all() and np.all(np.abs(tip) < 1e5):
+            at = round(float(tip[0])), round(float(tip[1]))
+            cv2.circle(out, at, 5 * scale, float(level), width)
+    return out

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.numbers import format_px, plain
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.encode import Picture, captioned_pictures, picture_of_figure
 from semcal_ros.report.html.page import render, write_page
-from semcal_ros.report.html.pictures import captioned_pictures
 from semcal_ros.report.html.style import INK, OURS, REFERENCE, legend, new_figure, tidy
 
 __all__ = ["DemoRow", "correction_report"]

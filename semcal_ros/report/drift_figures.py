@@ -16,8 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from semcal_ros.core.drift.estimates import kind_of
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath, kind_of
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.style import (

@@ -14,7 +14,7 @@ from semcal_ros.cli.common import progress
 from semcal_ros.cli.drift_common import Follower, camera_of, start_time_s, timing_seen
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Frame, Recording

@@ -20,7 +20,7 @@ from semcal_ros.bridge.headers import fill_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.files.bags.reader import BagWriter, blank_message, open_bag
 from semcal_ros.synthetic import Drift, drift_plan, preset
 

@@ -11,7 +11,7 @@ import pytest
 from drift_scenes import DriftingSpecimen, small_camera
 
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
 from semcal_ros.core.drift.frame_time import (
     LEFT_IN,
     REMOVED,
@@ -19,7 +19,6 @@ from semcal_ros.core.drift.frame_time import (
     estimate_frame_time,
 )
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.path import DriftPath, path_of_updates
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 

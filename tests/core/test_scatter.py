@@ -7,8 +7,7 @@ import pytest
 from grid_views import grid_views
 
 from semcal_ros.core.calibration.calibrate import calibrate_views
-from semcal_ros.core.calibration.scatter import excess_sigma_px, with_excess
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
 from semcal_ros.synthetic import preset
 
 

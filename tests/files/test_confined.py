@@ -9,8 +9,7 @@ import pytest
 
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.confined import AllowedPaths, read_plain_text
-from semcal_ros.files.plain_yaml import check_plain_yaml
+from semcal_ros.files.confined import AllowedPaths, check_plain_yaml, read_plain_text
 
 
 def test_only_what_really_lies_inside_is_allowed(tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def test_every_continuous_parameter_is_described() -> None:
 
 def test_every_key_of_the_calibration_file_is_described() -> None:
     schema = json.loads(
-        (ROOT / "semcal_ros/schemas/calibration.schema.json").read_text(encoding="utf-8")
+        (ROOT / "semcal_ros/files/calibration.schema.json").read_text(encoding="utf-8")
     )
     keys = {
         *schema["properties"],

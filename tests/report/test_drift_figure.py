@@ -14,7 +14,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.drift_figures import drift_figure, write_drift_figure
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.register import prepare_reference, register
 

@@ -25,7 +25,7 @@ from semcal_ros.applications.cantilever.undeformed import REACH_PX, Rest, View, 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.path import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]

@@ -1,6 +1,6 @@
 """From affine to metric structure with calibrated parallel projections.
 
-The tracks are in true scale (see :class:`~semcal_ros.applications.reconstruction.types.Tracks`), so the rows of every camera
+The tracks are in true scale (see :class:`.Tracks`), so the rows of every camera
 become orthonormal: ``M_i Q M_i^T = I`` for one symmetric Q = A A^T. That is linear in the six entries of Q and
 absolute: scale, aspect and skew are those of the calibration. Two things remain open in parallel projection,
 whatever the number of views:

@@ -24,8 +24,8 @@ from semcal_ros.applications.reconstruction.patches import (
     PatchSettings,
     Posed,
     measure_patches,
+    plane_at_centre,
 )
-from semcal_ros.applications.reconstruction.raster_motion import plane_at_centre
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -145,7 +145,7 @@ def reconstruct(
     *,
     on_step: Callable[[str], object] = lambda _: None,
 ) -> Structure:
-    """Points and poses from the keyframes of a :class:`~semcal_ros.applications.reconstruction.feature_tracks.SequenceTracker`.
+    """Points and poses from the keyframes of a :class:`.SequenceTracker`.
 
     Parameters
     ----------

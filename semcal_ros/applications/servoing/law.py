@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.applications.servoing.axis import AxisObserver
 from semcal_ros.applications.servoing.detection import TargetView
-from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
+from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver, FollowWatch
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
 from semcal_ros.applications.servoing.settings import ServoSettings
-from semcal_ros.applications.servoing.watch import FollowWatch
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Servo", "ServoStep"]

@@ -19,8 +19,7 @@ from semcal_ros.core.calibration.joint import (
     suited_to_views,
     without_magnification,
 )
-from semcal_ros.core.calibration.jumps import likely_jump
-from semcal_ros.core.calibration.outliers import OutlyingView, outlying_views
+from semcal_ros.core.calibration.outliers import OutlyingView, likely_jump, outlying_views
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.problem import (
     Priors,

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
-from semcal_ros.core.calibration.scatter import excess_sigma_px, with_excess
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 

@@ -36,8 +36,7 @@ from semcal_ros.core.calibration.residual_field_fit import (
     field_system,
     solve_field,
 )
-from semcal_ros.core.calibration.scatter import excess_sigma_px, with_excess
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 

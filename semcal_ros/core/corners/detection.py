@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.core.corners.lattice import Lattice, grow_best_lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.saddle import find_saddles
-from semcal_ros.core.corners.screening import prepare_image, screen_image
+from semcal_ros.core.corners.saddle import find_saddles, prepare_image, screen_image
 
 __all__ = ["LatticeDetection", "find_lattice"]
 

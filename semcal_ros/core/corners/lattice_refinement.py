@@ -13,6 +13,7 @@ from semcal_ros.core.corners.checks import (
     Fitted,
     credible,
     inflation,
+    one_board,
     parity_of,
     undisturbed,
 )
@@ -28,7 +29,6 @@ from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.neighbour_consistency import smooth
-from semcal_ros.core.corners.parts import one_board
 from semcal_ros.core.corners.priors import (
     Learnt,
     learn,

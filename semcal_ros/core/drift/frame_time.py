@@ -33,9 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.keyframe_store import MEANS_PREPARED
-from semcal_ros.core.drift.path import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["LEFT_IN", "REMOVED", "FrameTimeEstimate", "estimate_frame_time"]

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.path import DriftPath, path_of_updates
 from semcal_ros.core.drift.smoother import likely_restlessness, smoothed
 from semcal_ros.core.errors import InvalidValueError
 

@@ -22,7 +22,7 @@ from semcal_ros.core.drift.camera_uncertainty import (
     centre_covariance,
     scale_covariance,
 )
-from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftForecast, DriftOutlook, DriftSettings, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import Shot, Stills, resampleable
 from semcal_ros.core.drift.gating import (
@@ -38,7 +38,6 @@ from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.matching import Found, joins, look
 from semcal_ros.core.drift.measurement import at_itself, becoming_keyframe, bow_s2, loosened
 from semcal_ros.core.drift.operations import Drop, Measure, Move
-from semcal_ros.core.drift.outlook import DriftForecast, DriftOutlook
 from semcal_ros.core.drift.state import still
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.register import Registration

@@ -27,7 +27,7 @@ from semcal_ros.core.errors import BagError, CalibrationFileError
 from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
 from semcal_ros.files.bags.messages import blank_message, jazzy_types
 from semcal_ros.files.bags.writer import BagWriter
-from semcal_ros.files.plain_yaml import check_plain_yaml
+from semcal_ros.files.confined import check_plain_yaml
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import (
@@ -22,11 +24,36 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.signals import uninstall_signal_handlers
 
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.middleware.security import check_security
 
-__all__ = ["run_node"]
+__all__ = ["OrderlyEnd", "run_node"]
+
+
+class OrderlyEnd:
+    """From now on SIGINT and SIGTERM are only noted, until :meth:`follow` is called.
+
+    ROS itself would shut the middleware down at once, and ``destroy_node`` could publish nothing any more. To be made
+    in the main thread, once ROS is up.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        uninstall_signal_handlers()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, _number: int, _frame: Any) -> None:
+        # Raised here, it would come out anywhere, where something else may swallow it.
+        self._asked = True
+
+    def follow(self) -> None:
+        """End the spinning if that was asked for; to be called by a timer, which also lets Python hear of signals."""
+        if self._asked:
+            raise ExternalShutdownException
+
 
 # A thread that computes beside the stream must not keep the interpreter for long when a frame has come.
 _SWITCH_S = 5e-4

@@ -51,8 +51,8 @@ from semcal_ros.report.calibration.paper import paper_rows
 from semcal_ros.report.calibration.parameter_figures import parameter_groups
 from semcal_ros.report.calibration.pixel_size_figures import pixel_size_pictures
 from semcal_ros.report.calibration.prediction_figures import prediction_pictures
+from semcal_ros.report.html.encode import captioned_pictures
 from semcal_ros.report.html.page import render, write_page
-from semcal_ros.report.html.pictures import captioned_pictures
 
 __all__ = ["calibration_report"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,17 @@ from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.report.calibration.numbers import plain
 
-__all__ = ["Picture", "as_bytes_image", "data_uri", "jpeg_of", "picture_of_figure", "shrunk"]
+__all__ = [
+    "Picture",
+    "as_bytes_image",
+    "captioned_pictures",
+    "data_uri",
+    "jpeg_of",
+    "picture_of_figure",
+    "shrunk",
+]
 
 # Two dots of the file per CSS pixel of the page (96 per inch), so that pictures are sharp on fine
 # screens.
@@ -118,3 +128,18 @@ def jpeg_of(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> bytes:
             f"an image of shape {image.shape} that cannot be encoded", expected="an 8-bit image"
         )
     return bytes(data)
+
+
+_MAX_WIDTH = 640
+_QUALITY = 88
+
+
+def captioned_pictures(images: Sequence[tuple[str, NDArray[Any]]]) -> list[Picture]:
+    """(caption, image) pairs, gray or RGB of any depth, at most 640 px wide."""
+    pictures = []
+    for caption, image in images:
+        small, _ = shrunk(as_bytes_image(image), _MAX_WIDTH)
+        text = plain(caption)
+        src = data_uri("jpeg", jpeg_of(small, _QUALITY))
+        pictures.append(Picture(src, f"Image: {text}", text, small.shape[1], small.shape[0]))
+    return pictures
