@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.config.config import load_config
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -28,7 +28,6 @@ from semcal_ros.synthetic import (
 )
 from semcal_ros.workflows.calibrate import CollectedViews, collect_views, find_views, named_frames
 
-Array = NDArray[np.float64]
 PixelSize = tuple[float, float]
 
 # Label in the tables, and the preset.

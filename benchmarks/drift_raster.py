@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.tracker import DriftTracker
@@ -26,8 +26,6 @@ from semcal_ros.synthetic import (
     render_frame,
 )
 from semcal_ros.synthetic.drift import DriftFunction
-
-Array = NDArray[np.float64]
 
 # Steady, settling and wandering: some 10 px of 512 in a frame of 4 s at 20 000x.
 STRONG_DRIFT = Drift(

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from table import show
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.tracker import DriftTracker
-
-Array = NDArray[np.float64]
 
 SIZE, SCENE = 128, 512
 FAR_PX = 300.0

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic import ChessGrid, GoldOnCarbon, Specimen, preset, square_for
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 Gray = NDArray[np.uint8] | NDArray[np.uint16]
 Shift = tuple[float, float]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semcal_ros.bridge.fields import assign_floats
 from semcal_ros.bridge.headers import copy_header
@@ -14,6 +14,7 @@ from semcal_ros.bridge.protocols import (
     PoseWithCovarianceStampedMessage,
     TwistWithCovarianceStampedMessage,
 )
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["UNKNOWN_VARIANCE", "fill_drift", "fill_drift_velocity"]
@@ -83,7 +84,7 @@ def _set_vector(vector: Any, x: float, y: float) -> None:
     vector.x, vector.y, vector.z = x, y, 0.0
 
 
-def _floats(values: ArrayLike, what: str) -> NDArray[np.float64]:
+def _floats(values: ArrayLike, what: str) -> Array:
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -97,7 +98,7 @@ def _pair(values: ArrayLike, what: str) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def _block(covariance: ArrayLike, first: int) -> NDArray[np.float64]:
+def _block(covariance: ArrayLike, first: int) -> Array:
     matrix = whole = _floats(covariance, "covariance")
     if matrix.shape == (4, 4):
         matrix = matrix[first : first + 2, first : first + 2]
@@ -112,7 +113,7 @@ def _block(covariance: ArrayLike, first: int) -> NDArray[np.float64]:
     return matrix
 
 
-def _six_by_six(block: NDArray[np.float64]) -> NDArray[np.float64]:
+def _six_by_six(block: Array) -> Array:
     full = np.diag(np.full(6, UNKNOWN_VARIANCE))
     full[:2, :2] = block
     return full

@@ -6,8 +6,8 @@ import re
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
@@ -90,7 +90,7 @@ def value_of(kind: str, camera: ScanCamera) -> list[float]:
         The kind is unknown, or this camera has no such value (``p`` and ``k`` of a parallel
         projection, ``sigma`` of a camera without covariance).
     """
-    values: NDArray[np.float64]
+    values: Array
     if kind == "p":
         values = camera.P.reshape(-1)
     elif kind == "k":
@@ -110,7 +110,7 @@ def value_of(kind: str, camera: ScanCamera) -> list[float]:
     return [float(value) for value in values]
 
 
-def _sigma_px(camera: ScanCamera) -> NDArray[np.float64]:
+def _sigma_px(camera: ScanCamera) -> Array:
     right, bottom = camera.width - 1.0, camera.height - 1.0
     pixels = np.array(
         [[0.5 * right, 0.5 * bottom], [0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]

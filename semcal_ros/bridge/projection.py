@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.bridge.fields import assign_floats, new_nested, whole_number
 from semcal_ros.bridge.protocols import MultiArrayMessage
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
 
@@ -39,7 +39,7 @@ def fill_projection(message: MultiArrayMessage, camera: ScanCamera) -> None:
     assign_floats(message, "data", camera.P_affine)
 
 
-def projection_from_message(message: MultiArrayMessage) -> NDArray[np.float64]:
+def projection_from_message(message: MultiArrayMessage) -> Array:
     """(3, 4) matrix of a message filled by :func:`fill_projection`.
 
     Raises

@@ -7,10 +7,10 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.bridge.parameters import value_of
 from semcal_ros.cli.common import echo_json
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.calibration_file import Calibration
@@ -37,7 +37,7 @@ def command(calibration: Path, magnification: float, as_json: bool) -> None:
         _tell(camera, model)
 
 
-def _sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sigma(covariance: Array) -> Array:
     # Of an exactly known parameter, rounding may leave a variance of less than nothing.
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftForecast, DriftPath, DriftUpdate, path_of_updates
@@ -207,7 +207,7 @@ def forecast_text(forecast: DriftForecast, after_s: float) -> str:
     return f"drift {after_s:g} s after the last frame: x {parts[0]}, y {parts[1]} nm"
 
 
-def _lengths(values: NDArray[np.float64], sigmas: NDArray[np.float64]) -> list[str]:
+def _lengths(values: Array, sigmas: Array) -> list[str]:
     """Lengths in nm with their 1-sigma, to two digits of the smaller uncertainty."""
     known = 1e9 * float(np.min(sigmas))
     digits = int(np.clip(1 - np.floor(np.log10(known)), 0, 9)) if known > 0.0 else 3

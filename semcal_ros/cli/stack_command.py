@@ -28,6 +28,7 @@ from semcal_ros.cli.drift_common import (
     frame_time_option,
     with_frame_time,
 )
+from semcal_ros.core.arrays import Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
@@ -181,7 +182,7 @@ def _tiff(values: NDArray[np.float32], camera: ScanCamera) -> bytes:
 # -- average and video ----------------------------------------------------------------------------
 
 
-def _usable(survey: Survey) -> NDArray[np.bool_]:
+def _usable(survey: Survey) -> Mask:
     """Which of the chosen frames go into the average, (n,) bool."""
     if survey.path is None:
         return np.ones(len(survey.chosen), dtype=bool)
@@ -198,7 +199,7 @@ def _usable(survey: Survey) -> NDArray[np.bool_]:
 def _add_frames(
     opened: Recording,
     survey: Survey,
-    usable: NDArray[np.bool_],
+    usable: Mask,
     stack: Stack,
     film: Film | None,
 ) -> None:
@@ -237,7 +238,7 @@ def _caption(survey: Survey, number: int, used: bool) -> str:
 # -- what a person reads --------------------------------------------------------------------------
 
 
-def _report(survey: Survey, usable: NDArray[np.bool_], image: StackedImage) -> None:
+def _report(survey: Survey, usable: Mask, image: StackedImage) -> None:
     if survey.timing_note:
         click.echo(f"note: {survey.timing_note}", err=True)
     if survey.job.model is None:

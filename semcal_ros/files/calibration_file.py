@@ -15,8 +15,8 @@ from typing import Any
 import jsonschema
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -26,7 +26,6 @@ from semcal_ros.files.confined import check_plain_yaml, read_plain_text
 
 __all__ = ["FILE_VERSION", "Calibration"]
 
-Array = NDArray[np.float64]
 
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"

@@ -9,15 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.applications.reconstruction import Ball, Structure
+from semcal_ros.core.arrays import Array
 from semcal_ros.report.html.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
 
 __all__ = ["ball_figure", "ball_picture", "small_png"]
 
-Array = NDArray[np.float64]
 
 _NM = 1e9
 _COLORS = 96

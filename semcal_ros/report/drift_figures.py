@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.drift.estimates import DriftPath, kind_of
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
@@ -33,7 +33,6 @@ from semcal_ros.report.html.style import (
 
 __all__ = ["drift_figure", "write_drift_figure"]
 
-Array = NDArray[np.float64]
 
 _DPI = 160.0
 # Half the width of an interval that holds 95 % of a normal distribution.
@@ -57,7 +56,7 @@ class _Kind:
     """Frames that have one thing in common, and how they are marked."""
 
     text: str
-    frames: NDArray[np.intp]
+    frames: Indices
     color: str
     mark: str
 
@@ -328,7 +327,7 @@ def _residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> N
     _rug(axes, kinds, time)
 
 
-def _bands(axes: Axes, time: Array, values: Array, sigma: Array, good: NDArray[np.bool_]) -> None:
+def _bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> None:
     """Both axes with their bands, and limits that a few very uncertain frames do not set."""
     for k, (name, color, line) in enumerate((("x", OURS, "-"), ("y", SECOND, "--"))):
         half = np.where(np.isfinite(values[:, k]), _BAND * sigma[:, k], np.nan)

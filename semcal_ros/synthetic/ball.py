@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -36,8 +37,6 @@ __all__ = [
     "ball_plan",
 ]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
 
@@ -247,9 +246,7 @@ def _yield(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, pla
     return out
 
 
-def _near(
-    body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
-) -> NDArray[np.bool_]:
+def _near(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array) -> Mask:
     """Which rays can meet the body at all: by the distance from its outline in parallel projection."""
     w = (1.0 + rho * place[:, 2])[:, None]
     dx, dy = x - place[:, :1] / w, y - place[:, 1:2] / w

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
+
+from semcal_ros.core.arrays import Array, Image
 
 __all__ = ["BallOnTip"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _TILE = 128
 

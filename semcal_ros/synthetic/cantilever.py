@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
@@ -32,7 +33,6 @@ __all__ = [
     "cantilever_plan",
 ]
 
-Array = NDArray[np.float64]
 
 CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
 """Those of Malti et al. (2012), section 4.3."""

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Image
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["NOISE_FREE", "Detector"]
 
-Image = NDArray[np.float32]
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 # From this many electrons on, a normal distribution has the same first two moments and a skewness

@@ -9,13 +9,13 @@ from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["DRIFTS", "NO_DRIFT", "Drift", "DriftFunction", "drift_preset"]
 
-Array = NDArray[np.float64]
 
 DriftFunction = Callable[[Array], Array]
 """Displacement (n, 2) in m, sem frame, at times (n,) in s: what lay at X is seen at X + drift."""

@@ -8,12 +8,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Image
 
 __all__ = ["GoldOnCarbon"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _TILE = 1024
 _RADII_TEXELS = (6.0, 30.0)

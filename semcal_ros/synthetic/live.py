@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
@@ -19,7 +20,6 @@ from semcal_ros.synthetic.specimens import Specimen
 
 __all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
 
-Array = NDArray[np.float64]
 
 # Changes of magnification that are remembered, for frames that have begun before them.
 _TURNS = 16

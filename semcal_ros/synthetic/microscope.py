@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -15,7 +16,6 @@ from semcal_ros.synthetic.laws import Constant, Law
 
 __all__ = ["Residual", "VirtualMicroscope"]
 
-Array = NDArray[np.float64]
 
 _FIXED_POINT_STEPS = 60
 _FIXED_POINT_TOLERANCE_PX = 1e-10

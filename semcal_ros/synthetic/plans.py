@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, DriftFunction
@@ -31,7 +32,6 @@ __all__ = [
     "zoom_plan",
 ]
 
-Array = NDArray[np.float64]
 
 SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target")
 

@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Pose", "random_poses", "rotation_about_beam"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

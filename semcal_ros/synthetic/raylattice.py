@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -25,7 +25,6 @@ from semcal_ros.synthetic.pose import Pose
 
 __all__ = ["PlaneLattice", "RayLattice", "ray_lattice"]
 
-Array = NDArray[np.float64]
 
 _NODE_SPACING_PX = 12.0
 _MOST_INTERVALS = 96

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
@@ -17,8 +18,6 @@ from semcal_ros.synthetic.specimens import Specimen
 
 __all__ = ["render_frame", "render_reflectivity"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _BLOCK_ROWS = 32
 # Passes that lie closer together than this are drawn once: the blur that is left out has a variance

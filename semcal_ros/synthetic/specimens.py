@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["SQUARES_M", "ChessGrid", "FlatSpecimen", "Specimen", "square_for"]
 
-Array = NDArray[np.float64]
 
 SQUARES_M: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 """Square sizes of the multi-scale grid."""

@@ -8,14 +8,12 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
+from semcal_ros.core.arrays import Array, Image
 
 __all__ = ["TargetSpecimen"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 # Texels per cell: seven for each square of a marker, and nine for the white on either side.
 _TEXELS_PER_BIT = 7

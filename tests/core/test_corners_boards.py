@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from corner_boards import Board, position_bound
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection, find_lattice
-
-Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=64)

@@ -9,13 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.corners import find_lattice
-
-Array = NDArray[np.float64]
 
 
 def true_corners(frame: dict[str, Any], truth: dict[str, Any]) -> Array:

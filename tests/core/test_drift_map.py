@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy import stats
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import Carry, Drop, Measure, Move, Reshear, Settle, Widen
 from semcal_ros.core.drift.process_noise import Restlessness
 from semcal_ros.core.drift.state import DriftMap, still
 from semcal_ros.core.errors import InvalidValueError
-
-Array = NDArray[np.float64]
 
 WHITE = Restlessness(0.3)
 FADING = Restlessness(0.3, 1.7)

@@ -7,9 +7,9 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy import stats
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import (
     Carry,
     Drop,
@@ -30,8 +30,6 @@ from semcal_ros.core.drift.smoother import (
 )
 from semcal_ros.core.drift.state import DriftMap, still
 from semcal_ros.core.errors import InvalidValueError
-
-Array = NDArray[np.float64]
 
 
 def root_of(covariance: Array) -> Array:

@@ -11,6 +11,7 @@ import pytest
 from drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
@@ -32,8 +33,6 @@ from semcal_ros.core.drift.state import DriftMap, still
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
 from semcal_ros.core.registration.register import Registration, RegistrationSettings, register
-
-Array = NDArray[np.float64]
 
 SIZE = 160
 TEXTURE = Texture(2)

@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["grid_view", "grid_views"]
-
-Array = NDArray[np.float64]
 
 
 def grid_view(

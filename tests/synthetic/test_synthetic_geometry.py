@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import (
@@ -21,8 +22,6 @@ from semcal_ros.synthetic import (
     square_for,
 )
 from semcal_ros.synthetic.raylattice import ray_lattice
-
-Array = NDArray[np.float64]
 
 REACH_PX = 4.0
 STEPS = np.linspace(-REACH_PX, REACH_PX, 81)

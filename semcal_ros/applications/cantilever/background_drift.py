@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
@@ -23,8 +24,6 @@ from semcal_ros.core.registration.register import prepare_reference, register
 
 __all__ = ["Background", "follow_background"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 # The first look is at a picture that is reduced to some 256 px, in tiles: their number along each
 # side, their least side, and how many must be matched for their median to be trusted.
@@ -106,7 +105,7 @@ def follow_background(
     return Background(history.smoothed(), still)
 
 
-def _rough_drift(pictures: Sequence[Image], beam: NDArray[np.bool_]) -> Array:
+def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
     """(n, 2) px: the shift against the first picture that most tiles agree on, to some 0.1 px.
 
     A pusher moves or covers some of them only, and the median does not care.
@@ -148,7 +147,7 @@ def _rough_drift(pictures: Sequence[Image], beam: NDArray[np.bool_]) -> Array:
     return np.array(shifts)
 
 
-def _soft(beam: NDArray[np.bool_]) -> Image:
+def _soft(beam: Mask) -> Image:
     """1 outside of the beam, with a soft rim."""
     return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), _SOFT_PX), np.float32)
 
@@ -163,9 +162,7 @@ def _shifted(image: Image, shift: Array) -> Image:
     return np.asarray(moved, dtype=np.float32)
 
 
-def _changes(
-    pictures: Sequence[Image], shifts: Array, beam: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
     """Where the picture changes by itself."""
     if len(pictures) < 2:
         return np.zeros_like(beam)
@@ -187,9 +184,7 @@ def _changes(
     return _enlarged(wide | _moved_bodies(middle, strong, ground), beam.shape)
 
 
-def _moved_bodies(
-    middle: Array, strong: NDArray[np.bool_], ground: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _moved_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
     """Bright bodies with several changed cells: all of them, with edges along which they slid."""
     grey = np.clip(255.0 * (middle - middle.min()) / max(float(np.ptp(middle)), 1e-9), 0.0, 255.0)
     level, _ = cv2.threshold(grey.astype(np.uint8), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
@@ -205,7 +200,7 @@ def _moved_bodies(
     return np.asarray(cv2.dilate(moved.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool))
 
 
-def _enlarged(cells: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _enlarged(cells: Mask, shape: tuple[int, ...]) -> Mask:
     """Cells as pixels; the border that no whole cell covers is that of the last ones."""
     large = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
     rows, cols = shape[0] - large.shape[0], shape[1] - large.shape[1]

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -32,7 +32,6 @@ __all__ = [
     "shape_of",
 ]
 
-Array = NDArray[np.float64]
 
 SHAPES = ("free", "beam", "parabola")
 
@@ -74,7 +73,7 @@ class Bending:
     covariance: Array
     rms_m: float
     residuals: Array
-    used: NDArray[np.bool_]
+    used: Mask
 
     def curve(self, u: Array) -> Array:
         """Bending alone at fractions of the length; it goes on straight beyond the ends."""

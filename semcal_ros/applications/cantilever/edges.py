@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
+
+from semcal_ros.core.arrays import Array, Indices, Mask
 
 __all__ = ["EdgeFit", "EdgeModel", "StepFit", "best_width", "fit_edges", "fit_step", "same_width"]
 
-Array = NDArray[np.float64]
 
 _STEPS = 5
 _LEAST_PIXELS = 12
@@ -169,7 +169,7 @@ def _along_line(along: Array, model: EdgeModel, values: Array) -> Array:
 
 
 def _fitted(
-    block: NDArray[np.intp], distance: Array, grey: Array, model: EdgeModel, count: int
+    block: Indices, distance: Array, grey: Array, model: EdgeModel, count: int
 ) -> tuple[Array, Array, Array, float]:
     """Place, 1-sigma and step of each block's edge, and the squares that are left."""
     place, slope = np.zeros(count), np.zeros(count)
@@ -211,9 +211,7 @@ def _fitted(
     return place, sigma, step, float(squares.sum())
 
 
-def _gram(
-    block: NDArray[np.intp], weight: Array, columns: tuple[Array, Array, Array], count: int
-) -> Array:
+def _gram(block: Indices, weight: Array, columns: tuple[Array, Array, Array], count: int) -> Array:
     gram = np.zeros((count, 3, 3))
     for i in range(3):
         for j in range(i, 3):
@@ -228,7 +226,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix + guard * np.eye(3), right[..., None])[..., 0])
 
 
-def same_width(moved: Array, noise: Array) -> NDArray[np.bool_]:
+def same_width(moved: Array, noise: Array) -> Mask:
     """(blocks,) where the width is what it was: elsewhere something lies on an edge.
 
     The neighbours of such blocks are left out, too: it may reach into them a little.

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Strip", "find_strip"]
 
-Array = NDArray[np.float64]
 
 # Larger pictures are reduced before they are searched.
 _SEARCHED_PX = 640
@@ -295,7 +295,7 @@ def _corners(end: Array, outwards: Array, across: Array, half: float) -> list[Ar
     return [end + 4.0 * outwards + side * (half + 3.0) * across for side in (-1.0, 1.0)]
 
 
-def _longest_run(good: NDArray[np.bool_], gap: int) -> tuple[int, int] | None:
+def _longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
     """First and last index of the longest stretch, gaps closed."""
     places = np.flatnonzero(good)
     if not places.size:

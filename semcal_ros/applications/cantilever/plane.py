@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -19,7 +19,6 @@ from semcal_ros.core.rectification.raw_positions import RasterDrift
 
 __all__ = ["Axis", "PlaneMap", "drift_at"]
 
-Array = NDArray[np.float64]
 
 _NODE_SPACING_PX = 10.0
 _DEGREE = 5
@@ -117,7 +116,7 @@ class PlaneMap:
         """(n, 2) raw pixels of sem-frame points (n, 2), without drift."""
         return self.camera.project(np.column_stack([xy_m, np.zeros(len(xy_m))]))
 
-    def specimen(self, pixels: NDArray[np.intp], drift: RasterDrift) -> tuple[Array, Array]:
+    def specimen(self, pixels: Indices, drift: RasterDrift) -> tuple[Array, Array]:
         """Coordinates, relative to where the specimen was at zero drift, of pixels by flat index."""
         since = self.since_s.ravel()[pixels]
         square = self.square_s2.ravel()[pixels]

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.series import Series
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Repeatability", "frames_of_poses", "repeatability"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

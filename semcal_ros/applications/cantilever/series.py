@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semcal_ros.applications.cantilever.background_drift import follow_background
 from semcal_ros.applications.cantilever.bending import (
@@ -22,6 +22,7 @@ from semcal_ros.applications.cantilever.edges import EdgeFit, fit_edges, same_wi
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
 from semcal_ros.applications.cantilever.undeformed import REACH_PX, Rest, View, beam_at_rest
+from semcal_ros.core.arrays import AnyImage, Array, Indices
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
@@ -30,8 +31,6 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.generic]
 
 # Steps of an edge relative to the reference within which it is the same edge.
 _SAME_STEP = (0.5, 1.6)
@@ -140,7 +139,7 @@ class Series:
 
 
 def measure_series(
-    images: Sequence[Image],
+    images: Sequence[AnyImage],
     times_s: Sequence[float],
     camera: ScanCamera,
     timing: ScanTiming | None,
@@ -190,7 +189,7 @@ def measure_series(
     return Series(camera.magnification, rest, tuple(frames), shape, background.path, notes)
 
 
-def _check(images: Sequence[Image], times_s: Sequence[float], reference: Sequence[int]) -> None:
+def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequence[int]) -> None:
     if not images or len(images) != len(times_s):
         raise InvalidValueError(
             f"{len(images)} pictures at {len(times_s)} times", expected="one time for each"
@@ -237,7 +236,7 @@ class _Work:
 
     def __init__(
         self,
-        images: Sequence[Image],
+        images: Sequence[AnyImage],
         plane: PlaneMap,
         path: DriftPath,
         settings: SeriesSettings,
@@ -248,7 +247,7 @@ class _Work:
         self._pixels = self._near_beam(rough)
         self._seen: dict[int, tuple[Array, Array]] = {}
 
-    def _near_beam(self, axis: Axis) -> NDArray[np.intp]:
+    def _near_beam(self, axis: Axis) -> Indices:
         """Flat indices of the pixels that may show the beam in any frame."""
         along, across = axis.coordinates(self._plane.x_m, self._plane.y_m)
         moved = float(np.max(np.hypot(*self._path.drift_m.T), initial=0.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.edges import (
     EdgeFit,
@@ -16,11 +15,11 @@ from semcal_ros.applications.cantilever.edges import (
     fit_step,
 )
 from semcal_ros.applications.cantilever.plane import Axis
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["REACH_PX", "Rest", "View", "beam_at_rest"]
 
-Array = NDArray[np.float64]
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 View = tuple[Array, Array, Array]
 

@@ -13,16 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.reconstruction.types import Observations, camera_table
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["Adjustment", "adjust"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
 _LEAST_SCALE = 1e-6  # of observations without errors
@@ -236,7 +234,7 @@ def adjust(
 
 
 def _descend(
-    problem: _Problem, state: _State, sigma: float, free: Index, limit: int, tolerance: float
+    problem: _Problem, state: _State, sigma: float, free: Indices, limit: int, tolerance: float
 ) -> tuple[_State, int, bool]:
     damping, cost = _FIRST_DAMPING, problem.cost(state, sigma)
     for iteration in range(limit):
@@ -257,7 +255,7 @@ def _descend(
 
 
 def _stepped(
-    state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Index
+    state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Indices
 ) -> _State:
     pose, point, coupling, right_pose, right_point = blocks
     inverse = _inverted(_damped(point, damping))
@@ -289,7 +287,7 @@ def _inverted(blocks: Array) -> Array:
     return np.asarray(np.linalg.inv(blocks), dtype=np.float64)
 
 
-def _reduced(pose: Array, inverse: Array, coupling: Array, free: Index) -> tuple[Array, Array]:
+def _reduced(pose: Array, inverse: Array, coupling: Array, free: Indices) -> tuple[Array, Array]:
     """Schur complement on the free pose parameters, and coupling @ inverse of the points."""
     part = coupling[free]
     by_point = np.swapaxes(part.reshape(len(free), -1, 3), 0, 1) @ inverse
@@ -320,7 +318,7 @@ def _outer(a: Array, b: Array) -> Array:
     return np.asarray(np.swapaxes(a, 1, 2) @ b, dtype=np.float64)
 
 
-def _summed(values: Array, index: Index, count: int) -> Array:
+def _summed(values: Array, index: Indices, count: int) -> Array:
     """Sums of values (n, ...) over equal indices."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(index, weights=column, minlength=count) for column in flat.T]
@@ -332,7 +330,7 @@ def _finished(
     problem: _Problem,
     state: _State,
     sigma: float,
-    free: Index,
+    free: Indices,
     unit_m: float,
     iterations: int,
     converged: bool,

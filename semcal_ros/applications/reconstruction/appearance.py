@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Image
+
 __all__ = ["Appearance", "appearance_of", "bytes_for_tracking"]
 
-Image = NDArray[np.float32]
 _MAD_TO_SIGMA = 1.4826
 # Of a difference of neighbours across the diagonal, sum of squares of its kernel.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
@@ -25,8 +24,6 @@ from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 
 __all__ = ["Ball", "measure_ball"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

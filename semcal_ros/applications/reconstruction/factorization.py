@@ -12,16 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.reconstruction.types import Tracks
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["AffineStructure", "factorize"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
 _LEAST_COMMON = 12
@@ -80,9 +77,9 @@ def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
     return state.result()
 
 
-def _first_block(tracks: Tracks) -> tuple[Index, Index, float]:
+def _first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
     """Views and points of the block with the most relief, and that relief over its noise."""
-    best: tuple[float, Index, Index, float] | None = None
+    best: tuple[float, Indices, Indices, float] | None = None
     n_views = len(tracks.seen)
     for length in (w for w in _WINDOWS if w <= max(n_views, _LEAST_VIEWS)):
         for first in range(0, n_views - length + 1, max(1, length // 4)):
@@ -118,7 +115,7 @@ def _centred(block: Array) -> Array:
 class _Growing:
     """The structure while views and points are added to it."""
 
-    def __init__(self, tracks: Tracks, views: Index, points: Index, relief: float) -> None:
+    def __init__(self, tracks: Tracks, views: Indices, points: Indices, relief: float) -> None:
         self.xy, self.seen = tracks.xy_m, tracks.seen
         n_views, n_points = self.seen.shape
         self.cameras = np.zeros((n_views, 2, 3))
@@ -181,7 +178,7 @@ class _Growing:
         self.offsets[index] = found[:, 3]
         self.views_in[index] = True
 
-    def _filled(self, views: Index) -> Array:
+    def _filled(self, views: Indices) -> Array:
         return np.where(self.seen[views][..., None], self.xy[views], 0.0)
 
     def place_points(self, wanted: Mask) -> None:

@@ -20,14 +20,11 @@ from semcal_ros.applications.reconstruction.appearance import (
     bytes_for_tracking,
 )
 from semcal_ros.applications.reconstruction.epipolar import robust_epipolar
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Keyframe", "SequenceTracker", "TrackerSettings", "to_plane"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 _FEW = 30
@@ -102,7 +99,7 @@ class Keyframe:
     time_s: float
     image: NDArray[Any]
     camera: ScanCamera
-    ids: Index
+    ids: Indices
     xy: Array
     velocity: Array
 
@@ -289,7 +286,7 @@ class SequenceTracker:
 
     # -- features ---------------------------------------------------------------------------------
 
-    def _detected(self, seen: Appearance, taken: Array) -> tuple[Index, Array]:
+    def _detected(self, seen: Appearance, taken: Array) -> tuple[Indices, Array]:
         """Numbers and places (raw px) of new features away from those that are there."""
         s = self.settings
         response, from_noise = seen.corner_response()
@@ -321,7 +318,7 @@ class SequenceTracker:
         image: NDArray[Any],
         camera: ScanCamera,
         picture: NDArray[np.uint8],
-        ids: Index,
+        ids: Indices,
         xy: Array,
         motion: Array | None,
     ) -> None:

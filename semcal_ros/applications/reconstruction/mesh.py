@@ -10,17 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["SurfaceMesh", "mesh_of_cloud"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class SurfaceMesh:
     """
 
     vertices_m: Array
-    faces: Index
+    faces: Indices
     normals: Array
     sigma_m: Array
     boundary_edges: int
@@ -112,17 +109,17 @@ def _circumradius(a: Array, b: Array, c: Array) -> Array:
     return np.asarray(sides[0] * sides[1] * sides[2] / (4.0 * np.maximum(area, 1e-300)))
 
 
-def _edges(faces: Index) -> Index:
+def _edges(faces: Indices) -> Indices:
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return np.sort(pairs, axis=1)
 
 
-def _open_edges(faces: Index) -> int:
+def _open_edges(faces: Indices) -> int:
     _, counts = np.unique(_edges(faces), axis=0, return_counts=True)
     return int(np.count_nonzero(counts == 1))
 
 
-def _largest_part(faces: Index, points: int) -> Index:
+def _largest_part(faces: Indices, points: int) -> Indices:
     """The triangles that hang together by edges, of the largest such part."""
 
     edges = _edges(faces)

@@ -15,16 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from semcal_ros.applications.reconstruction.factorization import AffineStructure
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["MetricUpgrade", "mirrored", "upgrade_to_metric"]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

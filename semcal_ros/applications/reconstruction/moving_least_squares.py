@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["LocalSurface", "local_surface", "typical_spacing_m"]
 
-Array = NDArray[np.float64]
 
 _NEIGHBOURS = 48
 _LEAST = 8

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.reconstruction.appearance import Appearance
 from semcal_ros.applications.reconstruction.feature_tracks import Keyframe, to_plane
 from semcal_ros.applications.reconstruction.types import Observations
+from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
 __all__ = [
@@ -47,10 +47,6 @@ def plane_at_centre(frame: Keyframe, scan: ScanTiming | None, raw: Array) -> Arr
     seen = to_plane(frame.camera, raw)
     return seen - displacement_m(frame, scan, raw, seen)
 
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
 _GAIN_LEAST = 0.3
@@ -108,7 +104,7 @@ class Posed:
 class _Cut:
     """Patches of one view."""
 
-    points: NDArray[np.intp]
+    points: Indices
     centres: Array  # raw px
     by_patch: Array  # (n, 2, 2) raw px per patch px
     bend: Array  # (n, 2) raw px per squared patch px

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,15 +26,12 @@ from semcal_ros.applications.reconstruction.patches import (
     plane_at_centre,
 )
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["Structure", "StructureSettings", "mirror_of", "reconstruct", "tracks_of"]
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ class Structure:
     curvature_1_m: Array
     adjustment: Adjustment
     observations: Observations
-    frames: Index
+    frames: Indices
     cameras: tuple[ScanCamera, ...]
     tracked: int
     unplaced: int

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["SphereFit", "fit_sphere"]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _TRIALS = 500
 _MAD_TO_SIGMA = 1.4826

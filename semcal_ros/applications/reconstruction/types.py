@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Observations", "Tracks", "camera_table"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +56,15 @@ class Observations:
         (n, 2, 2) root of the information: ``root @ error`` has unit covariance, 1/px.
     """
 
-    view: Index
-    point: Index
+    view: Indices
+    point: Indices
     xy: Array
     root: Array
 
     def __len__(self) -> int:
         return len(self.view)
 
-    def chosen(self, keep: Mask | Index) -> Observations:
+    def chosen(self, keep: Mask | Indices) -> Observations:
         """Some of them."""
         return Observations(self.view[keep], self.point[keep], self.xy[keep], self.root[keep])
 

@@ -9,13 +9,12 @@ whose principal points are both wrong by d px, it lies at ``X + d / m1``, then a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.core.arrays import Array
 
 __all__ = ["AxisObserver"]
 
-Array = NDArray[np.float64]
 
 # Cameras of one magnification that differ: another calibration has come into force.
 _SAME_SCALE = 0.002

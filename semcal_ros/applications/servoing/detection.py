@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.applications.servoing.sides import refine_quads
 from semcal_ros.applications.servoing.target import NestedTarget, dictionary
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["TargetView", "find_target"]
 
-Array = NDArray[np.float64]
 
 # Larger images are averaged down by a whole factor to find the markers; their sides are then measured at full
 # resolution.
@@ -57,7 +57,7 @@ class TargetView:
         """The same markers with their corners (n, 4, 2) elsewhere."""
         return TargetView(self.ids, self.target_xy_m, xy, self.covariance_px2, self.reason)
 
-    def chosen(self, keep: NDArray[np.bool_]) -> TargetView:
+    def chosen(self, keep: Mask) -> TargetView:
         """Some of the markers."""
         return TargetView(
             self.ids[keep],

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semcal_ros.applications.servoing.axis import AxisObserver
 from semcal_ros.applications.servoing.detection import TargetView
@@ -19,11 +19,11 @@ from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceO
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
 from semcal_ros.applications.servoing.settings import ServoSettings
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Servo", "ServoStep"]
 
-Array = NDArray[np.float64]
 
 # Part of the error that is taken away per frame, at most. With the latency foretold, up to 2 is stable; without any
 # forecast 0.5 still is for a latency of two frames, whose limit is 0.618.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["CommandHistory", "DisturbanceObserver", "FollowWatch"]
 
-Array = NDArray[np.float64]
 
 _KEPT = 1024
 # Deviations beyond which a surprise is none of a drift, and how many in a row are one after all.

@@ -6,14 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["PlaneCamera", "projection_of_frame"]
 
-Array = NDArray[np.float64]
 
 # Two matrices that were computed from the same numbers, one of them divided by rho and multiplied by it again.
 _SAME = 1e-9

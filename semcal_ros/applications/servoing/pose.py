@@ -6,16 +6,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semcal_ros.applications.servoing.detection import TargetView
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["PlanePose", "PoseFit", "fit_pose", "interaction_matrix"]
 
-Array = NDArray[np.float64]
 
 _MOST_STEPS = 12
 _SETTLED_PX = 1e-6

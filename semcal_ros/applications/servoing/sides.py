@@ -13,12 +13,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Image, Mask
 
 __all__ = ["RefinedQuads", "refine_quads"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 # Part of a side that is left out at both of its ends, where the window would meet the next side.
 _ENDS = 0.14
@@ -52,7 +51,7 @@ class RefinedQuads:
 
     xy: Array
     covariance_px2: Array
-    good: NDArray[np.bool_]
+    good: Mask
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["CELLS", "MARKER_BITS", "RATIO", "SIDE", "NestedTarget", "dictionary"]
 
-Array = NDArray[np.float64]
 
 RATIO = 3
 """How many times smaller the next board is."""

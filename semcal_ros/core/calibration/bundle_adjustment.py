@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.normal_equations import (
     NormalEquations,
     Problem,
@@ -27,7 +27,6 @@ from semcal_ros.core.calibration.normal_equations import (
 
 __all__ = ["BundleResult", "refine"]
 
-Array = NDArray[np.float64]
 
 _MAX_ITERATIONS = 60
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10

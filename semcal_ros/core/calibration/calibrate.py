@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import PoseFit, fit_poses, rms_by_magnification
@@ -36,7 +36,6 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = ["METHODS", "RESIDUAL_MODES", "CalibrationResult", "MethodOptions", "calibrate_views"]
 
-Array = NDArray[np.float64]
 Functions = Mapping[str, ContinuousFunction]
 
 METHODS = ("joint", "pda", "discrete")
@@ -311,7 +310,7 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
 def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
     discrete = fit_discrete(setup, tau_px=options.tau_px)
 
-    def functions_of(keep: NDArray[np.bool_]) -> tuple[Functions, Array]:
+    def functions_of(keep: Mask) -> tuple[Functions, Array]:
         part = DiscreteFit(
             discrete.magnifications[keep],
             discrete.parameters[keep],

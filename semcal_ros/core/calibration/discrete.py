@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.distortion_centre import DistortionCentre, find_distortion_centre
 from semcal_ros.core.calibration.initial_values import initial_values
@@ -32,7 +32,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
 __all__ = ["DiscreteFit", "fit_discrete", "table_functions"]
 
-Array = NDArray[np.float64]
 
 # Prior 1-sigma that holds a parameter at its mean.
 _HELD = 1e-9

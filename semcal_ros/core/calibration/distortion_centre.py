@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import (
     fit_homography,
@@ -24,7 +24,6 @@ from semcal_ros.core.camera.plane_geometry import (
 
 __all__ = ["DistortionCentre", "find_distortion_centre"]
 
-Array = NDArray[np.float64]
 
 _SIGNIFICANCE = 1e-3
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
@@ -20,8 +20,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
 __all__ = ["PoseFit", "fit_poses", "rms_by_magnification"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -116,9 +114,7 @@ def fit_poses(
     return _best_of([again], problem.starts, g_of_view)
 
 
-def _best_of(
-    fits: Sequence[BundleResult], starts: NDArray[np.intp], magnifications: Array
-) -> PoseFit:
+def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Array) -> PoseFit:
     costs = np.stack(
         [
             np.add.reduceat(

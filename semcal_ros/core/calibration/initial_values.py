@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import (
     AffineView,
@@ -23,7 +23,6 @@ from semcal_ros.core.errors import CalibrationError
 
 __all__ = ["InitialValues", "initial_values", "pose_from_camera"]
 
-Array = NDArray[np.float64]
 
 # Width of the field over the distance of the pivot. Noise and distortion imitate some hundredths; an SEM at 100x has
 # 0.06 to 0.15, a photographic lens about 1.

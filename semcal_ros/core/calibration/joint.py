@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
@@ -49,7 +49,6 @@ __all__ = [
     "without_magnification",
 ]
 
-Array = NDArray[np.float64]
 
 RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.problem import Setup, variance_factor
@@ -23,7 +23,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
 __all__ = ["Summary", "select_functions"]
 
-Array = NDArray[np.float64]
 
 _MAX_SIZE = 8
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.projection import project_points, project_points_with_jacobians
@@ -41,8 +41,6 @@ __all__ = [
     "with_height_prior",
 ]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
 _HUBER = 3.0
@@ -77,8 +75,8 @@ class Problem:
     board_m: Array
     observed_px: Array
     whitening: Array
-    starts: Index
-    group: Index
+    starts: Indices
+    group: Indices
     designs: Array
     unit_m: Array
     norm_px: float
@@ -87,7 +85,7 @@ class Problem:
     height_sigma_m: Array
 
     @property
-    def view_of_point(self) -> Index:
+    def view_of_point(self) -> Indices:
         """(N,) view index of every point."""
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
 
@@ -302,7 +300,7 @@ def moved(problem: Problem, state: State, change: Array, pose: Array) -> State:
     )
 
 
-def part_of(problem: Problem, chosen: NDArray[np.bool_]) -> Problem:
+def part_of(problem: Problem, chosen: Mask) -> Problem:
     """The problem with only some of its views."""
     points = chosen[problem.view_of_point]
     counts = np.diff(problem.starts)[chosen]

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem, theta_system, whitened_norm
@@ -72,8 +71,6 @@ def likely_jump(setup: Setup, problem: Problem, result: BundleResult) -> Jump | 
             best = Jump(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
     return best
 
-
-Array = NDArray[np.float64]
 
 # Robust standard deviations: heights are a mixture of still and moved stages, with long tails.
 _HEIGHT_SIGMAS = 8.0

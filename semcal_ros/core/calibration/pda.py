@@ -10,16 +10,14 @@ of degree 3 and 5 prone to oscillate; all of these can be selected here so that 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.discrete import DiscreteFit
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = ["ode_weights", "pda_functions"]
-
-Array = NDArray[np.float64]
 
 
 def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Array:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.normal_equations import Problem, State, make_problem, whitened_norm
 from semcal_ros.core.calibration.views import GridView
@@ -29,7 +29,6 @@ __all__ = [
     "with_coefficients",
 ]
 
-Array = NDArray[np.float64]
 Functions = Mapping[str, ContinuousFunction]
 
 _JUMPING = ("scale", "aspect", "skew")

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
@@ -34,8 +34,6 @@ __all__ = [
     "solve_field",
 ]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Standard deviations of a coefficient that are tried, px: from less than the noise to a camera lens.
 _STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
@@ -77,7 +75,7 @@ class FieldSystem:
 
     information: Array
     right: Array
-    group: NDArray[np.intp]
+    group: Indices
     designs: Array
     weights: Array
     theta_mean: Array

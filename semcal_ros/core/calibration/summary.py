@@ -7,16 +7,14 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import PoseFit, rms_by_magnification
 from semcal_ros.core.calibration.joint import FittedField
 from semcal_ros.core.calibration.problem import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = ["about_field", "data_warnings", "statistics_of"]
-
-Array = NDArray[np.float64]
 
 
 def about_field(fitted: FittedField | None) -> dict[str, Any] | None:

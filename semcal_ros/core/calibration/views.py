@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = [
@@ -24,8 +25,6 @@ __all__ = [
 if TYPE_CHECKING:
     from semcal_ros.core.corners import LatticeDetection
 
-
-Array = NDArray[np.float64]
 
 # Relative error of the size of a square that tilt, height, noise and the microscope's own scale do not explain.
 _MISFIT = 0.12
@@ -142,7 +141,7 @@ class SquareAssignment:
         return float(np.exp(np.max(np.abs(np.log(self.apparent_m / self.square_m)))))
 
     @property
-    def misfits(self) -> NDArray[np.bool_]:
+    def misfits(self) -> Mask:
         """(v,) views whose squares have none of the known sizes at their magnification."""
         return np.asarray(np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -17,7 +17,6 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["FUNCTION_NAMES", "CalibrationModel", "checked_magnification", "design_matrix"]
 
-Array = NDArray[np.float64]
 
 # The scale is kept relative to the nominal one, width g / display width, so that it is a number near 1 at every g.
 FUNCTION_NAMES: tuple[str, ...] = ("scale", *PARAMETER_NAMES[1:])

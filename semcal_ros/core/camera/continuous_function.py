@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["KINDS", "ContinuousFunction", "basis_row"]
 
-Array = NDArray[np.float64]
 
 KINDS = ("chebyshev_log", "chebyshev", "legendre", "linear_log", "ode")
 

@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Mask
 
 __all__ = ["Undistortion", "distort_jacobians", "distort_normalised", "undistort_normalised"]
 
-Array = NDArray[np.float64]
 
 _MAX_ITERATIONS = 50
 # Half an ulp of a coordinate of order one: Newton cannot do better in double precision.
@@ -43,7 +43,7 @@ class Undistortion:
     """
 
     q: Array
-    converged: NDArray[np.bool_]
+    converged: Mask
     iterations: int
     residual: Array
 

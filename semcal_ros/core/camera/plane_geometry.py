@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array
 
 __all__ = [
     "AffineView",
@@ -22,8 +23,6 @@ __all__ = [
     "transform_points",
     "view_affine",
 ]
-
-Array = NDArray[np.float64]
 
 
 def cross_matrices(vectors: Array) -> Array:

@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import distort_jacobians, distort_normalised
 
 __all__ = [
@@ -27,7 +27,6 @@ __all__ = [
     "project_points_with_jacobians",
 ]
 
-Array = NDArray[np.float64]
 
 PARAMETER_NAMES: tuple[str, ...] = (
     "m",

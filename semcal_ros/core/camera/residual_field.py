@@ -19,14 +19,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["FieldSlice", "ResidualField", "zero_field"]
 
-Array = NDArray[np.float64]
 
 _DEGREE = 3
 # Half image widths; the outermost knots lie outside of the image, so that its border is inside of the domain.

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import (
     Undistortion,
     distort_normalised,
@@ -20,8 +21,6 @@ from semcal_ros.core.camera.residual_field import FieldSlice
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["ScanCamera", "as_points"]
-
-Array = NDArray[np.float64]
 
 
 def as_points(values: ArrayLike, dimensions: int) -> Array:

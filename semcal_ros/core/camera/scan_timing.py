@@ -13,8 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["ScanTiming"]
@@ -65,9 +66,7 @@ class ScanTiming:
         """Variance of the times at which the passes see one pixel, s^2."""
         return self.frame_time_s**2 * (self.averages**2 - 1) / 12.0
 
-    def pixel_offset_s(
-        self, row: ArrayLike, col: ArrayLike, rows: int, cols: int
-    ) -> NDArray[np.float64]:
+    def pixel_offset_s(self, row: ArrayLike, col: ArrayLike, rows: int, cols: int) -> Array:
         """Mean time of pixels over all passes, in seconds after the stamp.
 
         Parameters

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.corner_fit import CornerFit
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.window import PixelWindows
@@ -76,11 +76,6 @@ def _continues(fitted: Fitted, joined: Mask, other: Mask) -> bool:
     return bool(np.median(miss / allowed) < 1.0)
 
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Single = NDArray[np.float32]
-
 # Corners nearer to the frame than this are not fitted: less than half of their window is in the
 # image.
 MARGIN_PX = 2.0
@@ -137,7 +132,7 @@ class Fitted:
         )
 
 
-def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Single) -> Mask:
+def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) -> Mask:
     """Fits that settled near the prediction, with the right sign of contrast."""
     norm = np.linalg.norm(maps.axes, axis=2)
     spacing = np.abs(maps.cell_px2) / norm.max(axis=1)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32, Mask
 from semcal_ros.core.corners.edge_model import (
     ANGLES,
     BRIGHTNESS,
@@ -24,8 +24,6 @@ from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 BLUR_MIN_PX = 0.28
 BAND_MIN_PX = 3.0
@@ -51,7 +49,7 @@ class NoiseModel:
     slope: float
     dark: float
 
-    def variance(self, value: Single) -> Single:
+    def variance(self, value: Array32) -> Array32:
         """Variance at the grey values ``value``, same shape."""
         variance = np.float32(self.slope) * (value - np.float32(self.dark))
         variance += np.float32(self.floor)
@@ -109,7 +107,7 @@ class CornerFit:
     unlike: Array
     blur_pull: Array
 
-    def select(self, keep: NDArray[np.bool_]) -> CornerFit:
+    def select(self, keep: Mask) -> CornerFit:
         """The fits of the corners where ``keep`` is true."""
         return CornerFit(*(getattr(self, f.name)[keep] for f in fields(self)))
 
@@ -302,7 +300,7 @@ def fit_noise(fit: CornerFit) -> NoiseModel:
 
 
 def _statistics(
-    windows: PixelWindows, residual: Single, model: Single, freedom: Array
+    windows: PixelWindows, residual: Array32, model: Array32, freedom: Array
 ) -> tuple[Array, Array]:
     """Levels and variances of the pixels darker and brighter than the middle, both (n, 2)."""
     valid = windows.valid
@@ -318,7 +316,7 @@ def _statistics(
     return level, variance
 
 
-def _normal_equations(jacobian: Single, residual: Single, weight: Single) -> tuple[Array, Array]:
+def _normal_equations(jacobian: Array32, residual: Array32, weight: Array32) -> tuple[Array, Array]:
     weighted = jacobian * weight[:, None, :]
     normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
     right = (weighted @ residual[:, :, None])[:, :, 0].astype(np.float64)

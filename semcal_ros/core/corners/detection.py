@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import Array, Image, Indices
 from semcal_ros.core.corners.lattice import Lattice, grow_best_lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
@@ -14,9 +15,6 @@ from semcal_ros.core.corners.saddle import find_saddles, prepare_image, screen_i
 
 __all__ = ["LatticeDetection", "find_lattice"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Image = NDArray[np.float32]
 
 SCALES_PX = (2.5, 1.5, 4.2, 7.0)
 MINIMUM_CORNERS = 12

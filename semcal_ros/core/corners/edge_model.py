@@ -17,8 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [
@@ -35,8 +35,6 @@ __all__ = [
     "evaluate",
 ]
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 # x, y, direction of the edge along i and of that along j, log blur, extra sagitta of the two edges
 # over half a square; then b0, bx, by, a0, ax, ay, g1, g2.
@@ -102,7 +100,7 @@ ERF_C = tuple(
 NEIGHBOUR_BLURS = 8.0
 
 
-def _erf_and_bell(z: Single) -> tuple[Single, Single]:
+def _erf_and_bell(z: Array32) -> tuple[Array32, Array32]:
     """erf(z / sqrt 2) and exp(-z^2 / 2)."""
     bell = np.exp(np.float32(-0.5) * z * z)
     t = np.float32(1.0) / (np.float32(1.0) + (ERF_P * np.float32(np.sqrt(0.5))) * np.abs(z))
@@ -115,8 +113,8 @@ def _erf_and_bell(z: Single) -> tuple[Single, Single]:
 
 
 def _profile(
-    distance: Single, spacing: Single, blur: Single
-) -> tuple[Single, Single, Single, Single]:
+    distance: Array32, spacing: Array32, blur: Array32
+) -> tuple[Array32, Array32, Array32, Array32]:
     """S, dS/dd, dS/dlog(w) and B."""
     scale = np.float32(np.sqrt(2.0 / np.pi)) / blur
     value, slope = _erf_and_bell(distance / blur)
@@ -139,7 +137,7 @@ def _profile(
 
 def evaluate(
     windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, linear: Array | None
-) -> tuple[Single, Single]:
+) -> tuple[Array32, Array32]:
     """Derivatives of the model at the pixels, and the model.
 
     Returns
@@ -150,7 +148,7 @@ def evaluate(
         (n, p) grey values; zeros where ``linear`` is None.
     """
 
-    def column(values: Array) -> Single:
+    def column(values: Array) -> Array32:
         return np.asarray(values, dtype=np.float32)[:, None]
 
     px, py, angle_1, angle_2, log_blur, sag_1, sag_2 = nonlinear.T

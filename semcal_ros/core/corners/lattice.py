@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.corners.saddle import SaddlePoints
 
 __all__ = ["Lattice", "grow_best_lattice"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 NEIGHBOURS = 20
 # Saddle directions of skewed cells are off by some degrees, and noise adds to it.
@@ -46,7 +44,7 @@ class Lattice:
     xy: Array
     axes: Array
 
-    def select(self, keep: NDArray[np.bool_]) -> Lattice:
+    def select(self, keep: Mask) -> Lattice:
         """The points where ``keep`` is true."""
         return Lattice(self.ij[keep], self.xy[keep], self.axes[keep])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.checks import (
     CORNERS_MIN,
     MARGIN_PX,
@@ -39,10 +39,6 @@ from semcal_ros.core.corners.window import gather_windows
 
 __all__ = ["RefinedCorners", "refine_lattice"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Single = NDArray[np.float32]
 
 FIRST_BLUR_PX = 1.0
 GROW_ROUNDS = 4
@@ -97,7 +93,7 @@ class _Knowledge:
         return float(np.exp(self.learnt.common[LOG_BLUR]))
 
 
-def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
+def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
     """Fit all corners of a lattice, drop bad ones, look for missed ones; None if under six remain.
 
     A sample of the corners teaches noise, blur and what varies how much over the image; with this
@@ -150,7 +146,7 @@ def refine_lattice(image: Single, lattice: Lattice) -> RefinedCorners | None:
     return replace(result, foreign=agreeing - len(passed))
 
 
-def _quality(fitted: Fitted, image: Single) -> float:
+def _quality(fitted: Fitted, image: Array32) -> float:
     """Part of the corners that passed, of those expected well inside of the image."""
     size = np.array([image.shape[1], image.shape[0]])
     slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
@@ -172,7 +168,7 @@ def _shuffled(lattice: Lattice) -> Lattice:
     return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
 
 
-def _failed(cells: Indices, xy: Array, passed: Indices, image: Single) -> Array:
+def _failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array:
     """(k, 2) positions in the image of the cells, each once, that are not among those passed."""
     keys, first = np.unique(_keys(cells), return_index=True)
     size = np.array([image.shape[1], image.shape[0]])
@@ -203,7 +199,7 @@ def _plausible(lattice: Lattice) -> Lattice:
     return lattice.select(keep)
 
 
-def _first_fit(image: Single, cells: Indices, maps: LocalMaps) -> Fitted:
+def _first_fit(image: Array32, cells: Indices, maps: LocalMaps) -> Fitted:
     """Fit with equal weights and loose priors."""
     windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
@@ -237,7 +233,7 @@ def _relearn(known: Fitted, knowledge: _Knowledge) -> _Knowledge:
 
 
 def _fit(
-    image: Single, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
+    image: Array32, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
 ) -> Fitted:
     """Fit all cells from their local maps and judge each fit on its own."""
     band = band_px(knowledge.blur_px)
@@ -249,7 +245,7 @@ def _fit(
     return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
 
 
-def _last_fit(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted | None:
+def _last_fit(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted | None:
     """Fit once more, with maps and levels through the corners themselves."""
     maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
     known, maps = known.select(maps.usable), maps.select(maps.usable)
@@ -273,7 +269,7 @@ def _last_fit(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted | N
     return Fitted(known.cells, maps, known.windows, fit, good)
 
 
-def _fill(image: Single, known: Fitted, knowledge: _Knowledge) -> Fitted:
+def _fill(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted:
     """Fit free cells next to good corners, round by round, as long as that finds more."""
     limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
     tried = _keys(known.cells)

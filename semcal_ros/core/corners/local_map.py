@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Indices, Mask
 
 __all__ = ["LocalMaps", "fit_local_maps"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 # With many corners the squares are small and a quadratic over 5 x 5 corners follows any lens; with
 # few, large squares the third order matters.
@@ -52,13 +51,13 @@ class LocalMaps:
         return np.asarray(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0])
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> Mask:
         """Where enough neighbours, not all in a row, determine a regular map."""
         norm = np.linalg.norm(self.axes, axis=2)
         skew = self.cell_px2 / np.maximum(norm[:, 0] * norm[:, 1], 1e-9)
         return np.asarray((self.support >= SUPPORT_MIN) & (norm.min(axis=1) > 1.0) & (skew > 0.2))
 
-    def select(self, keep: NDArray[np.bool_]) -> LocalMaps:
+    def select(self, keep: Mask) -> LocalMaps:
         """The maps of the cells where ``keep`` is true."""
         return LocalMaps(
             self.xy[keep],

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.corners.checks import CORNERS_MIN, Fitted, inflation
 from semcal_ros.core.corners.local_map import SUPPORT_MIN, fit_local_maps
 from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
 
 __all__ = ["smooth"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
 MISS_SIGMAS = (5.0, 4.3, 3.7)

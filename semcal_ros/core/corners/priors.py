@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.corners.edge_model import (
     ANGLES,
     GRADIENTS,
@@ -26,8 +26,6 @@ from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 
 __all__ = ["LARGE_SQUARE_PX", "Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 PARAMETERS = NONLINEAR + LINEAR
 ANGLE_PRIOR = 0.03

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 # Below this part of the response of the strong saddles a maximum is taken for noise. The response
 # is quadratic in the contrast, so corners with a third of the contrast of the strong ones still

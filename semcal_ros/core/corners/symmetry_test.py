@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = ["opposite_squares"]
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 
 def opposite_squares(
     windows: PixelWindows,
     nonlinear: Array,
-    jacobian: Single,
-    residual: Single,
-    weight: Single,
+    jacobian: Array32,
+    residual: Array32,
+    weight: Array32,
     normal: Array,
     step: Array,
 ) -> tuple[Array, Array]:
@@ -44,7 +41,7 @@ def opposite_squares(
         (n,) the larger of the two steps, half the difference of grey value.
     """
 
-    def column(values: Array) -> Single:
+    def column(values: Array) -> Array32:
         return np.asarray(values, dtype=np.float32)[:, None]
 
     px, py, angle_1, angle_2 = nonlinear.T[:4]

@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32, Mask
+
 __all__ = ["PixelWindows", "gather_windows"]
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 # Windows of neighbouring corners just touch, so that no pixel is used twice and the errors are
 # independent.
@@ -38,14 +38,14 @@ class PixelWindows:
         (n,) part of the window that lies in the image.
     """
 
-    x: Single
-    y: Single
-    value: Single
-    valid: Single
+    x: Array32
+    y: Array32
+    value: Array32
+    valid: Array32
     origin: Array
     coverage: Array
 
-    def select(self, keep: NDArray[np.bool_] | slice) -> PixelWindows:
+    def select(self, keep: Mask | slice) -> PixelWindows:
         """The windows where ``keep`` is true, or a slice of them without a copy."""
         return PixelWindows(*(getattr(self, f.name)[keep] for f in fields(self)))
 
@@ -54,7 +54,7 @@ class PixelWindows:
         """All windows of several sets, padded alike."""
         pixels = max(part.x.shape[1] for part in parts)
 
-        def padded(name: str) -> Single:
+        def padded(name: str) -> Array32:
             out = np.zeros((sum(len(part.x) for part in parts), pixels), dtype=np.float32)
             first = 0
             for part in parts:
@@ -74,7 +74,7 @@ class PixelWindows:
 
 
 def gather_windows(
-    image: Single, origin: Array, axes: Array, bend: Array, band_px: float
+    image: Array32, origin: Array, axes: Array, bend: Array, band_px: float
 ) -> PixelWindows:
     """Pixels within half a square of each origin and within ``band_px`` of one of the two edges.
 
@@ -100,7 +100,7 @@ def gather_windows(
 
 
 def _gather_block(
-    image: Single, origin: Array, axes: Array, bend: Array, band_px: float, reach: int
+    image: Array32, origin: Array, axes: Array, bend: Array, band_px: float, reach: int
 ) -> PixelWindows:
     height, width = image.shape
     start = np.floor(origin + 0.5).astype(np.int64)
@@ -127,10 +127,10 @@ def _gather_block(
 
 
 def _packed(
-    image: Single,
-    inside: NDArray[np.bool_],
+    image: Array32,
+    inside: Mask,
     start: NDArray[np.int64],
-    shift: Single,
+    shift: Array32,
     origin: Array,
     coverage: Array,
 ) -> PixelWindows:
@@ -145,7 +145,7 @@ def _packed(
     first = np.cumsum(count) - count
     slot = np.arange(len(corner)) + (corner * pixels - first[corner])
 
-    def spread(values: Single) -> Single:
+    def spread(values: Array32) -> Array32:
         out = np.zeros(len(origin) * pixels, dtype=np.float32)
         out[slot] = values
         return out.reshape(-1, pixels)

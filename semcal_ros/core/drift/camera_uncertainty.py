@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "zoom_of",
 ]
 
-Array = NDArray[np.float64]
 
 # Places of the parameters in ScanCamera.covariance.
 _SCALES, _CENTRE = slice(0, 3), slice(3, 5)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.process_noise import Restlessness
@@ -27,7 +27,6 @@ __all__ = [
     "path_of_updates",
 ]
 
-Array = NDArray[np.float64]
 
 _NUMBER = re.compile(r"-?\d[\d.]*")
 
@@ -283,15 +282,15 @@ class DriftPath:
     sigma_px: Array
     residual: Array
     status: tuple[str, ...]
-    accepted: NDArray[np.bool_]
-    restarted: NDArray[np.bool_]
+    accepted: Mask
+    restarted: Mask
     calibrated: bool
 
     def __len__(self) -> int:
         return len(self.status)
 
     @property
-    def trusted(self) -> NDArray[np.bool_]:
+    def trusted(self) -> Mask:
         """(n,) bool: accepted, and tracked all the way back to the first frame."""
         return np.asarray(self.accepted & ~np.logical_or.accumulate(self.restarted))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import Measure, Move, Operation, Settle, Widen
 from semcal_ros.core.drift.process_noise import Restlessness
 from semcal_ros.core.drift.smoother import Event, Mark, likely_restlessness, replayed
@@ -14,7 +14,6 @@ from semcal_ros.core.drift.state import DriftMap
 
 __all__ = ["DriftFilter"]
 
-Array = NDArray[np.float64]
 
 # Part of the way that the process noise goes with each innovation.
 _PACE = 0.2

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -16,7 +17,6 @@ from semcal_ros.core.registration.reference import Region
 
 __all__ = ["Shot", "Stills", "resampleable"]
 
-Array = NDArray[np.float64]
 
 # Motions that bend a frame by less are left in it.
 _NEGLIGIBLE_PX = 1e-3

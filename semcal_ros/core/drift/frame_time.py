@@ -30,16 +30,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.keyframe_store import MEANS_PREPARED
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["LEFT_IN", "REMOVED", "FrameTimeEstimate", "estimate_frame_time"]
 
-Array = NDArray[np.float64]
 
 #: Shear per shift, 1-sigma, where distortion is left in the pictures, and where a calibration
 #: removed it.
@@ -152,7 +151,7 @@ class _Seen:
     own_velocity: Array
     key: Array
     key_velocity: Array
-    group: NDArray[np.intp]
+    group: Indices
 
 
 @dataclass
@@ -278,7 +277,7 @@ class _Solved:
 def _solved(
     seen: _Seen,
     design: Array,
-    groups: Sequence[NDArray[np.intp]],
+    groups: Sequence[Indices],
     time_s: float,
     belief: Array,
     shear_of_shift: float,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import Widen
 from semcal_ros.core.drift.state import DriftMap
 
 __all__ = ["GATE", "Surprises", "of_a_contradiction", "of_a_pause", "of_another_place"]
 
-Array = NDArray[np.float64]
 
 #: Innovations beyond this normalised square happen to a correct filter once in a million frames.
 GATE = 27.6

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
@@ -15,8 +12,6 @@ from semcal_ros.core.drift.smoother import likely_restlessness, smoothed
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["DriftHistory"]
-
-Array = NDArray[np.float64]
 
 
 class DriftHistory:

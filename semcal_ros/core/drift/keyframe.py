@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.frame import Shot
 from semcal_ros.core.registration.fractional_delay import FINE, sampled
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
@@ -24,8 +25,6 @@ __all__ = [
     "keyframe_of",
     "scale_ratio",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.core.drift.frame import Shot
 from semcal_ros.core.drift.keyframe import Keyframe, carried, scale_ratio
@@ -14,7 +13,6 @@ from semcal_ros.core.registration.reference import Reference, RegistrationSettin
 
 __all__ = ["MEANS_PREPARED", "SAME_SCALE", "Candidate", "KeyframeStore"]
 
-Array = NDArray[np.float64]
 
 #: Ratio of two scales below which pictures need no resampling: 0.05 px at the edge of 1024 px.
 SAME_SCALE = 1.0001

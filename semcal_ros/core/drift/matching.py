@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import Shot, Stills
 from semcal_ros.core.drift.keyframe import keyframe_of
@@ -19,7 +20,6 @@ from semcal_ros.core.registration.register import Registration, register
 
 __all__ = ["Found", "joins", "look"]
 
-Array = NDArray[np.float64]
 
 _LOOKS = 4
 # What frames must be like to become part of their keyframe's mean.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.camera_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
 from semcal_ros.core.drift.frame import Shot
 from semcal_ros.core.drift.operations import Carry, Measure
@@ -23,7 +23,6 @@ __all__ = [
     "measure_of",
 ]
 
-Array = NDArray[np.float64]
 
 # What the registration's model does not know, 1-sigma: of a shift, of a shear, and of a shear as a
 # part of the shift; the last is larger where distortion is left in.

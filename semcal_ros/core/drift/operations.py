@@ -10,8 +10,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.process_noise import Restlessness
 from semcal_ros.core.drift.state import EACH, MOVING, OWN, DriftMap
 from semcal_ros.core.errors import InvalidValueError
@@ -28,8 +28,6 @@ __all__ = [
     "Settle",
     "Widen",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

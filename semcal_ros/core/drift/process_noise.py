@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array
 
 __all__ = ["Restlessness"]
 
-Array = NDArray[np.float64]
 
 # Gauss-Legendre quadrature, and up to how many memories it is used.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import Measure, Operation
 from semcal_ros.core.drift.process_noise import Restlessness
 from semcal_ros.core.drift.state import DriftMap
@@ -24,7 +24,6 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Event", "Mark", "likely_restlessness", "replayed", "smoothed"]
 
-Array = NDArray[np.float64]
 
 _OUTLIER_NIS = 25.0
 _MAX_FOR_LIKELIHOOD = 600

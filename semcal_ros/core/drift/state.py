@@ -24,11 +24,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array
 
 __all__ = ["EACH", "MOVING", "OWN", "DriftMap", "still"]
 
-Array = NDArray[np.float64]
 
 #: Numbers of drift, velocity and acceleration; with the error of the principal point; of a keyframe.
 MOVING, OWN, EACH = 6, 8, 4

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
@@ -44,7 +45,6 @@ from semcal_ros.core.registration.register import Registration
 
 __all__ = ["DriftForecast", "DriftOutlook", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
-Array = NDArray[np.float64]
 
 # Multiple of the first step's sigma within which a shift agrees with what was expected.
 _REACH = 2.0

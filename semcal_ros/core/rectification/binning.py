@@ -9,15 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["binned"]
 
-Picture = NDArray[np.generic]
 
-
-def binned(image: Picture, camera: ScanCamera, largest_px: int) -> tuple[Picture, ScanCamera]:
+def binned(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyImage, ScanCamera]:
     """A picture with no side longer than ``largest_px``, and the camera that takes it.
 
     Square blocks of pixels are averaged. Rows and columns that fill no block, at the bottom and on

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 
 __all__ = ["RawMap", "SmoothMaps", "keep"]
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
@@ -57,8 +55,8 @@ class _Interpolant:
 
     points_xy: Array
     nodes: int
-    rows: Map
-    cols: Map
+    rows: Array32
+    cols: Array32
     test_rows: Array
     test_cols: Array
 
@@ -117,11 +115,11 @@ class RawMap:
     """
 
     size: tuple[int, int]
-    _rows: Map | None
-    _columns: Map | None
+    _rows: Array32 | None
+    _columns: Array32 | None
     _exact: tuple[ScanCamera | None, RasterDrift | None, ScanTiming | None]
 
-    def band(self, top: int, bottom: int, out: Map) -> None:
+    def band(self, top: int, bottom: int, out: Array32) -> None:
         """Write raw x and raw y of the rows ``top`` to ``bottom`` side by side: (rows, 2 w)."""
         if self._rows is not None and self._columns is not None:
             np.matmul(self._rows[top:bottom], self._columns, out=out)

@@ -14,15 +14,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
 
-Array = NDArray[np.float64]
 
 _MAX_STEPS = 50
 _SETTLED_PX = 1e-5

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import AnyImage, Array32
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -30,8 +31,6 @@ from semcal_ros.core.rectification.raw_positions import (
 
 __all__ = ["Rectifier"]
 
-Map = NDArray[np.float32]
-Picture = NDArray[np.generic]
 
 _INTERPOLATIONS = {
     "linear": cv2.INTER_LINEAR,
@@ -69,19 +68,19 @@ class Rectifier:
             )
         self._flag = _INTERPOLATIONS[interpolation]
         self._smooth = SmoothMaps()
-        self._kept: OrderedDict[tuple[object, ...], tuple[Map, Map]] = OrderedDict()
+        self._kept: OrderedDict[tuple[object, ...], tuple[Array32, Array32]] = OrderedDict()
         self._last: tuple[object, ...] | None = None
-        self._scratch: deque[Map] = deque()
+        self._scratch: deque[Array32] = deque()
 
     def rectify(
         self,
-        image: Picture,
+        image: AnyImage,
         camera: ScanCamera | None,
         drift: RasterDrift | None = None,
         timing: ScanTiming | None = None,
         *,
-        out: Picture | None = None,
-    ) -> Picture:
+        out: AnyImage | None = None,
+    ) -> AnyImage:
         """The frame as an ideal camera would see the specimen at zero drift.
 
         Parameters
@@ -129,7 +128,7 @@ class Rectifier:
         camera: ScanCamera | None,
         drift: RasterDrift | None = None,
         timing: ScanTiming | None = None,
-    ) -> tuple[Map, Map]:
+    ) -> tuple[Array32, Array32]:
         """Raw x and y, (h, w) float32 each, of every output pixel of an image of ``size`` (width,
         height).
         """
@@ -138,11 +137,13 @@ class Rectifier:
         key = camera_key(size, fitted) + drift_key(drift, timing)
         return self._whole(key, fitted, drift, timing)
 
-    def remapped(self, image: Picture, map_x: Map, map_y: Map) -> Picture:
+    def remapped(self, image: AnyImage, map_x: Array32, map_y: Array32) -> AnyImage:
         """The image at raw positions as :meth:`maps` gives them; 0 outside of it."""
         return self._remap(image, map_x, map_y, None)
 
-    def _remap(self, image: Picture, map_x: Map, map_y: Map, out: Picture | None) -> Picture:
+    def _remap(
+        self, image: AnyImage, map_x: Array32, map_y: Array32, out: AnyImage | None
+    ) -> AnyImage:
         picture, output = cast("NDArray[np.float32]", image), cast("NDArray[np.float32]", out)
         border = cv2.BORDER_CONSTANT
         warped = cv2.remap(
@@ -158,7 +159,7 @@ class Rectifier:
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
-    ) -> tuple[Map, Map]:
+    ) -> tuple[Array32, Array32]:
         """Both maps of the size that the key begins with; kept, for they are worth their memory."""
         if key in self._kept:
             self._kept.move_to_end(key)
@@ -167,22 +168,22 @@ class Rectifier:
         raw_map = self._smooth.of((width, height), camera, drift, timing)
         both = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
 
-        def copy(top: int, bottom: int, band: Map) -> None:
+        def copy(top: int, bottom: int, band: Array32) -> None:
             both[0][top:bottom], both[1][top:bottom] = band[:, :width], band[:, width:]
 
         self._each_band(raw_map, copy)
         keep(self._kept, key, both, _KEPT_MAPS)
         return both
 
-    def _in_bands(self, image: Picture, raw_map: RawMap, output: Picture) -> None:
+    def _in_bands(self, image: AnyImage, raw_map: RawMap, output: AnyImage) -> None:
         width = raw_map.size[0]
 
-        def resample(top: int, bottom: int, band: Map) -> None:
+        def resample(top: int, bottom: int, band: Array32) -> None:
             self._remap(image, band[:, :width], band[:, width:], output[top:bottom])
 
         self._each_band(raw_map, resample)
 
-    def _each_band(self, raw_map: RawMap, use: Callable[[int, int, Map], None]) -> None:
+    def _each_band(self, raw_map: RawMap, use: Callable[[int, int, Array32], None]) -> None:
         """Call ``use`` with first row, end and maps of all bands, in several threads."""
         width, height = raw_map.size
         rows = max(_BAND_PIXELS // width, 1)
@@ -220,7 +221,7 @@ def _helpers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(cv2.getNumThreads() - 1, 1), thread_name_prefix="rectify")
 
 
-def _check_image(image: Picture) -> None:
+def _check_image(image: AnyImage) -> None:
     if image.dtype.name not in _DTYPES or not (
         image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     ):
@@ -235,7 +236,7 @@ def _check_image(image: Picture) -> None:
         )
 
 
-def _checked_output(out: Picture, image: Picture) -> Picture:
+def _checked_output(out: AnyImage, image: AnyImage) -> AnyImage:
     same = out.shape == image.shape and out.dtype == image.dtype
     if not (same and out.flags.c_contiguous and out.flags.writeable):
         raise InvalidValueError(

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -22,8 +23,6 @@ from semcal_ros.core.rectification.rectifier import Rectifier
 
 __all__ = ["Stack", "StackedImage", "scanned"]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Rows or columns that an interpolation takes beyond the two nearest ones.
 _REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.inverse_compositional import Alignment, align, tile_energies
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
@@ -12,7 +12,6 @@ from semcal_ros.core.registration.tiles import Pyramid
 
 __all__ = ["NOTHING", "choose"]
 
-Array = NDArray[np.float64]
 
 NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
 # Part of the residual by which two shifts must differ to be told apart.

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Image
+
 __all__ = ["FINE", "SHARP", "Band", "gradients", "sampled"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _SAMPLES = 64
 

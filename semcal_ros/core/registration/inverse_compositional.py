@@ -21,8 +21,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
@@ -43,7 +43,6 @@ from semcal_ros.core.registration.tiles import (
 
 __all__ = ["Alignment", "align", "tile_energies"]
 
-Array = NDArray[np.float64]
 
 _MAX_PASSES = 12
 _COARSE_PASSES = 4

@@ -20,10 +20,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Image, Indices
+
 __all__ = ["PictureStatistics", "gaussian_taps", "noise_variance", "picture_statistics", "smoothed"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _CROP_PX = 256
 _NOISE_CROP_PX = 64
@@ -51,7 +51,7 @@ class PictureStatistics:
 
 
 @lru_cache(maxsize=8)
-def _rings(rows: int, cols: int) -> tuple[Array, NDArray[np.intp], Array, Array]:
+def _rings(rows: int, cols: int) -> tuple[Array, Indices, Array, Array]:
     """Window, ring of each coefficient, radial frequency (rad/px) and size of each ring."""
     window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1])
     radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None, :])

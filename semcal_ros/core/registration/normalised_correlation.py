@@ -16,12 +16,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.registration.tiles import Pyramid
 
 __all__ = ["CoarsePeak", "CoarseReference", "coarse_peaks"]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 _LEVELS_PX = (128, 256, 512)
 # A maximum over some 10^4 shifts of unrelated pictures stays below about 5 robust deviations.
@@ -77,13 +76,13 @@ class _Geometry:
     ``allowed`` whether they are enough, ``size`` that of the Fourier transforms.
     """
 
-    shift_x: NDArray[np.intp]
-    shift_y: NDArray[np.intp]
-    here: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
-    there: tuple[tuple[NDArray[np.intp], ...], tuple[NDArray[np.intp], ...]]
+    shift_x: Indices
+    shift_y: Indices
+    here: tuple[tuple[Indices, ...], tuple[Indices, ...]]
+    there: tuple[tuple[Indices, ...], tuple[Indices, ...]]
     count: Image
     root: Image
-    allowed: NDArray[np.bool_]
+    allowed: Mask
     size: tuple[int, int]
 
 
@@ -218,7 +217,7 @@ def _vertex(score: Image, row: int, col: int) -> tuple[float, float]:
     return row + d_row, col + d_col
 
 
-def _axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[NDArray[np.intp], ...]:
+def _axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[Indices, ...]:
     """Shifts along one axis, and the first and last-plus-one reference sample that overlaps."""
     shifts = np.arange(-(n_reference - 1), n_image)
     first = np.maximum(0, -shifts)
@@ -257,8 +256,8 @@ def _geometry(
 def _half(
     picture: Image,
     geometry: _Geometry,
-    rows: tuple[NDArray[np.intp], ...],
-    cols: tuple[NDArray[np.intp], ...],
+    rows: tuple[Indices, ...],
+    cols: tuple[Indices, ...],
 ) -> _Half:
     table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     # Shading was removed, so that single precision is enough for differences of the sums.
@@ -276,8 +275,8 @@ def _half(
 
 def _box_sums(
     table: Image,
-    rows: tuple[NDArray[np.intp], ...],
-    cols: tuple[NDArray[np.intp], ...],
+    rows: tuple[Indices, ...],
+    cols: tuple[Indices, ...],
 ) -> Image:
     strips = np.take(table, rows[1], axis=0) - np.take(table, rows[0], axis=0)
     # Columns are gathered as rows, which lie together in memory.

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.ambiguity import NOTHING, choose
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
@@ -39,8 +40,6 @@ __all__ = [
     "register",
 ]
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.generic]
 
 _SMALLEST_PX = 48
 # Levels of the pyramid keep at least that many px along the shorter side.
@@ -102,7 +101,7 @@ class Registration:
     nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
 
 
-def gray_of(image: ArrayLike) -> Picture:
+def gray_of(image: ArrayLike) -> AnyImage:
     """The mean of the channels, in a type that can be compared.
 
     Raises
@@ -121,7 +120,7 @@ def gray_of(image: ArrayLike) -> Picture:
     return picture if picture.dtype.name in _NATIVE else picture.astype(np.float32)
 
 
-def _cropped(image: ArrayLike, region: Region | None) -> tuple[Picture, Region]:
+def _cropped(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
     gray = gray_of(image)
     height, width = gray.shape
     if region is None:
@@ -135,7 +134,7 @@ def _cropped(image: ArrayLike, region: Region | None) -> tuple[Picture, Region]:
     return gray[top:bottom, left:right], region
 
 
-def _complaint(gray: Picture, settings: RegistrationSettings) -> str:
+def _complaint(gray: AnyImage, settings: RegistrationSettings) -> str:
     """Why a picture alone cannot be registered, or an empty string."""
     if min(gray.shape) < _SMALLEST_PX:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
@@ -243,7 +242,7 @@ def register(
     Parameters
     ----------
     reference
-        Picture, or one prepared by :func:`prepare_reference` (then ``reference_region`` and
+        AnyImage, or one prepared by :func:`prepare_reference` (then ``reference_region`` and
         ``settings`` are its own).
     image
         (h, w) or (h, w, 3) picture at the same scale; its size may differ.
@@ -309,7 +308,7 @@ def register(
 
 def _judged(
     reference: Reference,
-    gray: Picture,
+    gray: AnyImage,
     peak: CoarsePeak,
     fine: Alignment,
     origin: Array,
@@ -334,7 +333,7 @@ def _judged(
     )
 
 
-def _likeness(reference: Reference, gray: Picture, fine: Alignment) -> float:
+def _likeness(reference: Reference, gray: AnyImage, fine: Alignment) -> float:
     """Correlation that the noise-free pictures would have."""
     passed = float(np.sum(gaussian_taps(reference.levels[-1].sigma_px) ** 2)) ** 2
     noise = reference.noise_variance * passed

@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.tiles import Level, TileSums, TileWindow
 
 __all__ = ["TileFit", "TileGeometry", "fitted", "geometry_of", "residuals", "well_posed"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

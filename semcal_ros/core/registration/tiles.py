@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import AnyImage, Array, Image
 from semcal_ros.core.registration.fractional_delay import FINE, SHARP, Band, gradients, sampled
 from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smoothed
 
@@ -29,9 +30,6 @@ __all__ = [
     "tile_window",
 ]
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Picture = NDArray[np.generic]
 
 _LEAST_TILES = 3
 #: From how many pixels the common information is taken at most.
@@ -167,10 +165,10 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> Level | None:
 class Pyramid:
     """A grey picture of any type at the resolutions that are asked for."""
 
-    def __init__(self, picture: Picture) -> None:
-        self._known: dict[int, Picture] = {1: picture}
+    def __init__(self, picture: AnyImage) -> None:
+        self._known: dict[int, AnyImage] = {1: picture}
 
-    def at(self, factor: int) -> Picture:
+    def at(self, factor: int) -> AnyImage:
         """Averaged over squares of ``factor`` px, a power of two; what does not fill a square is
         left out.
         """
@@ -186,7 +184,7 @@ class Pyramid:
         return self._known[factor]
 
     @property
-    def full(self) -> Picture:
+    def full(self) -> AnyImage:
         """The picture itself."""
         return self._known[1]
 
@@ -220,7 +218,7 @@ def _rectangle(level: Level, window: TileWindow) -> tuple[int, int, int, int]:
 def tile_sums(
     level: Level,
     window: TileWindow,
-    image: Picture,
+    image: AnyImage,
     shift: Array,
     mean: float,
     slopes: Array | None,

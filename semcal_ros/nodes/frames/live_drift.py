@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import binned
@@ -67,8 +68,6 @@ _LOST = (OSError, EOFError, pickle.PickleError)
 _FAR = 20.0
 # Between measurements beside the stream, in times of one.
 _REST = 2.0
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from std_msgs.msg import Float64MultiArray
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.projection import projection_from_message
+from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
 from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
 from semcal_ros.nodes.common.subscription import MessageInfo
@@ -46,9 +47,9 @@ class ServoFrame:
     """
 
     image: NDArray[Any]
-    k: NDArray[np.float64]
-    drift_m: NDArray[np.float64]
-    projections: tuple[NDArray[np.float64], ...]
+    k: Array
+    drift_m: Array
+    projections: tuple[Array, ...]
     header: Any
     stamp_ns: int
 
@@ -82,7 +83,7 @@ class ServoInput:
         self._on_frame = on_frame
         self._on_error = on_error
         self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
-        self._projections: deque[NDArray[np.float64]] = deque(maxlen=_PROJECTIONS)
+        self._projections: deque[Array] = deque(maxlen=_PROJECTIONS)
         self._draining = False
         node.listen(Float64MultiArray, "projection", self._on_projection, value_input())
         self._inputs = [

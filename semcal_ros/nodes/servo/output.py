@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
-from numpy.typing import NDArray
 from rclpy.duration import Duration
 
 from semcal_ros.applications.servoing import ServoStep
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import copy_header
+from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import SemNode
 
 __all__ = ["ErrorOutput", "StageOutput"]
@@ -38,7 +38,7 @@ class StageOutput:
         """Whether the last velocity was not zero."""
         return bool(np.any(self.twist))
 
-    def send(self, twist: NDArray[np.float64]) -> None:
+    def send(self, twist: Array) -> None:
         """Publish (3,): x, y in m/s, rotation in rad/s."""
         message = Twist()
         message.linear.x, message.linear.y, message.angular.z = (float(v) for v in twist)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 
 __all__ = ["Cells", "all_corners", "cells_of", "empty_share", "filled_shares"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -20,11 +18,11 @@ class Cells:
 
     columns: int
     rows: int
-    index: NDArray[np.intp]
+    index: Indices
     centres: Array
 
     @property
-    def counts(self) -> NDArray[np.intp]:
+    def counts(self) -> Indices:
         """(columns * rows,) number of corners in each cell."""
         return np.bincount(self.index, minlength=self.columns * self.rows)
 

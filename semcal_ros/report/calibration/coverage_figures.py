@@ -8,8 +8,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.report.calibration.cells import all_corners, cells_of, filled_shares
 from semcal_ros.report.html.encode import Picture, picture_of_figure
@@ -34,7 +34,6 @@ __all__ = [
     "tilts_deg",
 ]
 
-Array = NDArray[np.float64]
 
 _CELLS = 24
 

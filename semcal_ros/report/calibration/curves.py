@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -13,7 +13,6 @@ from semcal_ros.report.html.style import SECOND
 
 __all__ = ["cameras_around", "curve", "marks_of_magnifications", "sampled_cameras", "wide_enough"]
 
-Array = NDArray[np.float64]
 
 _SAMPLES = 81
 

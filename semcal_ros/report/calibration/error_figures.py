@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
@@ -28,7 +28,6 @@ from semcal_ros.report.html.style import (
 
 __all__ = ["normalised_residuals", "residual_histogram", "rms_picture"]
 
-Array = NDArray[np.float64]
 
 _HISTOGRAM_LIMIT = 5.0
 

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.report.calibration.numbers import plain
 from semcal_ros.report.html.encode import Picture, as_bytes_image, data_uri, jpeg_of, shrunk
@@ -23,7 +24,6 @@ __all__ = [
     "rejected_pictures",
 ]
 
-Array = NDArray[np.float64]
 
 _OVERLAY_WIDTH = 320
 # Half the size of a cross: this part of the spacing of the corners, within limits, in px of the

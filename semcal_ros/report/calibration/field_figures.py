@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -32,7 +32,6 @@ __all__ = [
     "residual_picture",
 ]
 
-Array = NDArray[np.float64]
 
 _RESIDUAL_CELLS = 12
 _MAX_ARROWS = 700

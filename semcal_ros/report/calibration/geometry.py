@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.projection import ProjectionJacobians, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -20,7 +20,6 @@ __all__ = [
     "without_residual_field",
 ]
 
-Array = NDArray[np.float64]
 
 # How far a pose may move when the distortion is left out: what a view cannot see must not run away.
 _TURN_RAD = 0.1

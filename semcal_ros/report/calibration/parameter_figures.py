@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -20,8 +20,6 @@ from semcal_ros.report.html.encode import Picture, picture_of_figure
 from semcal_ros.report.html.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
 
 __all__ = ["ParameterGroup", "focal_length_px", "parameter_groups"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

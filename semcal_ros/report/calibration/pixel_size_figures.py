@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
@@ -26,8 +26,6 @@ from semcal_ros.report.html.style import (
 )
 
 __all__ = ["pixel_size_pictures"]
-
-Array = NDArray[np.float64]
 
 
 def pixel_size_pictures(model: CalibrationModel) -> list[Picture]:

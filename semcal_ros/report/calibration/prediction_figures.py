@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
@@ -33,7 +33,6 @@ from semcal_ros.report.html.style import (
 
 __all__ = ["prediction_pictures"]
 
-Array = NDArray[np.float64]
 
 # The map goes on to this factor outside of the calibrated range, to show what extrapolation costs.
 _BEYOND = 1.5
@@ -117,7 +116,7 @@ def _ends(table: Array, g: Array, x: float) -> float:
     return float(np.nanmax(column)) if _any(column) else float("inf")
 
 
-def _rings(model: CalibrationModel) -> tuple[Array, Array, NDArray[np.intp]]:
+def _rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
     """Radii (px), points of the field on circles of these radii, and the circle of each point."""
     width, height = model.image_size
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])

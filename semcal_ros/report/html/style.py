@@ -16,7 +16,8 @@ from matplotlib.ticker import (
     NullFormatter,
     NullLocator,
 )
-from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array
 
 __all__ = [
     "ACCENT",
@@ -37,7 +38,6 @@ __all__ = [
     "tidy",
 ]
 
-Array = NDArray[np.float64]
 
 INK = "#1b2430"
 MUTED = "#5b6674"
