@@ -12,8 +12,6 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import sys
-from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -21,9 +19,7 @@ from table import quick_from_command_line, show
 
 from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.synthetic import preset
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
-from grid_views import grid_views
+from semcal_ros.synthetic.grid_views import grid_views
 
 PRESETS = ("jsm820", "strong_perspective", "off_centre", "pincushion", "no_distortion")
 MAGNIFICATIONS = (100.0, 300.0, 700.0, 1500.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0)

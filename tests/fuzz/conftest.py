@@ -6,7 +6,8 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from fuzz_support import TALLIES, Tally
+
+from tests.helpers.fuzz_support import TALLIES, Tally
 
 _SEEN: dict[str, tuple[int, int]] = {}
 

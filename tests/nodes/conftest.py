@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from node_scenes import make_calibration
-from ros_process import Peer
+
+from tests.helpers.node_scenes import make_calibration
+from tests.helpers.ros_process import Peer
 
 HERE = Path(__file__).parent
 

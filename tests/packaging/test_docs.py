@@ -19,12 +19,11 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     from rclpy.node import Node
 
-from node_scenes import make_calibration
-
 from semcal_ros.bridge.parameters import PARAMETER_KINDS
 from semcal_ros.config.schema import CONFIG_SCHEMA
-from semcal_ros.nodes import base
+from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import Setting
+from tests.helpers.node_scenes import make_calibration
 
 ROOT = Path(__file__).resolve().parents[2]
 DOC = ROOT / "doc"
@@ -171,7 +170,7 @@ def test_the_diagnostic_keys_are_those_of_the_code() -> None:
         for row in re.findall(r"^\| (`.+?`) \|", section, re.MULTILINE)
         for key in re.findall(r"`([^`]+)`", row)
     }
-    files = [*(ROOT / "semcal_ros/nodes").glob("*.py"), ROOT / "semcal_ros/bridge/diagnostics.py"]
+    files = [*(ROOT / "semcal_ros/nodes").rglob("*.py"), ROOT / "semcal_ros/bridge/diagnostics.py"]
     code = "".join(path.read_text(encoding="utf-8") for path in files)
     noted = set(re.findall(r'\.note\(\s*f?"(\w+)', code)) | set(
         re.findall(r'^ +\("(drift_\w+)", ', code, re.MULTILINE)

@@ -14,7 +14,7 @@ from rclpy.node import Node
 import semcal_ros.nodes
 from semcal_ros.nodes.common.base import SemNode
 
-for _module in pkgutil.iter_modules(semcal_ros.nodes.__path__, "semcal_ros.nodes."):
+for _module in pkgutil.walk_packages(semcal_ros.nodes.__path__, "semcal_ros.nodes."):
     importlib.import_module(_module.name)
 
 

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_samples import (
+
+from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.report import calibration_report
+from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
     SIZE,
@@ -15,9 +18,6 @@ from report_samples import (
     found_of,
     grid_view,
 )
-
-from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
-from semcal_ros.report import calibration_report
 
 
 @pytest.fixture(scope="session")

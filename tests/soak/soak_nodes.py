@@ -13,8 +13,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from node_soak import Soak
-from ros_process import Peer
+
+from tests.helpers.node_soak import Soak
+from tests.helpers.ros_process import Peer
 
 DURATION_S = float(os.environ.get("SEMCAL_SOAK_S", "600"))
 SEED = int(os.environ.get("SEMCAL_SOAK_SEED", "0"))

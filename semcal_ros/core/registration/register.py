@@ -1,8 +1,8 @@
 """Shift between two pictures of the same specimen, with a covariance, or a refusal with a reason.
 
-Coarse search over all shifts by :mod:`~semcal_ros.core.registration.normalised_correlation`, then
-least squares at full resolution (:mod:`~semcal_ros.core.registration.inverse_compositional`). A wrong shift is worse than
-none, so a result is accepted only if the two stages agree, the halves of the overlap agree, the
+A coarse search over all shifts by :mod:`.normalised_correlation`, then least squares at full
+resolution (:mod:`.inverse_compositional`). A wrong shift is worse than none, so a result is
+accepted only if the two stages agree, the halves of the overlap agree, the
 pictures have most of their structure in common, and no rival shift explains the image as well.
 """
 

@@ -1,0 +1,227 @@
+"""The command line on small recordings of the virtual SEM."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.files.bags.reader import open_bag
+from tests.helpers.semcal_runs import refused, run
+
+COMMANDS = ["at", "calibrate", "drift", "evaluate", "import", "info", "play", "rectify", "simulate"]
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three magnifications of the grid, their calibration, and a short sweep and a drifting specimen."""
+    base = tmp_path_factory.mktemp("cli")
+    grid = [x for g in (300, 1000, 3000) for x in ("--magnification", g)]
+    assert run("simulate", base / "grid", "--views", 3, *grid) == 0
+    assert (
+        run("calibrate", base / "grid", "-o", base / "cal.yaml", "--report", base / "r.html") == 0
+    )
+    zoom = ("--magnification", 500, "--magnification", 2000)
+    assert run("simulate", base / "zoom", "--plan", "zoom", "--frames", 4, *zoom) == 0
+    gold = ("--magnification", 2500, "--bits", 16)
+    assert run("simulate", base / "gold", "--plan", "drift", "--frames", 6, *gold) == 0
+    return base
+
+
+def test_the_display_width_is_that_of_the_calibration(folder, tmp_path, capsys):
+    """A configuration of another display width, whose topic says to which width its numbers refer."""
+    config = tmp_path / "wide.yaml"
+    config.write_text(
+        "name: wide\ndisplay_width_m: 0.24\n"
+        "magnification: {quantity: magnification, display_width_m: 0.12}\n"
+    )
+    capsys.readouterr()
+    assert run("evaluate", folder / "cal.yaml", folder / "grid", "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    command = ("evaluate", folder / "cal.yaml", folder / "grid", "--json", "--config", config)
+    assert run(*command) == 0
+    assert json.loads(capsys.readouterr().out) == plain
+
+
+def test_calibration_and_report_are_there(folder):
+    assert (folder / "cal.yaml").read_text().startswith("# Calibration")
+    assert "<html" in (folder / "r.html").read_text()
+
+
+def test_calibration_agrees_with_the_truth(folder, capsys):
+    truth = json.loads((folder / "grid" / "truth.json").read_text())
+    for row in truth["parameters"]:
+        capsys.readouterr()
+        assert run("at", folder / "cal.yaml", row["magnification"], "--json") == 0
+        answer = json.loads(capsys.readouterr().out)
+        # Nine views with heights of 40 um over a pivot of 20 mm leave 0.1 % (1 sigma) of the scale.
+        assert answer["mean_pixel_size_m"] == pytest.approx(1 / row["m_px_per_m"], rel=4e-3)
+        assert answer["in_range"]
+        assert np.shape(answer["P"]) == (3, 4)
+        assert min(answer["projection_sigma_px"]) > 0
+
+
+def test_at_flags_extrapolation(folder, capsys):
+    assert run("at", folder / "cal.yaml", 9000) == 0
+    captured = capsys.readouterr()
+    assert "nm per px" in captured.out
+    assert "outside of the calibrated range" in captured.err
+
+
+def test_evaluate_on_views_that_were_not_used(folder, capsys):
+    other = folder / "other"
+    assert run("simulate", other, "--views", 2, "--seed", 7, "--magnification", 1000) == 0
+    assert run("evaluate", folder / "cal.yaml", other, "--json") == 0
+    answer = json.loads(capsys.readouterr().out.split("\n", 1)[1])
+    # Corner noise of the default detector is about 0.03 px.
+    assert answer["views"] == 2
+    assert answer["rms_px"] < 0.1
+    # Its statistics are notes: what stands in them must not matter.
+    edited = folder / "edited.yaml"
+    text = yaml.safe_load((folder / "cal.yaml").read_text())
+    for priors in (3, {"height_sigma_m": "low"}, {"height_sigma_m": -1.0}):
+        text["statistics"] = {"priors": priors}
+        edited.write_text(yaml.safe_dump(text))
+        assert run("evaluate", edited, other, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["views"] == 2
+
+
+def test_rectify_pairs_every_image_with_a_camera_info(folder):
+    out = folder / "zoom_rect"
+    assert run("rectify", folder / "zoom", "--calibration", folder / "cal.yaml", "-o", out) == 0
+    stamps: dict[str, list[int]] = {"/sem/image_rect": [], "/sem/camera_info": []}
+    projections = []
+    with open_bag(out) as bag:
+        for message in bag.messages():
+            if message.topic in stamps:
+                stamps[message.topic].append(stamp_ns_from_msg(message.message))
+            if message.topic == "/sem/projection":
+                projections.append(np.array(message.message.data).reshape(3, 4))
+    assert stamps["/sem/image_rect"] == stamps["/sem/camera_info"]
+    assert len(set(stamps["/sem/image_rect"])) == 4
+    # One projection for each of four magnifications, growing from 500x to 2000x.
+    assert len(projections) == 4
+    assert projections[-1][0, 0] / projections[0][0, 0] == pytest.approx(4.0, rel=0.02)
+
+
+def test_drift_follows_the_truth(folder):
+    table = folder / "drift.csv"
+    assert run("drift", folder / "gold", "--calibration", folder / "cal.yaml", "-o", table) == 0
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    truth = json.loads((folder / "gold" / "truth.json").read_text())["frames"]
+    drift = np.array([f["drift_m"] for f in truth])
+    found = np.array([[float(r["dx_m"]), float(r["dy_m"])] for r in rows])
+    pixel = truth[0]["pixel_size_m"][0]
+    # Sub-pixel registration of well textured frames: 0.01 px; a wrong sign would be ten times that.
+    np.testing.assert_allclose(found, drift - drift[0], atol=0.02 * pixel)
+    assert np.abs(drift[-1] - drift[0]).max() > 0.1 * pixel
+    assert rows[0]["status"] == "keyframe"
+    assert all(float(r["sigma_x_m"]) > 0 for r in rows[1:])
+
+
+def test_info_counts(folder, capsys):
+    assert run("info", folder / "zoom") == 0
+    out = capsys.readouterr().out
+    assert "/sem/image_raw" in out
+    assert "4 frames" in out
+    assert "4 magnifications, 500 to 2000" in out
+
+
+@pytest.mark.parametrize("method", ["discrete", "pda"])
+def test_the_papers_methods_run(folder, method, tmp_path):
+    more = [x for g in (300, 800, 2000, 5000) for x in ("--magnification", g)]
+    assert run("simulate", tmp_path / "grid", "--views", 3, *more) == 0
+    assert run("calibrate", tmp_path / "grid", "-o", tmp_path / "c.yaml", "--method", method) == 0
+    assert f"method: {method}" in (tmp_path / "c.yaml").read_text()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example(command, capsys):
+    assert run(command, "--help") == 0
+    out = capsys.readouterr().out
+    assert "Example:" in out
+    assert f"semcal {command}" in out
+
+
+def test_help_lists_every_command(capsys):
+    assert run("--help") == 0
+    out = capsys.readouterr().out
+    assert all(f"  {c} " in out for c in COMMANDS)
+
+
+def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
+    cal, out = folder / "cal.yaml", tmp_path / "out"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "does not exist" in refused(
+        capsys, "calibrate", tmp_path / "no", "-o", tmp_path / "c.yaml"
+    )
+    assert "expected" in refused(capsys, "info", empty)
+    assert "magnification" in refused(capsys, "at", cal, "nan")
+    assert "magnification" in refused(capsys, "at", cal, "--", "-3")
+    assert "greater than 0" in refused(capsys, "at", cal, "0")
+    assert "'abc' is not a valid float; see semcal at --help" in refused(capsys, "at", cal, "abc")
+    assert "no such" in refused(capsys, "fly").lower()
+    assert "1000,5000" in refused(
+        capsys, "calibrate", folder / "grid", "-o", tmp_path / "c.yaml", "--breakpoints", "a,b"
+    )
+    assert "missing" in refused(capsys, "rectify", folder / "grid").lower()
+    assert "not valid YAML" in refused(capsys, "at", _file(tmp_path / "a.yaml", "a: [1"), 100)
+    assert "not a calibration" in refused(capsys, "at", _file(tmp_path / "b.yaml", "a: 1"), 100)
+    newer = cal.read_text().replace("version: 1", "version: 2")
+    assert "update" in refused(capsys, "at", _file(tmp_path / "n.yaml", newer), 100)
+    assert "folder" in refused(
+        capsys, "calibrate", folder / "grid", "-o", tmp_path / "x" / "c.yaml"
+    )
+    assert "config" in refused(capsys, "info", folder / "grid", "--config", "unknown_microscope")
+    assert "grid" in refused(capsys, "calibrate", folder / "gold", "-o", tmp_path / "c.yaml")
+    truncated = tmp_path / "t.mcap"
+    data = next((folder / "grid").glob("*.mcap")).read_bytes()
+    truncated.write_bytes(data[: len(data) // 2])
+    refused(capsys, "rectify", truncated, "--calibration", cal, "-o", out)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "a.yaml",
+        "b.yaml",
+        "empty",
+        "n.yaml",
+        "t.mcap",
+    ]
+
+
+def _file(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_an_existing_output_is_not_touched(folder, tmp_path, capsys):
+    before = sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir())
+    line = refused(
+        capsys,
+        "rectify",
+        folder / "gold",
+        "--calibration",
+        folder / "cal.yaml",
+        "-o",
+        folder / "zoom",
+    )
+    assert "exists" in line
+    assert sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir()) == before
+
+
+def test_the_module_is_the_command(folder):
+    done = subprocess.run(
+        [sys.executable, "-m", "semcal_ros", "at", str(folder / "cal.yaml"), "1e3"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "nm per px" in done.stdout
+    assert done.stderr == ""

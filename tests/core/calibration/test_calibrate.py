@@ -1,0 +1,178 @@
+"""Calibration from views with known truth: what counts is the projection at magnifications never shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import MethodOptions, calibrate_views
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+CALIBRATED = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
+BETWEEN = [170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0]
+NOISE = 0.05
+
+
+def _calibrate(name, method="joint", options=None, magnifications=CALIBRATED, views=4):
+    microscope = preset(name)
+    seen = grid_views(microscope.camera_at, magnifications, noise_px=NOISE, views=views)
+    return calibrate_views(
+        seen,
+        image_size=microscope.image_size,
+        display_width_m=microscope.display_width_m,
+        method=method,
+        options=options,
+    )
+
+
+def _model_error(result, name, magnifications=BETWEEN):
+    """RMS px against noise-free views at magnifications that were never calibrated, poses fitted."""
+    microscope = preset(name)
+    clean = grid_views(microscope.camera_at, magnifications, views=3, seed=99)
+    fit = fit_poses(clean, result.model.at, height_sigma_m=4e-5)
+    return max(rms_by_magnification(fit).values())
+
+
+@pytest.fixture(scope="module")
+def joint():
+    return _calibrate("jsm820")
+
+
+@pytest.mark.parametrize(
+    "name", ["jsm820", "no_distortion", "strong_perspective", "parallel", "off_centre"]
+)
+def test_joint_predicts_magnifications_that_it_never_saw(name):
+    result = _calibrate(name)
+    # 28 views of about 100 corners with 0.05 px noise: a smooth camera is determined to a fraction of the noise. What
+    # is left is the difference between the microscope's laws and polynomials through 7 magnifications.
+    assert _model_error(result, name) < 0.03
+    assert result.model.statistics["fit"]["converged"]
+
+
+def test_joint_scale_is_within_its_own_uncertainty(joint):
+    truth = preset("jsm820")
+    deviations = []
+    for g in CALIBRATED + BETWEEN:
+        camera = joint.model.at(g)
+        sigma = np.sqrt(camera.covariance[0, 0])
+        deviations.append((camera.m - truth.camera_at(g).m) / sigma)
+        assert abs(camera.m / truth.camera_at(g).m - 1) < 0.004
+    # The heights of 28 views (sigma 40 um over a pivot of 20 mm) leave about 0.1 %. The choice of the number of
+    # coefficients is not part of the covariance, which over six seeds was 1.4 times too small in the mean: the limit
+    # for the largest of 13 correlated deviations is that much above the three sigma of a perfect one.
+    assert np.abs(deviations).max() < 4.2
+    assert np.abs(deviations).max() > 0.02
+
+
+def test_residuals_are_the_noise(joint):
+    expected = NOISE * np.sqrt(2.0)
+    assert joint.model.statistics["rms_px"] == pytest.approx(expected, rel=0.05)
+    assert joint.model.statistics["held_out_rms_px"] == pytest.approx(expected, rel=0.25)
+    assert joint.model.statistics["fit"]["variance_factor"] == pytest.approx(1.0, rel=0.1)
+
+
+def test_held_out_errors_cover_every_magnification(joint):
+    assert sorted(joint.held_out_rms_px) == CALIBRATED
+    rows = joint.model.statistics["by_magnification"]
+    assert [r["held_out_extrapolated"] for r in rows] == [True, *[False] * 5, True]
+
+
+def test_discrete_is_good_where_it_was_calibrated_and_worse_between(joint):
+    result = _calibrate("jsm820", "discrete")
+    assert _model_error(result, "jsm820", CALIBRATED) < 0.05
+    between = _model_error(result, "jsm820")
+    assert between < 0.3
+    assert between > _model_error(joint, "jsm820")
+    separate = result.model.statistics["fit"]["separate"]
+    assert [s["magnification"] for s in separate] == CALIBRATED
+    assert separate[0]["distortion"] is True
+
+
+def test_discrete_finds_no_distortion_where_there_is_none():
+    result = _calibrate("no_distortion", "discrete")
+    separate = result.model.statistics["fit"]["separate"]
+    # At a significance of 1e-3, seven true null hypotheses are all kept in 99 % of cases; the seed is fixed.
+    assert not any(s["distortion"] for s in separate)
+    for g in CALIBRATED:
+        assert result.model.at(g).xi_r == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)]
+)
+def test_pda_and_legendre_run_between_the_magnifications(options):
+    magnifications = [100.0, *(1000.0 * k for k in range(1, 11))]
+    result = _calibrate("jsm820", "pda", options, magnifications, views=3)
+    # The paper reports 0.9 to 1.45 px RMS; without its corner and drift noise the method itself is well below.
+    assert _model_error(result, "jsm820", [500.0, 2500.0, 6500.0, 9500.0]) < 0.5
+    kind = "ode" if options.legendre_degree is None else "legendre"
+    assert {f.kind for f in result.model.functions.values()} == {kind}
+
+
+def test_one_magnification_can_be_calibrated():
+    result = _calibrate("jsm820", magnifications=[1000.0], views=6)
+    assert _model_error(result, "jsm820", [1000.0]) < 0.02
+    assert result.held_out_rms_px == {}
+    assert result.model.statistics["held_out_rms_px"] is None
+
+
+def test_out_of_range_is_flagged_and_wider(joint):
+    inside, outside = joint.model.at(10000.0), joint.model.at(20000.0)
+    farther = joint.model.at(40000.0)
+    assert inside.in_range and not outside.in_range
+    corner = [[256 / inside.m, 256 / inside.m, 0.0]]
+    sigma = [
+        float(c.project_sigma(np.array(corner) * inside.m / c.m).max())
+        for c in (inside, outside, farther)
+    ]
+    assert sigma[0] < sigma[1] < sigma[2]
+
+
+@pytest.mark.parametrize("g", [0.0, -5.0, np.nan, np.inf])
+def test_meaningless_magnifications_are_refused(joint, g):
+    with pytest.raises(InvalidValueError, match="magnification"):
+        joint.model.at(g)
+
+
+def test_what_the_views_cannot_determine_is_said():
+    # At 10 000x the perspective within the field is nearly nothing.
+    result = _calibrate("parallel", magnifications=[8000.0, 9000.0, 10000.0], views=2)
+    assert any("principal point" in w for w in result.warnings)
+    assert any("fewer than 3 views" in w for w in result.warnings)
+
+
+def test_bad_requests_are_refused():
+    views = grid_views(preset("jsm820").camera_at, [1000.0], views=3)
+    with pytest.raises(InvalidValueError, match="method"):
+        calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="magic")
+    with pytest.raises(CalibrationError, match="no usable view"):
+        calibrate_views([], image_size=(512, 512), display_width_m=0.12)
+    with pytest.raises(CalibrationError, match="at least 4"):
+        calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="pda")
+    with pytest.raises(InvalidValueError, match="order"):
+        calibrate_views(
+            views,
+            image_size=(512, 512),
+            display_width_m=0.12,
+            method="pda",
+            options=MethodOptions(5),
+        )
+
+
+def test_two_views_cannot_determine_scale_aspect_and_skew():
+    with pytest.raises(CalibrationError, match="at least 3 views"):
+        _calibrate("jsm820", magnifications=[1000.0], views=2)
+
+
+def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
+    microscope = preset("jsm820")
+    views = grid_views(microscope.camera_at, [1000.0], views=2)
+    blind = replace(microscope.camera_at(1000.0), xi_r=-50.0, ex=5000.0)
+    assert not np.isfinite(blind.undistort(views[0].image_xy)).any()
+    with pytest.raises(CalibrationError, match="can undistort 0 corners"):
+        fit_poses(views, lambda _: blind)

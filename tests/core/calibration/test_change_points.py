@@ -1,0 +1,85 @@
+"""Piecewise ranges: scan generators that switch an attenuator, so that the scale jumps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.calibration_file import Calibration
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+CALIBRATED = [100.0, 300.0, 700.0, 1500.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0]
+JUMP = 0.01
+MICROSCOPE = preset("jsm820")
+
+
+def _camera(g, jump=JUMP):
+    camera = MICROSCOPE.camera_at(g)
+    above = float(g >= 3000.0)
+    return replace(
+        camera, m=camera.m * (1.0 + jump * above), aspect=camera.aspect * (1.0 + 0.3 * jump * above)
+    )
+
+
+def _calibrated(jump=JUMP, **options):
+    views = grid_views(lambda g: _camera(g, jump), CALIBRATED, noise_px=0.05, views=4, seed=2)
+    return calibrate_views(views, image_size=MICROSCOPE.image_size, display_width_m=0.12, **options)
+
+
+def test_a_jump_is_suspected_and_said_but_not_applied():
+    result = _calibrated()
+    (warning,) = [w for w in result.warnings if "jump" in w]
+    assert "between magnifications 2500 and 4000" in warning
+    assert len(result.model.functions["scale"].breaks) == 0
+
+
+def test_a_smooth_microscope_is_not_suspected():
+    assert not any("jump" in w for w in _calibrated(jump=0.0).warnings)
+
+
+def test_a_breakpoint_gives_the_scale_on_both_sides():
+    model = _calibrated(breakpoints=(3000.0,)).model
+    for g in (2900.0, 3000.0, 3100.0):
+        camera, truth = model.at(g), _camera(g)
+        error = camera.m / truth.m - 1.0
+        sigma = np.sqrt(camera.covariance[0, 0]) / truth.m
+        # Heights of 40 um between pivot and specimen leave the scale of four views uncertain by 0.1 %.
+        assert abs(error) < 3.0 * sigma
+        assert sigma < 0.002
+    assert model.at(3000.0).m / model.at(2999.999).m - 1.0 == pytest.approx(JUMP, abs=0.004)
+
+
+def test_breakpoints_survive_the_file(tmp_path):
+    calibration = Calibration.from_model(_calibrated(breakpoints=(3000.0, 7000.0)).model)
+    calibration.save(tmp_path / "cal.yaml")
+    again = Calibration.load(tmp_path / "cal.yaml")
+    assert again.functions["scale"].breaks.tolist() == [3000.0, 7000.0]
+    for g in (2999.0, 3000.0, 7000.0):
+        np.testing.assert_array_equal(again.at(g).parameters, calibration.at(g).parameters)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "method"), [((50.0,), "joint"), ((20000.0,), "joint"), ((3000.0,), "discrete")]
+)
+def test_meaningless_breakpoints_are_refused(breaks, method):
+    with pytest.raises(InvalidValueError, match="breakpoints"):
+        _calibrated(breakpoints=breaks, method=method)
+
+
+def test_a_function_with_a_jump():
+    function = ContinuousFunction(
+        "chebyshev_log", np.array([1.0, 0.5, 0.25]), (100.0, 10000.0), breaks=np.array([1000.0])
+    )
+    assert (function.size, function.smooth_size) == (3, 2)
+    assert function(999.999) == pytest.approx(1.0, abs=1e-5)
+    # The breakpoint belongs to the range above it.
+    assert function(1000.0) == pytest.approx(1.25)
+    assert function(20000.0) - function(10000.0) == pytest.approx(
+        0.5 * np.log(2.0) / np.log(10.0), rel=1e-3
+    )

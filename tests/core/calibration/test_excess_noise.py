@@ -1,0 +1,62 @@
+"""Scatter beyond the stated uncertainty is found where there is some, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+
+def _view(n, rng):
+    sigma = rng.uniform(0.02, 0.08, n)
+    covariance = sigma[:, None, None] ** 2 * np.eye(2)
+    return GridView(1.0, np.zeros((n, 2)), np.zeros((n, 2)), sigma, "", covariance)
+
+
+@pytest.mark.parametrize("excess", [0.0, 0.1, 0.5])
+def test_known_excess_is_found(excess):
+    rng = np.random.default_rng(0)
+    view = _view(4000, rng)
+    residuals = rng.normal(size=(4000, 2)) * np.hypot(view.sigma_px, excess)[:, None]
+    # A tenth of outliers must not matter much: they move the median by a few percent.
+    residuals[:400] *= 30.0
+    # The median of 4000 squares is known to 2 %, the outliers raise it by 20 %: 10 % of a sigma.
+    assert excess_sigma_px([view], residuals, 6) == pytest.approx(excess, rel=0.13)
+
+
+def test_excess_is_added_to_every_corner():
+    view = _view(10, np.random.default_rng(1))
+    (wider,) = with_excess([view], 0.3)
+    np.testing.assert_allclose(wider.sigma_px**2, view.sigma_px**2 + 0.09)
+    np.testing.assert_allclose(wider.covariance_px2, view.covariance_px2 + 0.09 * np.eye(2))
+
+
+def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
+    microscope = preset("jsm820")
+    rng = np.random.default_rng(2)
+    magnifications = [100.0, 400.0, 1500.0, 5000.0]
+    even = grid_views(microscope.camera_at, magnifications, noise_px=0.02, views=4)
+    uneven = [
+        GridView(
+            v.magnification,
+            v.board_xy_m,
+            v.image_xy + rng.normal(scale=0.2, size=v.image_xy.shape),
+            v.sigma_px,
+            v.name,
+        )
+        for v in even
+    ]
+    options = {"image_size": (512, 512), "display_width_m": 0.12, "residual": "off"}
+    good, bad = (calibrate_views(v, **options) for v in (even, uneven))
+    assert good.model.statistics["fit"]["excess_sigma_px"] == 0.0
+    # Some thousand corners: known to a few percent.
+    assert bad.model.statistics["fit"]["excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
+    assert not any("residuals are" in w for w in good.warnings)
+    assert any("residuals are 10" in w or "residuals are 9" in w for w in bad.warnings)
+    # Where there are views, ten times the scatter makes what they determine much less certain.
+    sigma = [np.sqrt(np.diag(r.model.at(1500.0).covariance)[[1, 2, 6]]) for r in (good, bad)]
+    assert np.all(sigma[1] > 2.0 * sigma[0])

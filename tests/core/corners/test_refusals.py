@@ -1,0 +1,127 @@
+"""What the corner finder refuses, and the reasons that it gives."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.errors import InvalidValueError
+from tests.helpers.corner_boards import Board
+
+
+def blobs(seed: int) -> NDArray[np.uint8]:
+    """Bright grains of many sizes, like gold on carbon."""
+    rng = np.random.default_rng(seed)
+    grains = np.zeros((512, 512), np.float32)
+    for _ in range(700):
+        centre = tuple(int(v) for v in rng.uniform(0, 512, 2))
+        cv2.circle(grains, centre, int(rng.uniform(4, 14)), float(rng.uniform(0.5, 1.0)), -1)
+    dose = 40.0 * cv2.GaussianBlur(grains, (0, 0), 1.2) + 10.0
+    return rng.poisson(dose).clip(0, 255).astype(np.uint8)
+
+
+def smooth_noise(seed: int, scale_px: float) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).normal(size=(512, 512))
+    if scale_px > 0:
+        noise = cv2.GaussianBlur(noise, (0, 0), scale_px)
+    return np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("image", "word"),
+    [
+        (np.full((128, 128), 90, np.uint8), "blank"),
+        (np.full((128, 128), 255, np.uint8), "blank"),
+        (np.full((128, 128), np.nan), "finite"),
+        (np.random.default_rng(0).poisson(60.0, (256, 256)).astype(np.uint8), "no chess lattice"),
+        (blobs(1), "no chess lattice"),
+        (blobs(2), "no chess lattice"),
+    ],
+    ids=["blank", "all white", "not finite", "noise on nothing", "gold", "more gold"],
+)
+def test_boardless_images_are_refused_with_a_reason(image: NDArray[np.generic], word: str) -> None:
+    detection = find_lattice(image)
+    assert not detection.accepted
+    assert word in detection.reason
+    assert len(detection.xy) == len(detection.ij) == len(detection.sigma_px) == 0
+
+
+@pytest.mark.parametrize("scale_px", [0.0, 1.0, 2.0, 4.0, 8.0, 15.0])
+def test_random_texture_of_any_grain_is_refused(scale_px: float) -> None:
+    for seed in range(2):
+        detection = find_lattice(smooth_noise(seed, scale_px))
+        assert not detection.accepted and detection.reason
+
+
+def test_saturated_board_is_refused() -> None:
+    picture = Board(30.0, electrons=30.0).render(np.random.default_rng(0), np.float64)
+    detection = find_lattice(np.clip(600.0 * picture, 0.0, 255.0).astype(np.uint8))
+    assert not detection.accepted and "saturated" in detection.reason
+
+
+def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:512, 0:512]
+    patterns = {
+        "stripes": (x // 20) % 2,
+        "dots": (x % 30 - 15) ** 2 + (y % 30 - 15) ** 2 < 60,
+        "squares with gaps": (x % 30 < 24) & (y % 30 < 24),
+    }
+    for name, pattern in patterns.items():
+        detection = find_lattice(rng.poisson(50.0 + 100.0 * pattern).astype(np.uint8))
+        assert not detection.accepted, name
+        assert detection.reason
+
+
+def joined(first: Board, second: Board) -> NDArray[np.uint8]:
+    """Two boards in one picture, side by side along a slanted line."""
+    x = np.arange(512)[None, :] + 0.3 * np.arange(512)[:, None]
+    picture = np.where(x < 330.0, first.clean(4), second.clean(4))
+    return np.random.default_rng(5).poisson(80.0 * picture).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("turn", "offset"),
+    [(15.0, (0.6, 0.6)), (10.0, (0.55, 0.2))],
+    ids=["turned by 5 deg", "shifted by a quarter"],
+)
+def test_two_boards_that_join_are_refused(turn: float, offset: tuple[float, float]) -> None:
+    detection = find_lattice(
+        joined(Board(15.0, turn_deg=10.0), Board(15.0, turn_deg=turn, offset=offset))
+    )
+    assert not detection.accepted and "two boards" in detection.reason
+
+
+@pytest.mark.parametrize(("square", "turn"), [(15.0, 35.0), (24.0, 40.0)])
+def test_two_boards_never_give_a_mixed_lattice(square: float, turn: float) -> None:
+    boards = Board(15.0, turn_deg=10.0), Board(square, turn_deg=turn, offset=(0.1, 0.6))
+    detection = find_lattice(joined(*boards))
+    if detection.accepted:
+        miss = [cKDTree(b.corners(0.0)[1]).query(detection.xy)[0].max() for b in boards]
+        # All corners belong to one board.
+        assert min(miss) < 1.0 < max(miss)
+    else:
+        assert "two boards" in detection.reason
+
+
+def test_too_few_corners_are_refused() -> None:
+    detection = find_lattice(
+        Board(210.0, turn_deg=10.0, electrons=50.0).render(np.random.default_rng(0))
+    )
+    assert not detection.accepted and detection.reason
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((64, 64, 3), np.uint8), np.zeros((8, 8), np.uint8), np.zeros((64, 64), bool)],
+    ids=["colour", "tiny", "bool"],
+)
+def test_what_is_not_an_image_raises(image: NDArray[np.generic]) -> None:
+    with pytest.raises(InvalidValueError, match="expected"):
+        find_lattice(image)
+    with pytest.raises(InvalidValueError, match="databar"):
+        find_lattice(np.zeros((64, 64), np.uint8), databar_rows=60)

@@ -1,0 +1,140 @@
+"""Drift inside of the frame, through a zoom, and over a long way, on recordings with known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.synthetic import Detector, Drift, GoldOnCarbon, Pose, preset, render_frame
+from tests.helpers.drift_scenes import Texture, noisy
+
+SIZE = 384
+MICROSCOPE = preset("jsm820").with_image_size(SIZE, SIZE)
+
+
+def frame_of(magnification: float, timing: ScanTiming, drift: Drift, start_s: float, number: int):
+    microscope = MICROSCOPE.with_timing(timing)
+    image = render_frame(
+        microscope,
+        GoldOnCarbon(0),
+        Pose.flat(),
+        magnification,
+        start_time_s=start_s,
+        drift=drift,
+        seed=(0, number),
+        detector=Detector(),
+    )
+    return image, microscope.camera_at(magnification)
+
+
+def left_px(
+    camera: ScanCamera,
+    timing: ScanTiming,
+    drift: Drift,
+    start_s: float,
+    zero: np.ndarray,
+    found: RasterDrift,
+) -> np.ndarray:
+    """(n,) distance in px, all over the field, between where the correction puts what a raw pixel
+    saw and where it belongs at the drift that was true when the pixel was scanned.
+    """
+
+    def belongs(raw: np.ndarray) -> np.ndarray:
+        passes = np.arange(timing.averages) * timing.frame_time_s
+        # Of all passes together: the offset of a pixel is the mean over them.
+        first = timing.pixel_offset_s(raw[:, 1], raw[:, 0], SIZE, SIZE) - passes.mean()
+        moved = np.mean([drift(start_s + first + p) for p in passes], axis=0)
+        return camera.undistort(raw) - (moved - zero) @ camera.ideal_from_sem_jacobian.T
+
+    side = np.linspace(0.0, SIZE - 1.0, 5)
+    field = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    output = belongs(field)
+    raw = raw_from_output(output, (SIZE, SIZE), camera, found, timing)
+    return np.asarray(np.hypot(*(belongs(raw) - output).T))
+
+
+@pytest.mark.parametrize("timing", [ScanTiming(2.0, 1, 0.1), ScanTiming(0.25, 8, 0.1)])
+def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: ScanTiming) -> None:
+    drift = Drift(
+        velocity_m_s=(40e-9, -25e-9), wander_m=30e-9, wander_period_s=(60.0, 15.0), seed=3
+    )
+    history = DriftHistory()
+    tracker = DriftTracker(history=history)
+    zero = drift(np.array([timing.centre_offset_s]))[0]
+    starts = timing.acquisition_time_s * np.arange(7)
+    updates = []
+    for k, start in enumerate(starts):
+        image, camera = frame_of(20_000.0, timing, drift, start, k)
+        updates.append(tracker.update(image, start, camera, timing))
+    assert all(u.accepted for u in updates)
+    path = history.smoothed()
+
+    def of(found: list[RasterDrift]) -> np.ndarray:
+        parts = zip(starts, found, strict=True)
+        return np.array([left_px(camera, timing, drift, s, zero, f) for s, f in parts])
+
+    after = of([path.raster(k) for k in range(len(path))])
+    shifted = of([RasterDrift(u.drift_m, np.zeros(2)) for u in updates])
+    # A shift of the whole picture leaves half of what the drift moves in a pass: 80 nm in 2 s, in
+    # px of 15 nm, or an eighth of it.
+    assert float(shifted[1:].max()) > (2.0 if timing.averages == 1 else 0.25)
+    assert float(np.sqrt(np.mean(after**2))) < 0.03
+    assert float(after.max()) < 0.05 * (1.0 if timing.averages == 1 else 2.0)
+    # Live, once the pace is known.
+    live = of([u.raster for u in updates])[3:]
+    assert float(np.sqrt(np.mean(live**2))) < 0.05
+
+
+def test_drift_is_continuous_through_a_zoom() -> None:
+    timing = ScanTiming(0.4, 1, 0.1)
+    drift = Drift(velocity_m_s=(20e-9, -12e-9), settling_m=(-200e-9, 300e-9), settling_time_s=15.0)
+    tracker = DriftTracker()
+    zero = drift(np.array([timing.centre_offset_s]))[0]
+    steps = [1000.0, 2000.0, 4000.0, 8000.0, 4000.0, 2000.0, 1000.0]
+    errors, sigmas, statuses = [], [], []
+    for k, magnification in enumerate(np.repeat(steps, 3)):
+        start = 0.5 * k
+        image, camera = frame_of(float(magnification), timing, drift, start, k)
+        update = tracker.update(image, start, camera, timing)
+        truth = drift(np.array([start + timing.centre_offset_s]))[0] - zero
+        errors.append(update.drift_m - truth)
+        sigmas.append(np.sqrt(np.diag(update.covariance)[:2]))
+        statuses.append(update.status)
+    assert not [s for s in statuses if s.startswith("coasting")]
+    # On the way back the keyframes of the way out serve again.
+    assert [k for k, s in enumerate(statuses) if s == "keyframe"] == [0, 3, 6, 9]
+    error, sigma = np.array(errors)[1:], np.array(sigmas)[1:]
+    assert np.all(np.abs(error) < 4.0 * sigma)
+    # The steps of the zoom are no steps of the drift; and at 300 nm per px the drift of the first
+    # frame is known to a hundredth of a px.
+    assert np.all(np.abs(np.diff(error, axis=0)) < 4.0 * sigma[1:])
+    assert float(np.max(sigma[3:])) < 5e-9
+
+
+def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
+    texture, frames, far = Texture(3, 360), 160, 200.0
+    tracker = DriftTracker()
+    errors, sigmas, keyframes = [], [], 0
+    for k in range(frames):
+        out = 1.0 - abs(2.0 * k / (frames - 1) - 1.0)
+        truth = np.array([far * out, 30.0 * np.sin(6.0 * out)])
+        picture = noisy(texture.view((truth[0], truth[1]), 128), 8.0, k)
+        image = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+        update = tracker.update(image, 0.1 * k)
+        assert update.accepted, update.reason
+        errors.append(update.drift_px - truth)
+        sigmas.append(np.sqrt(np.diag(update.covariance)[:2]))
+        keyframes += update.status == "keyframe"
+    assert keyframes >= 5
+    error, sigma = np.array(errors), np.array(sigmas)
+    # Single pictures are good to 0.01 px: nothing of the way is left at its end.
+    assert float(np.max(np.abs(error[-1]))) < 0.05
+    assert np.all(sigma[-1] < 0.03)
+    # The way adds uncertainty, and says so.
+    assert np.all(sigma[frames // 2] > 1.5 * sigma[-1])
+    assert np.all(np.abs(error[1:]) < 4.5 * sigma[1:])

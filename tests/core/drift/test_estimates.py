@@ -1,0 +1,87 @@
+"""Forecasts of the drift from what was known at one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.operations import Move
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.errors import InvalidValueError
+from tests.helpers.drift_scenes import Texture, noisy, small_camera
+
+SIZE = 192
+CAMERA = small_camera(1000.0, SIZE)
+TEXTURE = Texture(3, 512)
+VELOCITY = np.array([0.10e-6, -0.06e-6])
+
+
+def feed(tracker: DriftTracker, first: int, last: int) -> None:
+    for k in range(first, last):
+        shift = CAMERA.ideal_from_sem_jacobian @ (VELOCITY * k)
+        picture = noisy(TEXTURE.view((shift[0], shift[1]), SIZE), 5.0, k)
+        tracker.update(picture.astype(np.float32), float(k), CAMERA, rectified=True)
+
+
+def test_a_forecast_holds_the_drift_to_come_within_its_sigma() -> None:
+    tracker = DriftTracker()
+    feed(tracker, 0, 20)
+    outlook = tracker.outlook()
+    assert outlook.time_s == 19.0
+    sigmas = []
+    for ahead_s in (0.0, 0.5, 2.0, 5.0):
+        forecast = outlook.at(19.0 + ahead_s)
+        sigma = np.sqrt(np.diag(forecast.covariance))
+        error = forecast.drift_m - VELOCITY * forecast.time_s
+        assert np.all(np.abs(error) < 4.0 * sigma[:2])
+        np.testing.assert_array_equal(forecast.raster.position, forecast.drift_m)
+        sigmas.append(sigma[0])
+    assert sigmas == sorted(sigmas)
+    # The drift is so steady that most of it is the noise of the first frame.
+    assert sigmas[-1] > 1.1 * sigmas[0]
+
+
+@pytest.mark.parametrize("ahead_s", [1e-3, 0.3, 20.0])
+def test_a_forecast_is_what_the_filter_itself_would_predict(ahead_s: float) -> None:
+    """The forecast is worked out in a shorter way than the filter's own step in time."""
+    tracker = DriftTracker()
+    feed(tracker, 0, 12)
+    outlook = tracker.outlook()
+    time_s = outlook.time_s + ahead_s
+    forecast, state = outlook.at(time_s), Move(time_s)(outlook.state, outlook.restlessness)
+    covariance = state.own + scale_covariance(outlook.camera, state.position, state.velocity)
+    # Nothing but the order of rounding differs.
+    np.testing.assert_allclose(forecast.drift_m, state.position, rtol=1e-12)
+    np.testing.assert_allclose(forecast.velocity_m_s, state.velocity, rtol=1e-12)
+    np.testing.assert_allclose(forecast.acceleration_m_s2, state.acceleration, rtol=1e-12)
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    np.testing.assert_allclose(forecast.covariance / scale, covariance / scale, atol=1e-12)
+
+
+def test_an_outlook_stays_as_it_was_while_tracking_goes_on() -> None:
+    tracker = DriftTracker()
+    feed(tracker, 0, 10)
+    outlook = tracker.outlook()
+    before = outlook.at(10.5)
+    feed(tracker, 10, 14)
+    again = outlook.at(10.5)
+    np.testing.assert_array_equal(before.drift_m, again.drift_m)
+    np.testing.assert_array_equal(before.covariance, again.covariance)
+    # At its own time it says what the update said.
+    update = tracker.update(
+        noisy(TEXTURE.view((0.0, 0.0), SIZE), 5.0, 99).astype(np.float32), 14.0, CAMERA
+    )
+    now = tracker.outlook().at(14.0)
+    np.testing.assert_allclose(now.drift_m, update.drift_m)
+    np.testing.assert_allclose(now.velocity_m_s, update.velocity_m_s)
+
+
+def test_what_cannot_be_foretold_is_refused() -> None:
+    tracker = DriftTracker()
+    with pytest.raises(InvalidValueError, match="before the first frame"):
+        tracker.outlook()
+    feed(tracker, 0, 2)
+    for time_s in (0.5, float("nan"), float("inf")):
+        with pytest.raises(InvalidValueError, match="after"):
+            tracker.outlook().at(time_s)

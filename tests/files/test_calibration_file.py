@@ -1,0 +1,120 @@
+"""The calibration file: full precision, atomic, and clear about what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from semcal_ros import Calibration, SemcalError
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.errors import CalibrationFileError
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+
+@pytest.fixture(scope="module", params=["joint", "discrete", "pda"])
+def calibration(request):
+    microscope = preset("jsm820")
+    views = grid_views(
+        microscope.camera_at, [500.0, 1000.0, 2000.0, 4000.0], views=3, noise_px=0.05
+    )
+    result = calibrate_views(
+        views, image_size=(512, 512), display_width_m=0.12, method=request.param
+    )
+    return Calibration.from_model(result.model)
+
+
+def test_loading_gives_back_every_bit(calibration, tmp_path):
+    path = tmp_path / "cal.yaml"
+    calibration.save(path)
+    loaded = Calibration.load(path)
+    assert loaded.magnification_range == (500.0, 4000.0)
+    assert loaded.method == calibration.method
+    assert loaded.statistics["views"] == 12
+    # One triangle is stored; the two differ by rounding at most.
+    np.testing.assert_allclose(loaded.covariance, calibration.covariance, rtol=1e-9)
+    for g in (500.0, 777.7, 4000.0, 9000.0):
+        a, b = loaded.at(g), calibration.at(g)
+        np.testing.assert_array_equal(a.parameters, b.parameters)
+        assert a.in_range == b.in_range
+    assert loaded.dumps() == calibration.dumps()
+
+
+def _broken(calibration, edit):
+    data = yaml.safe_load(calibration.dumps())
+    edit(data)
+    return yaml.safe_dump(data)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda d: d.update(format="other"), "not a calibration file"),
+        (lambda d: d.update(version=2), "update semcal_ros"),
+        (lambda d: d.update(version=0), "calibrate again"),
+        (lambda d: d.update(version="1"), "file version"),
+        (lambda d: d.pop("functions"), "functions"),
+        (lambda d: d["functions"].pop("rho"), "rho"),
+        (lambda d: d["functions"]["rho"].update(kind="magic"), "functions.rho.kind"),
+        (lambda d: d["functions"]["px"].update(coefficients=[float("nan")]), "finite"),
+        (lambda d: d["functions"]["px"].update(coefficients=["a"]), "functions.px.coefficients"),
+        (lambda d: d.update(display_width_m=-1.0), "display_width_m"),
+        (lambda d: d.update(magnifications=[5.0, 1.0]), "ascending"),
+        (lambda d: d["covariance"]["upper_rows"].pop(), "covariance"),
+        (lambda d: d["covariance"]["upper_rows"][0].__setitem__(0, -1.0), "covariance"),
+        (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e6), "correlations"),
+        (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e308), "correlations"),
+        (lambda d: d.update(surprise=1), "surprise"),
+    ],
+)
+def test_wrong_files_are_refused_in_one_line(calibration, edit, message):
+    with pytest.raises(CalibrationFileError, match=message) as caught:
+        Calibration.loads(_broken(calibration, edit), source="cal.yaml")
+    assert str(caught.value).startswith("cal.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "a: [1, 2", "- 1", "!!python/object:os.system x", "\x00", "7"]
+)
+def test_foreign_text_is_refused(text):
+    with pytest.raises(CalibrationFileError):
+        Calibration.loads(text)
+
+
+def test_a_truncated_file_is_refused(calibration):
+    text = calibration.dumps()
+    for length in (10, len(text) // 3, len(text) // 2, len(text) - 20):
+        with pytest.raises(CalibrationFileError):
+            Calibration.loads(text[:length])
+
+
+def test_missing_and_binary_files(tmp_path):
+    with pytest.raises(CalibrationFileError, match="semcal calibrate"):
+        Calibration.load(tmp_path / "none.yaml")
+    with pytest.raises(CalibrationFileError):
+        Calibration.load(tmp_path)
+    binary = tmp_path / "x.yaml"
+    binary.write_bytes(b"\xff\xfe\x00\x80" * 100)
+    with pytest.raises(CalibrationFileError, match="not a text file"):
+        Calibration.load(binary)
+
+
+def test_a_failed_save_leaves_the_old_file(calibration, tmp_path, monkeypatch):
+    path = tmp_path / "cal.yaml"
+    calibration.save(path)
+    before = path.read_bytes()
+
+    def no_space(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", no_space)
+    with pytest.raises(CalibrationFileError, match="No space left"):
+        calibration.save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["cal.yaml"]
+
+
+def test_errors_are_in_one_tree():
+    assert issubclass(CalibrationFileError, SemcalError)

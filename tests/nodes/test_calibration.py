@@ -1,0 +1,223 @@
+"""Views are collected from a live stream, calibrated by service calls, and saved."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcal_ros.files.calibration_file import Calibration
+from tests.helpers.calibration_session import (
+    MAGNIFICATIONS,
+    PLAN,
+    SERVER,
+    SIZE,
+    VIEWS,
+    Session,
+    calibration_session,
+    text_value,
+)
+from tests.helpers.node_scenes import make_calibration
+from tests.helpers.ros_process import running
+
+PARAMETERS = "/sem/parameter_server"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with calibration_session(tmp_path_factory.mktemp("allowed")) as made:
+        yield made
+
+
+def test_there_is_nothing_to_add_calibrate_save_or_cancel_at_first(session: Session) -> None:
+    for service, reason in (
+        ("add_view", "no frame with a known magnification yet"),
+        ("calibrate", "no usable view"),
+        ("save", "no calibration to save"),
+        ("cancel", "no calibration is running"),
+    ):
+        answer = session.call(service)
+        assert not answer.success
+        assert reason in answer.message
+
+
+def test_an_image_without_a_grid_is_refused_with_a_reason_and_shown(session: Session) -> None:
+    flat = np.random.default_rng(1).normal(120, 10, (SIZE, SIZE)).clip(0, 255).astype(np.uint8)
+    session.show(flat, 1000.0)
+    count = len(session.overlays)
+    answer = session.call("add_view")
+    assert not answer.success
+    assert answer.message.startswith("no grid found at 1000x: ")
+    session.peer.wait_for(lambda: len(session.overlays) > count, "the overlay")
+
+
+def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path: Path) -> None:
+    assert session.call("clear").success
+    for index in range(len(PLAN.frames)):
+        session.add_view(index)
+    assert not session.call("add_view").success  # the same frame again
+    overlay = session.peer.wait_for(lambda: session.overlays[-1], "the overlay")
+    assert (overlay.encoding, overlay.width, overlay.height) == ("bgr8", SIZE, SIZE)
+    pixels = np.frombuffer(overlay.data, np.uint8).reshape(SIZE, SIZE, 3)
+    assert np.any(np.ptp(pixels, axis=2) > 100)  # marks in colour
+
+    old = make_calibration()
+    old.save(tmp_path / "old.yaml")
+    expected = {f"p@{g}": old.at(g).P.ravel() for g in (1250.0, 5250.0)}
+    asked_during: set[str] = set()
+    with running("parameter_server", {"calibration": tmp_path / "old.yaml"}):
+        session.peer.wait_for(lambda: session.peer.state(PARAMETERS), "the parameter server")
+        start = len(session.progress)
+        calibrated = session.begin("calibrate")
+        while not calibrated.done():
+            stage = session.shown().get("stage", "")
+            values = session.peer.get_parameters(PARAMETERS, *expected)
+            if calibrated.done():
+                break
+            for value, matrix in zip(values, expected.values(), strict=True):
+                np.testing.assert_array_equal(value.double_array_value, matrix)
+            # The stream is taken in, too; fewer frames than may wait.
+            if stage not in asked_during:
+                session.publish(PLAN.render(0), MAGNIFICATIONS[0])
+            asked_during.add(stage)
+        session.wait_seen(MAGNIFICATIONS[0])
+    assert calibrated.result().success, calibrated.result().message
+    # Not only before it has begun in earnest.
+    assert asked_during - {"", "start", "done"}
+    # By the latched topic, it has reached even the server that answered from another one.
+    text = session.peer.wait_for(lambda: session.texts, "the calibration")[-1].data
+    calibration = Calibration.loads(text)
+    assert calibration.magnifications == MAGNIFICATIONS
+    assert calibration.method == "joint"
+
+    shown = [{v.key: v.value for v in status.values} for status in session.progress[start:]]
+    fractions = [float(values["fraction"]) for values in shown if "fraction" in values]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert shown[-1]["stage"] == "done"
+    assert shown[-1]["views"] == str(VIEWS * len(MAGNIFICATIONS))
+    assert shown[-1]["views at 2000x"] == str(VIEWS)
+    assert session.shown()["message"] == calibrated.result().message
+
+    for g in MAGNIFICATIONS:
+        camera, truth = calibration.at(g), PLAN.microscope.camera_at(g)
+        # 16 views of 384 px leave 0.2 % (1-sigma) of scale at worst, since tilt and scale trade off.
+        assert camera.pixel_size_m == pytest.approx(truth.pixel_size_m, rel=0.006)
+        sigma = np.sqrt(camera.covariance[0, 0]) / camera.m
+        assert 0.0 < sigma < 0.004
+
+
+def test_the_calibration_is_saved_where_the_parameter_says(session: Session) -> None:
+    file = session.folder / "live.yaml"
+    assert session.set_output(file).successful
+    answer = session.call("save")
+    assert answer.success, answer.message
+    assert file.read_text() == session.texts[-1].data
+
+
+# Tests may run as root, whom permission bits do not stop; these stop everybody.
+def _folder_in_place_of_the_file(folder: Path) -> Path:
+    (folder / "folder.yaml").mkdir()
+    return folder / "folder.yaml"
+
+
+def _file_in_place_of_the_folder(folder: Path) -> Path:
+    (folder / "plain").write_text("old")
+    return folder / "plain" / "live.yaml"
+
+
+def _no_folder(folder: Path) -> Path:
+    return folder / "missing" / "live.yaml"
+
+
+@pytest.mark.parametrize(
+    ("prepare", "reason"),
+    [
+        (_folder_in_place_of_the_file, "Is a directory"),
+        (_file_in_place_of_the_folder, "Not a directory"),
+        (_no_folder, "No such file"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_one_plain_answer(
+    session: Session, prepare: Callable[[Path], Path], reason: str
+) -> None:
+    assert session.set_output(prepare(session.folder)).successful
+    before = sorted(session.folder.rglob("*"))
+    answer = session.call("save")
+    assert not answer.success
+    assert reason in answer.message
+    assert sorted(session.folder.rglob("*")) == before
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(session: Session) -> None:
+    """By a limit of the size of files, which stops a write half-way as a full disk does."""
+    file = session.folder / "full.yaml"
+    file.write_text("old")
+    assert session.set_output(file).successful
+    before = sorted(session.folder.iterdir())
+    pid, limit = session.node.process.pid, resource.RLIMIT_FSIZE
+    soft, hard = resource.prlimit(pid, limit)
+    assert len(session.texts[-1].data) > 8192
+    resource.prlimit(pid, limit, (8192, hard))
+    try:
+        answer = session.call("save")
+    finally:
+        resource.prlimit(pid, limit, (soft, hard))
+    assert not answer.success
+    assert "File too large" in answer.message
+    assert file.read_text() == "old"
+    assert sorted(session.folder.iterdir()) == before
+    assert session.call("save").success
+    assert Calibration.load(file).magnifications == MAGNIFICATIONS
+
+
+def test_what_lies_outside_of_the_directory_is_refused(session: Session, tmp_path: Path) -> None:
+    (session.folder / "door").symlink_to(tmp_path)
+    for path in (
+        tmp_path / "a.yaml",
+        session.folder / ".." / "a.yaml",
+        session.folder / "door" / "a.yaml",
+        "/proc/self/cwd/a.yaml",
+        "~/a.yaml",
+        session.folder.parent / (session.folder.name + "2") / "a.yaml",
+    ):
+        result = session.set_output(path)
+        assert not result.successful
+        assert f"inside of {session.folder}" in result.reason
+
+
+def test_a_file_that_became_a_link_to_elsewhere_is_not_written(
+    session: Session, tmp_path: Path
+) -> None:
+    file, victim = session.folder / "linked.yaml", tmp_path / "victim"
+    file.write_text("old")
+    victim.write_text("precious")
+    assert session.set_output(file).successful
+    file.unlink()
+    file.symlink_to(victim)
+    answer = session.call("save")
+    assert not answer.success
+    assert f"which is {victim}" in answer.message
+    assert victim.read_text() == "precious"
+    assert file.is_symlink()
+
+
+def test_too_few_views_are_refused_and_the_calibration_stays(session: Session) -> None:
+    before = len(session.texts)
+    assert session.call("clear").success
+    session.add_view(0)
+    assert session.call("clear").message == "1 views removed"
+    session.add_view(0)
+    answer = session.call("calibrate")
+    assert not answer.success
+    assert "expected at least 3 views" in answer.message
+    assert len(session.texts) == before
+
+
+def test_an_unknown_method_is_refused(session: Session) -> None:
+    result = session.peer.set_parameter(SERVER, "method", text_value("magic"))
+    assert not result.successful
+    assert "one of" in result.reason
