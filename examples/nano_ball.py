@@ -26,7 +26,7 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 from semcal_ros import Calibration
-from semcal_ros.applications.reconstruction import Keyframe, SequenceTracker
+from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe
 from semcal_ros.cli import main as semcal
 from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
@@ -127,7 +127,7 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
     return small_png(figure, 100.0)
 
 
-def draw_trails(axes, keyframes: list[Keyframe]) -> None:
+def draw_trails(axes, keyframes: list[TrackKeyframe]) -> None:
     """Features of the last keyframe, and where they were in those before."""
     last = keyframes[-1]
     axes.plot(*last.xy.T, ".", color="#4fb3ff", markersize=2)

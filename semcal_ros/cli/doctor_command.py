@@ -9,8 +9,8 @@ import click
 
 from semcal_ros.cli.common import config_option, echo_json
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.doctor.examination import examine
-from semcal_ros.doctor.findings import Finding, Level
+from semcal_ros.doctor.diagnosis import diagnose
+from semcal_ros.doctor.findings import Finding, Severity
 
 __all__ = ["command"]
 
@@ -45,14 +45,14 @@ def command(
     Example:
       semcal doctor --config jsm820 --calibration cal.yaml --seconds 10
     """
-    found = examine(config, calibration, _full(namespace), seconds)
+    found = diagnose(config, calibration, _full(namespace), seconds)
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_counts(found)})
     else:
         for finding in found:
             click.echo(f"{finding.level.value:<8} {finding}")
         click.echo(", ".join(f"{count} {name}" for name, count in _counts(found).items()))
-    if any(finding.level is Level.PROBLEM for finding in found):
+    if any(finding.level is Severity.PROBLEM for finding in found):
         sys.exit(1)
 
 
@@ -68,9 +68,9 @@ def _full(namespace: str) -> str:
 def _counts(found: list[Finding]) -> dict[str, int]:
     levels = [finding.level for finding in found]
     return {
-        "problems": levels.count(Level.PROBLEM),
-        "notes": levels.count(Level.NOTE),
-        "ok": levels.count(Level.OK),
+        "problems": levels.count(Severity.PROBLEM),
+        "notes": levels.count(Severity.NOTE),
+        "ok": levels.count(Severity.OK),
     }
 
 

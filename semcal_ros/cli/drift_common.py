@@ -19,7 +19,7 @@ from semcal_ros.core.drift.frame_time import LEFT_IN, REMOVED, estimate_frame_ti
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.files.recordings import Frame
+from semcal_ros.files.recordings import RecordedFrame
 
 __all__ = [
     "GIVE_FRAME_TIME",
@@ -54,7 +54,9 @@ live_option = click.option(
 )
 
 
-def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig) -> ScanCamera:
+def camera_of(
+    frame: RecordedFrame, model: Calibration | None, config: MicroscopeConfig
+) -> ScanCamera:
     """The calibrated camera of a frame, or the nominal one of the display width."""
     height, width = frame.image.shape[:2]
     if model is None:
@@ -62,7 +64,7 @@ def camera_of(frame: Frame, model: Calibration | None, config: MicroscopeConfig)
     return model.at(frame.magnification).resized(width, height)
 
 
-def start_time_s(frame: Frame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
+def start_time_s(frame: RecordedFrame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
     """Start of the acquisition in seconds after the first frame's stamp."""
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
 
@@ -98,7 +100,7 @@ class Follower:
         self._smoothed: DriftPath | None = None
 
     def update(
-        self, frame: Frame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
+        self, frame: RecordedFrame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
     ) -> DriftUpdate:
         """Drift at the next frame."""
         update = self.tracker.update(frame.image, time_s, camera, scan)

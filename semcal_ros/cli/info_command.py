@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from semcal_ros.cli.common import config_option, configured, echo_table, progress
-from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 __all__ = ["command"]
 
@@ -46,5 +46,5 @@ def command(recording: Path, config: str) -> None:
         click.echo(f"note: {note}", err=True)
 
 
-def _format(frame: Frame) -> str:
+def _format(frame: RecordedFrame) -> str:
     return f"{frame.image.shape[1]} x {frame.image.shape[0]} {frame.encoding}"

@@ -31,7 +31,7 @@ from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.files.bags.reader import BagWriter, blank_message
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 __all__ = ["command"]
 
@@ -63,7 +63,7 @@ class _Output:
         self._writer.write(name, log_time_ns, message)
 
     def frame(
-        self, frame: Frame, image: Any, camera: ScanCamera, update: DriftUpdate | None
+        self, frame: RecordedFrame, image: Any, camera: ScanCamera, update: DriftUpdate | None
     ) -> None:
         header = blank_message("std_msgs/msg/Header")
         fill_header(header, frame.stamp_ns, frame.frame_id)
@@ -84,7 +84,7 @@ class _Output:
             fill_drift_velocity(velocity, update.velocity_m_s, update.covariance, header)
             self._write("drift_velocity", when, velocity)
 
-    def _on_change(self, frame: Frame, camera: ScanCamera) -> None:
+    def _on_change(self, frame: RecordedFrame, camera: ScanCamera) -> None:
         if self._magnification is None:
             text = blank_message(_TOPICS["calibration"])
             fill_calibration_text(text, self._model.dumps())

@@ -34,7 +34,7 @@ from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.files.recordings import Frame, Recording, open_recording
+from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
 from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
 from semcal_ros.workflows.select_frames import Job, Survey, surveyed
 
@@ -145,7 +145,7 @@ def _check_outputs(recording: Path, output: Path, sigma: Path | None, video: Pat
         seen.add(target)
 
 
-def _check_first(frame: Frame, output: Path) -> None:
+def _check_first(frame: RecordedFrame, output: Path) -> None:
     if output.suffix.lower() not in _TIFF and frame.image.dtype.kind != "u":
         raise InvalidValueError(
             f"-o {output} for {frame.encoding} frames",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Finding", "Level", "note", "ok", "problem"]
+__all__ = ["Finding", "Severity", "note", "ok", "problem"]
 
 
-class Level(Enum):
+class Severity(Enum):
     """How bad it is: only a problem lets the command fail."""
 
     OK = "ok"
@@ -30,7 +30,7 @@ class Finding:
         What was found, what would be well, and the next step; the last two are empty where all is well.
     """
 
-    level: Level
+    level: Severity
     subject: str
     seen: str
     expected: str = ""
@@ -47,14 +47,14 @@ class Finding:
 
 def ok(subject: str, seen: str) -> Finding:
     """All is well."""
-    return Finding(Level.OK, subject, seen)
+    return Finding(Severity.OK, subject, seen)
 
 
 def note(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
     """Worth knowing, but nothing fails for it."""
-    return Finding(Level.NOTE, subject, seen, expected, do)
+    return Finding(Severity.NOTE, subject, seen, expected, do)
 
 
 def problem(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
     """Something cannot work like this."""
-    return Finding(Level.PROBLEM, subject, seen, expected, do)
+    return Finding(Severity.PROBLEM, subject, seen, expected, do)

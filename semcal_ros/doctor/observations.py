@@ -12,11 +12,11 @@ __all__ = [
     "Arrival",
     "CalibrationSeen",
     "Endpoint",
+    "Environment",
     "Graph",
     "ImageSeen",
     "Session",
     "Status",
-    "Surroundings",
 ]
 
 SUITE = (
@@ -33,7 +33,7 @@ SUITE = (
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Environment:
     """This machine and the environment of this process.
 
     Attributes

@@ -28,11 +28,11 @@ from semcal_ros.files.tiff.folder import TiffFolder, scan_tiff_folder
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Frame", "Recording", "Rejected", "open_recording"]
+__all__ = ["RecordedFrame", "Recording", "RejectedFrame", "open_recording"]
 
 
 @dataclass(frozen=True)
-class Frame:
+class RecordedFrame:
     """One usable image of a recording.
 
     Parameters
@@ -61,7 +61,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Rejected:
+class RejectedFrame:
     """A message or file that was left out, and why."""
 
     log_time_ns: int
@@ -84,7 +84,7 @@ class Recording(ABC):
         self.config = config
         self._notes: list[str] = []
         self._pass_notes: list[str] = []
-        self._rejected: list[Rejected] = []
+        self._rejected: list[RejectedFrame] = []
 
     def __enter__(self) -> Self:
         return self
@@ -116,11 +116,11 @@ class Recording(ABC):
         return (*self._notes, *self._pass_notes)
 
     @property
-    def rejected(self) -> tuple[Rejected, ...]:
+    def rejected(self) -> tuple[RejectedFrame, ...]:
         """Damaged or unknown images that the last reading of :meth:`frames` left out."""
         return tuple(self._rejected)
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[RecordedFrame]:
         """Usable frames in the order of the recording, read as asked for; can be called again.
 
         Raises
@@ -147,7 +147,7 @@ class Recording(ABC):
             )
 
     @abstractmethod
-    def _frames(self) -> Iterator[Frame]: ...
+    def _frames(self) -> Iterator[RecordedFrame]: ...
 
     def _cut(self, image: NDArray[Any], rows: int) -> NDArray[Any]:
         if not 0 <= rows < image.shape[0]:
@@ -214,7 +214,7 @@ class _BagRecording(Recording):
     def frame_count(self) -> int:
         return self._image_topic.count
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Iterator[RecordedFrame]:
         without, unstamped, images = 0, 0, 0
         for raw in self._reader.raw_messages([self._image_topic.name]):
             if raw.type != self._image_topic.type:
@@ -223,7 +223,7 @@ class _BagRecording(Recording):
             try:
                 frame, stamped = self._frame(raw)
             except SemcalError as error:
-                self._rejected.append(Rejected(raw.log_time_ns, str(error)))
+                self._rejected.append(RejectedFrame(raw.log_time_ns, str(error)))
                 continue
             unstamped += not stamped
             if frame is None:
@@ -241,7 +241,7 @@ class _BagRecording(Recording):
                 f"the recording declares {self.frame_count} images and holds {images}"
             )
 
-    def _frame(self, raw: RawMessage) -> tuple[Frame | None, bool]:
+    def _frame(self, raw: RawMessage) -> tuple[RecordedFrame | None, bool]:
         """The frame of a message (``None`` without magnification); whether it has a stamp."""
         message = self._reader.decode(raw)
         pixels, encoding = decoded_image(message)
@@ -252,7 +252,7 @@ class _BagRecording(Recording):
         if magnification is None:
             return None, stamp_ns != 0
         return (
-            Frame(
+            RecordedFrame(
                 image=image,
                 stamp_ns=stamp_ns or raw.log_time_ns,
                 log_time_ns=raw.log_time_ns,
@@ -277,14 +277,14 @@ class _TiffRecording(Recording):
     def frame_count(self) -> int:
         return len(self._folder.entries)
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Iterator[RecordedFrame]:
         for entry in self._folder.entries:
             try:
                 loaded = entry.load()
             except SemcalError as error:
-                self._rejected.append(Rejected(entry.stamp_ns, str(error)))
+                self._rejected.append(RejectedFrame(entry.stamp_ns, str(error)))
                 continue
-            yield Frame(
+            yield RecordedFrame(
                 image=loaded.image,
                 stamp_ns=entry.stamp_ns,
                 log_time_ns=entry.stamp_ns,
@@ -306,16 +306,16 @@ class _PlainRecording(Recording):
     def frame_count(self) -> int:
         return len(self._paths)
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Iterator[RecordedFrame]:
         for index, path in enumerate(self._paths):
             # The files tell no time; a second apart is as good as any.
             stamp_ns = (index + 1) * 1_000_000_000
             try:
                 image = self._cut(read_plain_image(path), self.config.image.databar_rows)
             except SemcalError as error:
-                self._rejected.append(Rejected(stamp_ns, str(error)))
+                self._rejected.append(RejectedFrame(stamp_ns, str(error)))
                 continue
-            yield Frame(
+            yield RecordedFrame(
                 image=image,
                 stamp_ns=stamp_ns,
                 log_time_ns=stamp_ns,

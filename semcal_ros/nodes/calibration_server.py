@@ -24,7 +24,7 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.calibration_input import calibration_digest
 from semcal_ros.nodes.frames.overlay import corner_overlay
-from semcal_ros.nodes.frames.stream import Frame, FrameInput, StreamNode
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_process import CalibrationProcess
 from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, Stage, without_images
 from semcal_ros.workflows.calibrate import FoundView
@@ -55,8 +55,8 @@ class CalibrationServer(StreamNode):
     def __init__(self) -> None:
         super().__init__("calibration_server", _SETTINGS)
         self._lock = threading.Lock()
-        self._newest: Frame | None = None
-        self._added: Frame | None = None
+        self._newest: StreamFrame | None = None
+        self._added: StreamFrame | None = None
         self._views: list[FoundView] = []
         self._calibration: Calibration | None = None
         self._running: CalibrationProcess | None = None
@@ -108,7 +108,7 @@ class CalibrationServer(StreamNode):
 
     # -- stream ------------------------------------------------------------------------------------
 
-    def _on_frame(self, frame: Frame) -> None:
+    def _on_frame(self, frame: StreamFrame) -> None:
         if self.known_magnification(frame) is not None and not frame.mixed:
             with self._lock:
                 self._newest = frame

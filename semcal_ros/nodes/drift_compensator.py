@@ -10,7 +10,7 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.compressed import compressed_settings
 from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
 from semcal_ros.nodes.frames.outputs import DriftOutput, ImageOutput
-from semcal_ros.nodes.frames.stream import Frame, FrameInput, StreamNode, nominal_camera
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode, nominal_camera
 
 __all__ = ["DriftCompensator", "main"]
 
@@ -39,7 +39,7 @@ class DriftCompensator(StreamNode):
     def _set_interpolation(self, value: str) -> None:
         self._rectifier = Rectifier(value)
 
-    def _on_frame(self, frame: Frame) -> None:
+    def _on_frame(self, frame: StreamFrame) -> None:
         g = self.known_magnification(frame)
         if g is None:
             return

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.stream import Frame, FrameInput
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame
 
 __all__ = ["RectifierNode", "main"]
 
@@ -34,7 +34,7 @@ class RectifierNode(CalibratedStreamNode):
             databar_rows=0 if stabilized else None,
         )
 
-    def _on_frame(self, frame: Frame) -> None:
+    def _on_frame(self, frame: StreamFrame) -> None:
         camera = None
         if self.calibration.current is not None:
             g = self.known_magnification(frame)

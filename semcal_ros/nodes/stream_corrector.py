@@ -8,7 +8,7 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
 from semcal_ros.nodes.frames.outputs import DriftOutput
-from semcal_ros.nodes.frames.stream import Frame, FrameInput, nominal_camera
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, nominal_camera
 
 __all__ = ["StreamCorrector", "main"]
 
@@ -32,7 +32,7 @@ class StreamCorrector(CalibratedStreamNode):
         if self._drift is not None:
             self._drift.reset()
 
-    def _on_frame(self, frame: Frame) -> None:
+    def _on_frame(self, frame: StreamFrame) -> None:
         g = self.known_magnification(frame)
         if g is None or self._drift is None:
             return

@@ -21,7 +21,7 @@ from semcal_ros.applications.servoing import (
 )
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.common.run import OrderlyEnd, run_node
+from semcal_ros.nodes.common.run import DeferredSignals, run_node
 from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
@@ -52,7 +52,7 @@ class VisualServo(SemNode):
         # The middleware may end a node that is still being made.
         self._stage: StageOutput | None = None
         super().__init__("visual_servo", SERVO_SETTINGS)
-        self._end = OrderlyEnd()
+        self._end = DeferredSignals()
         values = self.settings
         self._target = NestedTarget(values["target_cell_m"])
         centre = values["rotation_centre_x_m"], values["rotation_centre_y_m"]

@@ -17,7 +17,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.files.recordings import Frame, Recording
+from semcal_ros.files.recordings import RecordedFrame, Recording
 
 __all__ = ["Job", "Survey", "surveyed"]
 
@@ -47,7 +47,7 @@ class Job:
     at: float | None = None
     follower: Follower | None = None
 
-    def camera(self, frame: Frame) -> ScanCamera:
+    def camera(self, frame: RecordedFrame) -> ScanCamera:
         """Of a frame."""
         return camera_of(frame, self.model, self.microscope)
 
@@ -101,7 +101,7 @@ class Survey:
 
 
 def surveyed(
-    opened: Recording, job: Job, *, on_first: Callable[[Frame], None], levels: bool
+    opened: Recording, job: Job, *, on_first: Callable[[RecordedFrame], None], levels: bool
 ) -> Survey:
     """Read a recording for the first time: choose its frames and track their drift.
 
@@ -137,7 +137,7 @@ def surveyed(
 
 
 def _surveyed_once(
-    opened: Recording, job: Job, on_first: Callable[[Frame], None], levels: bool
+    opened: Recording, job: Job, on_first: Callable[[RecordedFrame], None], levels: bool
 ) -> Survey:
     counts: Counter[str] = Counter()
     wanted = None if job.at is None else _label(job.at)
@@ -169,11 +169,11 @@ def _label(magnification: float) -> str:
     return f"{magnification:.6g}"
 
 
-def _kind(frame: Frame) -> tuple[object, ...]:
+def _kind(frame: RecordedFrame) -> tuple[object, ...]:
     return (*frame.image.shape, frame.encoding)
 
 
-def _black_white(frame: Frame) -> tuple[float, float]:
+def _black_white(frame: RecordedFrame) -> tuple[float, float]:
     values = frame.image[::4, ::4]
     if values.dtype.kind == "f":
         values = values[np.isfinite(values)]
@@ -181,13 +181,13 @@ def _black_white(frame: Frame) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _begun(frame: Frame, job: Job) -> Survey:
+def _begun(frame: RecordedFrame, job: Job) -> Survey:
     height, width = frame.image.shape[:2]
     size = width, height
     return Survey(job, job.camera(frame), frame.image.dtype, size, frame.stamp_ns)
 
 
-def _add(survey: Survey, index: int, frame: Frame, job: Job) -> None:
+def _add(survey: Survey, index: int, frame: RecordedFrame, job: Job) -> None:
     time_s = start_time_s(frame, survey.first_stamp_ns, job.microscope)
     if survey.times_s and time_s < survey.times_s[-1]:
         raise BagError(

@@ -18,8 +18,8 @@ from semcal_ros.cli import main
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.doctor import surroundings_checks as checks
 from semcal_ros.doctor.calibration_checks import calibration_seen, check_calibration
-from semcal_ros.doctor.examination import judge
-from semcal_ros.doctor.findings import Finding, Level
+from semcal_ros.doctor.diagnosis import evaluate
+from semcal_ros.doctor.findings import Finding, Severity
 from semcal_ros.doctor.graph_checks import (
     check_nodes,
     check_parameters,
@@ -31,11 +31,11 @@ from semcal_ros.doctor.observations import (
     SUITE,
     Arrival,
     Endpoint,
+    Environment,
     Graph,
     ImageSeen,
     Session,
     Status,
-    Surroundings,
 )
 from semcal_ros.doctor.stream_checks import (
     check_diagnostics,
@@ -51,13 +51,13 @@ from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
 from tests.helpers.node_scenes import make_calibration
 
 ROOT = Path(__file__).resolve().parents[2]
-OK, NOTE, PROBLEM = Level.OK, Level.NOTE, Level.PROBLEM
+OK, NOTE, PROBLEM = Severity.OK, Severity.NOTE, Severity.PROBLEM
 MIB = 1024**2
 CONFIG = MicroscopeConfig("test", 0.12)
 CALIBRATION = make_calibration()
 IMAGES, MAGNIFICATION, RECT, *_ = suite_topics(CONFIG, "/sem")
 NOW_NS = 1_800_000_000_000_000_000
-AROUND = Surroundings(
+AROUND = Environment(
     python=(3, 12),
     packages={"numpy": "2.1.0", "ros-rclpy": "7.1.6", "ros-sensor-msgs": "5.3.6"},
     required=("numpy>=1.26",),
@@ -72,7 +72,7 @@ AROUND = Surroundings(
 )
 
 
-def only(found: list[Finding], level: Level, *words: str) -> None:
+def only(found: list[Finding], level: Severity, *words: str) -> None:
     """There is one finding, of this level and with these words."""
     assert [finding.level for finding in found] == [level], found
     for word in words:
@@ -81,15 +81,15 @@ def only(found: list[Finding], level: Level, *words: str) -> None:
         assert "; " in str(found[0]), "a problem without advice"
 
 
-def worst(found: list[Finding]) -> set[Level]:
+def worst(found: list[Finding]) -> set[Severity]:
     return {finding.level for finding in found}
 
 
-def around(**changes: Any) -> Surroundings:
+def around(**changes: Any) -> Environment:
     return replace(AROUND, **changes)
 
 
-def with_environment(**values: str) -> Surroundings:
+def with_environment(**values: str) -> Environment:
     return around(environment={**AROUND.environment, **values})
 
 
@@ -97,14 +97,14 @@ def with_environment(**values: str) -> Surroundings:
 
 
 def test_sound_surroundings_are_all_ok() -> None:
-    found = [finding for check in checks.SURROUNDINGS_CHECKS for finding in check(AROUND)]
+    found = [finding for check in checks.ENVIRONMENT_CHECKS for finding in check(AROUND)]
     assert worst(found) == {OK}
 
 
 @pytest.mark.parametrize(
     ("version", "level"), [((3, 9), PROBLEM), ((3, 10), OK), ((3, 15), PROBLEM)]
 )
-def test_python(version: tuple[int, int], level: Level) -> None:
+def test_python(version: tuple[int, int], level: Severity) -> None:
     only(checks.check_python(around(python=version)), level, ".".join(map(str, version)))
 
 
@@ -189,7 +189,7 @@ def test_middleware() -> None:
         ("a", PROBLEM),
     ],
 )
-def test_domain(given: str, level: Level) -> None:
+def test_domain(given: str, level: Severity) -> None:
     only(checks.check_domain(with_environment(ROS_DOMAIN_ID=given)), level, given)
 
 
@@ -205,7 +205,7 @@ def test_domain(given: str, level: Level) -> None:
         ({"ROS_DISCOVERY_SERVER": "10.0.0.1:11811"}, NOTE),
     ],
 )
-def test_discovery(environment: Mapping[str, str], level: Level) -> None:
+def test_discovery(environment: Mapping[str, str], level: Severity) -> None:
     only(checks.check_discovery(with_environment(**environment)), level)
 
 
@@ -343,7 +343,7 @@ def test_parameters_and_configuration() -> None:
     ("clock", "simulated", "level"),
     [(False, False, OK), (True, True, OK), (False, True, PROBLEM), (True, False, NOTE)],
 )
-def test_clock_and_simulated_time(clock: bool, simulated: bool, level: Level) -> None:
+def test_clock_and_simulated_time(clock: bool, simulated: bool, level: Severity) -> None:
     player = Endpoint("/sem/bag_player", "rosgraph_msgs/msg/Clock")
     graph = Graph(
         publishers={"/clock": (player,)} if clock else {},
@@ -412,7 +412,7 @@ def test_large_images_use_the_rule_of_the_nodes() -> None:
         (-1e6, NOTE, "another clock"),
     ],
 )
-def test_stamps(age_s: float, level: Level, words: str) -> None:
+def test_stamps(age_s: float, level: Severity, words: str) -> None:
     heard = session(arrivals={IMAGES.name: arrivals(age_s=age_s)})
     only(check_stamps(IMAGES, heard), level, words)
 
@@ -429,13 +429,13 @@ def test_stamps_of_a_replay_and_bad_ones() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "level"), [(0.001, OK), (-0.2, PROBLEM), (2.0, NOTE)])
-def test_clocks_of_two_hosts(seconds: float, level: Level) -> None:
+def test_clocks_of_two_hosts(seconds: float, level: Severity) -> None:
     heard = session(arrivals={IMAGES.name: arrivals(transport_s=seconds)})
     only(check_transport_time(IMAGES, heard), level)
 
 
 @pytest.mark.parametrize(("made", "level"), [(30, OK), (29, OK), (10, NOTE), (0, PROBLEM)])
-def test_the_output_keeps_up(made: int, level: Level) -> None:
+def test_the_output_keeps_up(made: int, level: Severity) -> None:
     graph = Graph(publishers={RECT.name: (Endpoint("/sem/rectifier", RECT.type),)})
     heard = session(graph=graph, arrivals={IMAGES.name: arrivals(30), RECT.name: arrivals(made)})
     only(check_output_rate(IMAGES, RECT, heard), level)
@@ -496,7 +496,7 @@ def test_a_calibration_that_fits() -> None:
     ],
 )
 def test_a_calibration_that_does_not_fit(
-    g: float | None, size: tuple[int, int], level: Level, words: str
+    g: float | None, size: tuple[int, int], level: Severity, words: str
 ) -> None:
     only(calibrated(g, size), level, words)
 
@@ -510,7 +510,7 @@ def test_another_display_and_no_calibration() -> None:
 
 
 def judged(heard: Session, given: tuple[str, Any] | None = None) -> list[Finding]:
-    return judge(heard, AROUND, ("generic", CONFIG), given, "/sem")
+    return evaluate(heard, AROUND, ("generic", CONFIG), given, "/sem")
 
 
 def test_the_calibration_in_force_is_the_given_one_or_that_of_the_topic() -> None:
@@ -539,7 +539,7 @@ def doctor(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
 
 @pytest.fixture
 def no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("semcal_ros.doctor.examination")
+    module = importlib.import_module("semcal_ros.doctor.diagnosis")
     seen = around(import_errors={"rclpy": "No module named 'rclpy'"}, rclpy_file="", rmw="")
     monkeypatch.setattr(module, "look_around", lambda: seen)
 

@@ -15,7 +15,7 @@ from semcal_ros.config.config import ImageConfig, MagnificationConfig, Microscop
 from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
 from semcal_ros.files.bags.reader import BagTopic, BagWriter, blank_message
 from semcal_ros.files.bags.topics import find_topic, topic_matches
-from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 FLOAT = "std_msgs/msg/Float64"
 IMAGE = "sensor_msgs/msg/Image"
@@ -50,7 +50,7 @@ def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
     return path
 
 
-def frames_of(path: Path, config: MicroscopeConfig = CONFIG) -> list[Frame]:
+def frames_of(path: Path, config: MicroscopeConfig = CONFIG) -> list[RecordedFrame]:
     with open_recording(path, config) as recording:
         return list(recording.frames())
 

@@ -22,7 +22,7 @@ from semcal_ros.config.config import (
 )
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.reader import BagWriter, blank_message
-from semcal_ros.files.recordings import Frame, open_recording
+from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 T0 = 1_700_000_000 * 10**9
 RAW = MicroscopeConfig(name="test", display_width_m=0.12)
@@ -59,7 +59,9 @@ def recorded(path: Path, *messages: tuple[str, Any]) -> Path:
     return path
 
 
-def frames_and_notes(path: Path, config: MicroscopeConfig) -> tuple[list[Frame], tuple[str, ...]]:
+def frames_and_notes(
+    path: Path, config: MicroscopeConfig
+) -> tuple[list[RecordedFrame], tuple[str, ...]]:
     with open_recording(path, config) as recording:
         return list(recording.frames()), recording.notes
 

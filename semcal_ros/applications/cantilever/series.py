@@ -21,7 +21,12 @@ from semcal_ros.applications.cantilever.bending import (
 from semcal_ros.applications.cantilever.edges import EdgeFit, fit_edges, same_width
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
-from semcal_ros.applications.cantilever.undeformed import REACH_PX, Rest, View, beam_at_rest
+from semcal_ros.applications.cantilever.undeformed import (
+    REACH_PX,
+    PixelSamples,
+    UndeformedBeam,
+    measure_undeformed_beam,
+)
 from semcal_ros.core.arrays import AnyImage, Array, Indices
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -131,7 +136,7 @@ class Series:
     """
 
     magnification: float
-    rest: Rest
+    rest: UndeformedBeam
     frames: tuple[Deflection, ...]
     shape: Shape
     drift: DriftPath
@@ -181,7 +186,7 @@ def measure_series(
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
     work = _Work(images, plane, background.path, settings, rough)
-    rest = beam_at_rest(
+    rest = measure_undeformed_beam(
         rough, [work.view(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
     frames, shape = work.deflections(rest, tuple(reference), on_frame)
@@ -216,7 +221,7 @@ def _axis_of(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
 
 
 def _notes(
-    rest: Rest, frames: Sequence[Deflection], path: DriftPath, settings: SeriesSettings
+    rest: UndeformedBeam, frames: Sequence[Deflection], path: DriftPath, settings: SeriesSettings
 ) -> tuple[str, ...]:
     notes = list(rest.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
@@ -257,14 +262,14 @@ class _Work:
         near = (np.abs(across) < wide) & (along > first - room) & (along < last + room)
         return np.flatnonzero(near)
 
-    def view(self, axis: Axis, frame: int) -> View:
+    def view(self, axis: Axis, frame: int) -> PixelSamples:
         """Pixels in coordinates of the axis, freed of drift, and their grey levels."""
         x, y = self._plane.specimen(self._pixels, self._path.raster(frame))
         grey = self._images[frame].ravel()[self._pixels].astype(np.float64)
         return (*axis.coordinates(x, y), grey)
 
     def deflections(
-        self, rest: Rest, reference: tuple[int, ...], on_frame: Callable[[], None]
+        self, rest: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
     ) -> tuple[list[Deflection], Shape]:
         """All frames in the order of time, each begun where the one before was; their shape."""
         edges, free = [], []
@@ -285,7 +290,7 @@ class _Work:
         bent = [self._bending(k, fit, rest, reference, shape) for k, fit in enumerate(edges)]
         return [self._result(k, one, rest) for k, one in enumerate(bent)], shape
 
-    def _nearby(self, view: View, rest: Rest, terms: Array) -> Array:
+    def _nearby(self, view: PixelSamples, rest: UndeformedBeam, terms: Array) -> Array:
         """A bending to start from: that with the largest contrast between beam and surroundings."""
         model, reach = rest.model, self._settings.reach_m
         along, across, grey = view
@@ -309,7 +314,7 @@ class _Work:
                 best, found = contrast, float(end)
         return terms if abs(found - now) < step else found * np.array([1.5, -0.5])
 
-    def _edges(self, view: View, rest: Rest, terms: Array) -> EdgeFit:
+    def _edges(self, view: PixelSamples, rest: UndeformedBeam, terms: Array) -> EdgeFit:
         """Edges of a frame, looked for again where the first look has found the beam."""
         length, model = self._settings.length_m, rest.model
         u = model.centres_m / length
@@ -327,7 +332,7 @@ class _Work:
         self,
         frame: int,
         fit: EdgeFit,
-        rest: Rest,
+        rest: UndeformedBeam,
         reference: tuple[int, ...],
         shape: Shape | None,
     ) -> Bending:
@@ -353,7 +358,7 @@ class _Work:
             return fit_bending(u, moved, np.full_like(noise, np.inf), length, offset, shape)
         return found
 
-    def _result(self, frame: int, bending: Bending, rest: Rest) -> Deflection:
+    def _result(self, frame: int, bending: Bending, rest: UndeformedBeam) -> Deflection:
         length, axis, camera = self._settings.length_m, rest.axis, self._plane.camera
         value, noise = bending.deflection_m, bending.sigma_m
         known = 0.0 if np.isnan(value) else value

@@ -18,10 +18,10 @@ from semcal_ros.applications.cantilever.plane import Axis
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["REACH_PX", "Rest", "View", "beam_at_rest"]
+__all__ = ["REACH_PX", "PixelSamples", "UndeformedBeam", "measure_undeformed_beam"]
 
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
-View = tuple[Array, Array, Array]
+PixelSamples = tuple[Array, Array, Array]
 
 #: How far from an edge pixels count.
 REACH_PX = 6.0
@@ -37,7 +37,7 @@ _BESIDE_REACH_PX = 24.0
 
 
 @dataclass(frozen=True)
-class Rest:
+class UndeformedBeam:
     """The beam at rest.
 
     Attributes
@@ -65,7 +65,9 @@ class Rest:
     notes: tuple[str, ...]
 
 
-def beam_at_rest(rough: Axis, views: list[View], length_m: float, px_m: float) -> Rest:
+def measure_undeformed_beam(
+    rough: Axis, views: list[PixelSamples], length_m: float, px_m: float
+) -> UndeformedBeam:
     """Measure the beam in the reference frames.
 
     Parameters
@@ -97,7 +99,7 @@ def beam_at_rest(rough: Axis, views: list[View], length_m: float, px_m: float) -
             expected="a beam that is brighter than what lies beside it",
             do="give base and tip, or check focus and contrast",
         )
-    return Rest(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
+    return UndeformedBeam(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
 
 
 def averaged(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
@@ -127,13 +129,13 @@ def _blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
     return EdgeModel(width_m, reach, first + inset, size, count, axis.half_width_m)
 
 
-def _moved(view: View, before: Axis, now: Axis) -> View:
+def _moved(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
     """A view in the coordinates of another axis."""
     points = before.point(view[0], view[1])
     return (*now.coordinates(points[:, 0], points[:, 1]), view[2])
 
 
-def _straightened(rough: Axis, views: list[View], px_m: float) -> tuple[Axis, float]:
+def _straightened(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
     """The axis along the middle of both edges, and the width of these."""
     axis, width_m = rough, _EDGE_PX * px_m
     for turn in range(4):
@@ -173,7 +175,7 @@ def _refined(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
 
 
 def _with_ends(
-    axis: Axis, views: list[View], width_m: float, length_m: float, px_m: float
+    axis: Axis, views: list[PixelSamples], width_m: float, length_m: float, px_m: float
 ) -> tuple[Axis, float, float, list[str]]:
     """The axis with arc lengths from the base; the length in view and its 1-sigma; notes."""
     notes: list[str] = []
@@ -218,7 +220,7 @@ def _mean(steps: list[StepFit]) -> StepFit:
     return StepFit(place, float(1.0 / np.sqrt(weight.sum())), known[0].step)
 
 
-def _base_edge(view: View, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+def _base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
     """Edge of the holder on both sides of the beam; distances grow into the holder."""
     along, across, grey = view
     away = np.abs(across) - model.half_width_m
@@ -226,7 +228,7 @@ def _base_edge(view: View, at_m: float, model: EdgeModel, px_m: float) -> StepFi
     return fit_step(at_m - along[beside], grey[beside], model, rough_m=_END_SEARCH_PX * px_m)
 
 
-def _end_edge(view: View, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+def _end_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
     """Edge of the free end; distances grow into the beam."""
     along, across, grey = view
     middle = np.abs(across) < max(model.half_width_m - _BESIDE_PX * px_m, 0.5 * model.half_width_m)

@@ -10,9 +10,9 @@ from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
 from semcal_ros.applications.reconstruction.ball import Ball, measure_ball
 from semcal_ros.applications.reconstruction.factorization import AffineStructure, factorize
 from semcal_ros.applications.reconstruction.feature_tracks import (
-    Keyframe,
     SequenceTracker,
     TrackerSettings,
+    TrackKeyframe,
 )
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
 from semcal_ros.applications.reconstruction.metric_upgrade import (
@@ -32,7 +32,6 @@ __all__ = [
     "Adjustment",
     "AffineStructure",
     "Ball",
-    "Keyframe",
     "MetricUpgrade",
     "Observations",
     "SequenceTracker",
@@ -40,6 +39,7 @@ __all__ = [
     "Structure",
     "StructureSettings",
     "SurfaceMesh",
+    "TrackKeyframe",
     "TrackerSettings",
     "Tracks",
     "adjust",

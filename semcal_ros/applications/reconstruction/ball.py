@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from semcal_ros.applications.reconstruction.adjustment import adjust
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
 from semcal_ros.applications.reconstruction.moving_least_squares import (
-    local_surface,
+    fit_local_surface,
     typical_spacing_m,
 )
 from semcal_ros.applications.reconstruction.reconstruct import Structure
@@ -170,7 +170,7 @@ def _scale_sigma(structure: Structure, height_sigma_m: float) -> float:
 def _meshed(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
     points = structure.points_m[sphere.inliers]
     radius = max(2.0 * typical_spacing_m(points), 0.12 * sphere.radius_m)
-    surface = local_surface(points, points, radius).facing(points - sphere.centre_m)
+    surface = fit_local_surface(points, points, radius).facing(points - sphere.centre_m)
     return mesh_of_cloud(surface.points_m, sphere.centre_m, surface.normals, surface.sigma_m)
 
 

@@ -24,7 +24,7 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Keyframe", "SequenceTracker", "TrackerSettings", "to_plane"]
+__all__ = ["SequenceTracker", "TrackKeyframe", "TrackerSettings", "to_plane"]
 
 
 _FEW = 30
@@ -75,7 +75,7 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframe:
+class TrackKeyframe:
     """A frame that takes part in the reconstruction.
 
     Attributes
@@ -118,7 +118,7 @@ class _Reference:
     """The last keyframe while frames are tracked against it."""
 
     picture: NDArray[np.uint8]
-    frame: Keyframe
+    frame: TrackKeyframe
     latest_m: Array
     alive: Mask
     before: Array | None
@@ -143,7 +143,7 @@ class SequenceTracker:
 
     def __init__(self, settings: TrackerSettings | None = None) -> None:
         self.settings = settings or TrackerSettings()
-        self.keyframes: list[Keyframe] = []
+        self.keyframes: list[TrackKeyframe] = []
         self.frames = 0
         self._next_id = 0
         self._reference: _Reference | None = None
@@ -204,7 +204,7 @@ class SequenceTracker:
         )
         return True
 
-    def finish(self) -> list[Keyframe]:
+    def finish(self) -> list[TrackKeyframe]:
         """All keyframes, each with the movement during its acquisition."""
         self._settle()
         return self.keyframes
@@ -323,7 +323,7 @@ class SequenceTracker:
         motion: Array | None,
     ) -> None:
         self._settle()
-        frame = Keyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
+        frame = TrackKeyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
         self.keyframes.append(frame)
         latest = to_plane(camera, xy)
         self._reference = _Reference(

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["LocalSurface", "local_surface", "typical_spacing_m"]
+__all__ = ["LocalSurface", "fit_local_surface", "typical_spacing_m"]
 
 
 _NEIGHBOURS = 48
@@ -57,7 +57,9 @@ def typical_spacing_m(points_m: Array) -> float:
     return float(np.median(cKDTree(points_m).query(points_m, k=2)[0][:, 1]))
 
 
-def local_surface(cloud_m: Array, at_m: Array, radius_m: float, *, steps: int = 2) -> LocalSurface:
+def fit_local_surface(
+    cloud_m: Array, at_m: Array, radius_m: float, *, steps: int = 2
+) -> LocalSurface:
     """Surface of a cloud at points near it.
 
     Parameters

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.applications.reconstruction.appearance import Appearance
-from semcal_ros.applications.reconstruction.feature_tracks import Keyframe, to_plane
+from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, to_plane
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 
-def displacement_m(frame: Keyframe, scan: ScanTiming | None, raw: Array, xy_m: Array) -> Array:
+def displacement_m(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array, xy_m: Array) -> Array:
     """How far (n, 2) in m the specimen has moved since the centre of the acquisition when raw pixels
     (n, 2) are seen that show the places ``xy_m`` (n, 2) of the sem frame.
     """
@@ -42,7 +42,7 @@ def displacement_m(frame: Keyframe, scan: ScanTiming | None, raw: Array, xy_m: A
     return np.asarray(velocity * offset[:, None], dtype=np.float64)
 
 
-def plane_at_centre(frame: Keyframe, scan: ScanTiming | None, raw: Array) -> Array:
+def plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array) -> Array:
     """Sem-frame X, Y (n, 2) in m of raw pixels (n, 2), as they were at the centre of the acquisition."""
     seen = to_plane(frame.camera, raw)
     return seen - displacement_m(frame, scan, raw, seen)
@@ -112,7 +112,7 @@ class _Cut:
 
 
 def measure_patches(
-    frames: Sequence[Keyframe],
+    frames: Sequence[TrackKeyframe],
     looks: Sequence[Appearance],
     scan: ScanTiming | None,
     posed: Posed,
@@ -157,7 +157,7 @@ def _tangents(normals: Array) -> tuple[Array, Array]:
 
 def _cut(
     view: int,
-    frame: Keyframe,
+    frame: TrackKeyframe,
     scan: ScanTiming | None,
     posed: Posed,
     size_m: float,
@@ -257,7 +257,7 @@ def _template(stack: Array) -> Array:
 
 
 def _observed(
-    frames: Sequence[Keyframe],
+    frames: Sequence[TrackKeyframe],
     scan: ScanTiming | None,
     cuts: Sequence[_Cut],
     shift: Array,

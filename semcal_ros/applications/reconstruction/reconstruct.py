@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
 from semcal_ros.applications.reconstruction.appearance import Appearance, appearance_of
 from semcal_ros.applications.reconstruction.factorization import factorize
-from semcal_ros.applications.reconstruction.feature_tracks import Keyframe
+from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
 from semcal_ros.applications.reconstruction.metric_upgrade import mirrored, upgrade_to_metric
 from semcal_ros.applications.reconstruction.moving_least_squares import (
-    local_surface,
+    fit_local_surface,
     typical_spacing_m,
 )
 from semcal_ros.applications.reconstruction.patches import (
@@ -135,7 +135,7 @@ class Structure:
 
 
 def reconstruct(
-    keyframes: Sequence[Keyframe],
+    keyframes: Sequence[TrackKeyframe],
     scan: ScanTiming | None = None,
     settings: StructureSettings | None = None,
     *,
@@ -192,7 +192,9 @@ def reconstruct(
     return work.structure(len(keyframes), tracks.seen.shape[1], metric.condition)
 
 
-def tracks_of(keyframes: Sequence[Keyframe], scan: ScanTiming | None, least: int = 3) -> Tracks:
+def tracks_of(
+    keyframes: Sequence[TrackKeyframe], scan: ScanTiming | None, least: int = 3
+) -> Tracks:
     """Tracks through keyframes, in the plane of the specimen, those of at least ``least`` views."""
     if len(keyframes) < 3:
         raise StructureError(
@@ -225,7 +227,7 @@ class _Work:
 
     def __init__(
         self,
-        keyframes: list[Keyframe],
+        keyframes: list[TrackKeyframe],
         cameras: tuple[ScanCamera, ...],
         scan: ScanTiming | None,
         settings: StructureSettings,
@@ -355,7 +357,7 @@ class _Work:
         """Normals towards the gun and the mean curvature about them."""
         spread = float(np.sqrt(np.mean(np.var(self.points, axis=0))))
         radius = 0.5 * spread if wide else max(3.0 * typical_spacing_m(self.points), 0.2 * spread)
-        surface = local_surface(self.points, self.points, radius, steps=1)
+        surface = fit_local_surface(self.points, self.points, radius, steps=1)
         towards = np.zeros((len(self.points), 3))
         np.add.at(towards, self.seen.point, -self.rotations[self.seen.view, 2])
         surface = surface.facing(towards)

@@ -15,7 +15,11 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.applications.servoing.axis import AxisObserver
 from semcal_ros.applications.servoing.detection import TargetView
-from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver, FollowWatch
+from semcal_ros.applications.servoing.motion import (
+    CommandHistory,
+    DisturbanceObserver,
+    StageMonitor,
+)
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
 from semcal_ros.applications.servoing.settings import ServoSettings
@@ -135,7 +139,7 @@ class Servo:
         self.fault = ""
         self._last: _Seen | None = None
         self._near = 0
-        self._watch = FollowWatch()
+        self._watch = StageMonitor()
         self._observer = DisturbanceObserver(
             self.settings.drift_sigma_m_s, self.settings.drift_change_m_s
         )

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CommandHistory", "DisturbanceObserver", "FollowWatch"]
+__all__ = ["CommandHistory", "DisturbanceObserver", "StageMonitor"]
 
 
 _KEPT = 1024
@@ -113,7 +113,7 @@ _JUDGED_PX = 36.0
 _LEAST, _MOST = 0.3, 3.0
 
 
-class FollowWatch:
+class StageMonitor:
     """Adds up commanded and seen ways, and says when they have nothing to do with each other.
 
     A stage that does not move, one whose axes are others than assumed, or a picture that is held still while the

@@ -14,14 +14,14 @@ from semcal_ros.core.calibration.normal_equations import (
     NormalEquations,
     Problem,
     State,
-    moved,
     normal_equations,
     part_of,
     prior_cost,
-    reduced,
+    reduced_normal_equations,
     residuals,
+    retract,
     scaled_solve,
-    theta_system,
+    schur_complement,
     view_costs,
 )
 
@@ -92,12 +92,12 @@ class _Step:
 
 
 def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
-    information, gradient, back_camera, back_right = reduced(problem, normal, damping)
-    matrix, right = theta_system(problem, state.theta, information, gradient)
+    information, gradient, back_camera, back_right = schur_complement(problem, normal, damping)
+    matrix, right = reduced_normal_equations(problem, state.theta, information, gradient)
     change = scaled_solve(matrix, right, damping)
     camera_change = (problem.designs @ change)[problem.group]
     pose = back_right - np.einsum("vpq,vq->vp", back_camera, camera_change)
-    new = moved(problem, state, change, pose)
+    new = retract(problem, state, change, pose)
     whole = np.concatenate([camera_change, pose], axis=1)
     bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
     precision = problem.prior_sigma**-2.0
@@ -192,7 +192,7 @@ def _refined_poses(
         change = np.asarray(
             np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0], dtype=np.float64
         )
-        trial = moved(problem, state, np.zeros_like(state.theta), change)
+        trial = retract(problem, state, np.zeros_like(state.theta), change)
         trial_costs = view_costs(problem, trial)
         better = trial_costs <= costs
         decrease = np.where(better, costs - trial_costs, 0.0)
@@ -214,8 +214,8 @@ def _result(
     problem: Problem, state: State, cost: float, iterations: int, reason: str
 ) -> BundleResult:
     normal = normal_equations(problem, state)
-    information, gradient, back_camera, _ = reduced(problem, normal, 0.0)
-    matrix, _ = theta_system(problem, state.theta, information, gradient)
+    information, gradient, back_camera, _ = schur_complement(problem, normal, 0.0)
+    matrix, _ = reduced_normal_equations(problem, state.theta, information, gradient)
     covariance = _covariance(matrix)
     spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)
     height_row = back_camera[:, 5]

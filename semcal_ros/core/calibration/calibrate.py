@@ -11,7 +11,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
-from semcal_ros.core.calibration.evaluate import PoseFit, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.evaluate import ViewPose, fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.joint import (
     RESIDUAL_MODES,
     JointFit,
@@ -19,7 +19,7 @@ from semcal_ros.core.calibration.joint import (
     suited_to_views,
     without_magnification,
 )
-from semcal_ros.core.calibration.outliers import OutlyingView, likely_jump, outlying_views
+from semcal_ros.core.calibration.outliers import OutlyingView, find_change_point, outlying_views
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.problem import (
     Priors,
@@ -88,7 +88,7 @@ class CalibrationResult:
 
     model: CalibrationModel
     views: tuple[GridView, ...]
-    fit: PoseFit
+    fit: ViewPose
     held_out_rms_px: Mapping[float, float]
     warnings: tuple[str, ...]
     outliers: tuple[OutlyingView, ...] = ()
@@ -275,7 +275,7 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
             "do not follow the microscope everywhere, or the grid is not regular"
             + ("; record more magnifications" if len(setup.magnifications) > 1 else "")
         )
-    jump = likely_jump(setup, fit.problem, fit.result)
+    jump = find_change_point(setup, fit.problem, fit.result)
     if jump is not None:
         warnings.append(
             f"the scale seems to jump by {100.0 * jump.relative:.2g} +- {100.0 * jump.sigma:.1g} % between "

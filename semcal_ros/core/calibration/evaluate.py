@@ -19,11 +19,11 @@ from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_ex
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
-__all__ = ["PoseFit", "fit_poses", "rms_by_magnification"]
+__all__ = ["ViewPose", "fit_poses", "rms_by_magnification"]
 
 
 @dataclass(frozen=True)
-class PoseFit:
+class ViewPose:
     """Views with fitted poses.
 
     Attributes
@@ -56,7 +56,7 @@ def fit_poses(
     *,
     height_sigma_m: Array | float = 1e-4,
     starts: tuple[Array, Array] | None = None,
-) -> PoseFit:
+) -> ViewPose:
     """Fit the pose of every view with the camera of its magnification held fixed.
 
     ``height_sigma_m`` is the prior 1-sigma of the heights, one number or (V,). ``starts`` are rotations (V, 3, 3) and
@@ -114,7 +114,7 @@ def fit_poses(
     return _best_of([again], problem.starts, g_of_view)
 
 
-def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Array) -> PoseFit:
+def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Array) -> ViewPose:
     costs = np.stack(
         [
             np.add.reduceat(
@@ -124,7 +124,7 @@ def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Arra
         ]
     )
     best = np.argmin(costs, axis=0)
-    return PoseFit(
+    return ViewPose(
         rotations=np.stack([fits[k].state.rotations[v] for v, k in enumerate(best)]),
         translations_m=np.stack([fits[k].state.translations_m[v] for v, k in enumerate(best)]),
         residuals_px=tuple(
@@ -135,7 +135,7 @@ def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Arra
     )
 
 
-def rms_by_magnification(fit: PoseFit) -> dict[float, float]:
+def rms_by_magnification(fit: ViewPose) -> dict[float, float]:
     """RMS distance of the corners in px for each magnification, ascending."""
     out: dict[float, float] = {}
     for g in np.unique(fit.magnifications):

@@ -15,7 +15,12 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
-from semcal_ros.core.calibration.normal_equations import Problem, State, scaled_solve, theta_system
+from semcal_ros.core.calibration.normal_equations import (
+    Problem,
+    State,
+    reduced_normal_equations,
+    scaled_solve,
+)
 from semcal_ros.core.calibration.problem import (
     Functions,
     Setup,
@@ -236,7 +241,9 @@ def _covariance_with_reserve(
     result = refine(problem, state, max_iterations=0)
     factor = variance_factor(stage.problem, stage.result)
     if field is None:
-        reduced = theta_system(problem, state.theta, result.information, result.gradient)
+        reduced = reduced_normal_equations(
+            problem, state.theta, result.information, result.gradient
+        )
         covariance, moved = result.covariance, scaled_solve(*reduced, 0.0)
     else:
         system = field_system(setup, problem, result, field.field)
@@ -393,5 +400,5 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
     information[index] = 0.0
     gradient[index] = 0.0
     theta = theta_of(fit.functions)
-    matrix, right = theta_system(fit.problem, theta, information, gradient)
+    matrix, right = reduced_normal_equations(fit.problem, theta, information, gradient)
     return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0)), None

@@ -26,14 +26,14 @@ __all__ = [
     "State",
     "WhitenedRows",
     "make_problem",
-    "moved",
     "normal_equations",
     "part_of",
     "prior_cost",
-    "reduced",
+    "reduced_normal_equations",
     "residuals",
+    "retract",
     "scaled_solve",
-    "theta_system",
+    "schur_complement",
     "view_costs",
     "whiten",
     "whitened_norm",
@@ -254,7 +254,7 @@ def normal_equations(problem: Problem, state: State) -> NormalEquations:
     )
 
 
-def reduced(
+def schur_complement(
     problem: Problem, normal: NormalEquations, damping: float
 ) -> tuple[Array, Array, Array, Array]:
     """Eliminate the poses: information (M, 10, 10), gradient (M, 10), V^-1 W' and V^-1 b per view."""
@@ -271,7 +271,7 @@ def reduced(
     return information, gradient, solved[:, :, :10], solved[:, :, 10]
 
 
-def theta_system(
+def reduced_normal_equations(
     problem: Problem, theta: Array, information: Array, gradient: Array
 ) -> tuple[Array, Array]:
     """Reduced normal equations (K, K) and (K,) of theta, with its prior, from the blocks per magnification."""
@@ -291,7 +291,7 @@ def scaled_solve(matrix: Array, right: Array, damping: float) -> Array:
     return np.asarray(scale * np.linalg.solve(scaled, scale * right), dtype=np.float64)
 
 
-def moved(problem: Problem, state: State, change: Array, pose: Array) -> State:
+def retract(problem: Problem, state: State, change: Array, pose: Array) -> State:
     """The state after changes of theta (K,) and of the poses (V, 6)."""
     return State(
         state.theta + change,

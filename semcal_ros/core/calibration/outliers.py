@@ -13,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import Problem, theta_system, whitened_norm
+from semcal_ros.core.calibration.normal_equations import (
+    Problem,
+    reduced_normal_equations,
+    whitened_norm,
+)
 from semcal_ros.core.calibration.problem import Setup, variance_factor
 from semcal_ros.core.calibration.views import GridView
 
-__all__ = ["Jump", "OutlyingView", "likely_jump", "outlying_views"]
+__all__ = ["ChangePoint", "OutlyingView", "find_change_point", "outlying_views"]
 
 
 # Half chi-squares, that is 2.7 standard deviations: a recording without jump has one in twenty chances to be suspected.
@@ -25,7 +29,7 @@ _LEAST_GAIN = 3.65
 
 
 @dataclass(frozen=True)
-class Jump:
+class ChangePoint:
     """A jump of the scale that the views ask for.
 
     Attributes
@@ -42,12 +46,14 @@ class Jump:
     sigma: float
 
 
-def likely_jump(setup: Setup, problem: Problem, result: BundleResult) -> Jump | None:
+def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> ChangePoint | None:
     """The jump that would improve an adjustment most, or None if none is worth mentioning.
 
     ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it has already are left out.
     """
-    matrix, right = theta_system(problem, result.state.theta, result.information, result.gradient)
+    matrix, right = reduced_normal_equations(
+        problem, result.state.theta, result.information, result.gradient
+    )
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = matrix * np.outer(scale, scale)
     g = setup.magnifications
@@ -68,7 +74,7 @@ def likely_jump(setup: Setup, problem: Problem, result: BundleResult) -> Jump | 
         if gain > best_gain:
             sigma = float(np.sqrt(variance / information))
             best_gain = gain
-            best = Jump(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
+            best = ChangePoint(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
     return best
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.evaluate import PoseFit, rms_by_magnification
+from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
 from semcal_ros.core.calibration.joint import FittedField
 from semcal_ros.core.calibration.problem import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
@@ -54,7 +54,7 @@ def statistics_of(
     setup: Setup,
     details: Mapping[str, Any],
     height_sigma_m: Array,
-    poses: PoseFit,
+    poses: ViewPose,
     held_out: Mapping[float, float],
     warnings: Sequence[str],
 ) -> dict[str, Any]:

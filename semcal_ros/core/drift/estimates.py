@@ -11,16 +11,16 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.process_noise import Restlessness
-from semcal_ros.core.drift.state import MOVING, DriftMap
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.state import MOVING, DriftState
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.reference import RegistrationSettings
 
 __all__ = [
     "DriftForecast",
-    "DriftOutlook",
     "DriftPath",
+    "DriftPredictor",
     "DriftSettings",
     "DriftUpdate",
     "kind_of",
@@ -198,7 +198,7 @@ class DriftForecast:
 
 
 @dataclass(frozen=True)
-class DriftOutlook:
+class DriftPredictor:
     """All that a forecast needs; it never changes, so that another thread may hold it.
 
     Attributes
@@ -211,8 +211,8 @@ class DriftOutlook:
         Camera of the last frame, or None for drift in px.
     """
 
-    state: DriftMap
-    restlessness: Restlessness
+    state: DriftState
+    restlessness: ProcessNoise
     camera: ScanCamera | None
 
     @property

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.operations import Measure, Move, Operation, Settle, Widen
-from semcal_ros.core.drift.process_noise import Restlessness
-from semcal_ros.core.drift.smoother import Event, Mark, likely_restlessness, replayed
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.operations import AddKeyframe, Inflate, Measure, Operation, Predict
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
+from semcal_ros.core.drift.state import DriftState
 
 __all__ = ["DriftFilter"]
 
@@ -32,9 +32,9 @@ _LEARNT = (4, 8, 16)
 class _Pending:
     """A keyframe whose own noise is known only when something is registered against it."""
 
-    settle: Settle
+    settle: AddKeyframe
     index: int
-    before: DriftMap
+    before: DriftState
 
 
 class DriftFilter:
@@ -50,11 +50,11 @@ class DriftFilter:
         Whether to keep what happened for good.
     """
 
-    def __init__(self, start: DriftMap, acceleration_psd: float | None, history: bool) -> None:
+    def __init__(self, start: DriftState, acceleration_psd: float | None, history: bool) -> None:
         self.start = start
         self.state = start
         self.events: list[Event] = []
-        self.restlessness = Restlessness(acceleration_psd or 0.0)
+        self.restlessness = ProcessNoise(acceleration_psd or 0.0)
         self.measured = 0
         self._adapts = acceleration_psd is None
         self._history = history
@@ -80,9 +80,9 @@ class DriftFilter:
     def settle_later(self, key: int, removed: Array, bow: float) -> None:
         """The frame of now becomes a keyframe that was not measured; its noise is told later.
 
-        The arguments are those of :class:`~semcal_ros.core.drift.operations.Settle`.
+        The arguments are those of :class:`~semcal_ros.core.drift.operations.AddKeyframe`.
         """
-        settle = Settle(key, removed, bow, np.zeros((4, 4)), 0.0)
+        settle = AddKeyframe(key, removed, bow, np.zeros((4, 4)), 0.0)
         self._pending = _Pending(settle, len(self.events), self.state)
         self.do(settle)
 
@@ -93,9 +93,9 @@ class DriftFilter:
         pending = self._pending
         assert pending is not None
         given = self.restlessness.psd
-        self.restlessness = Restlessness(psd if self._adapts else given, _MEMORY * interval_s)
+        self.restlessness = ProcessNoise(psd if self._adapts else given, _MEMORY * interval_s)
         variances = [0.0, sigma**2, self.restlessness.acceleration_variance]
-        widened = Widen(np.diag(np.repeat(variances, 2)))
+        widened = Inflate(np.diag(np.repeat(variances, 2)))
         self.events.insert(pending.index, widened)
         pending.index += 1
         pending.before = widened(pending.before, self.restlessness)
@@ -126,13 +126,13 @@ class DriftFilter:
         self.measured += 1
         if self._adapts and self.measured in _LEARNT and self.restlessness.psd > 0.0:
             # The guess that all began with is worth less than what was seen since.
-            times = [event.time_s for event in self.events if isinstance(event, Move)]
+            times = [event.time_s for event in self.events if isinstance(event, Predict)]
             interval_s = float(np.median(np.diff([self.start.time_s, *times])))
             near = self.restlessness
             if interval_s > 0.0:
                 near = replace(near, memory_s=_MEMORY * interval_s)
-            self.restlessness = likely_restlessness(self.start, self.events, near, (1.0,))
-            self.state = replayed(self.start, self.events, self.restlessness)
+            self.restlessness = estimate_process_noise(self.start, self.events, near, (1.0,))
+            self.state = replay(self.start, self.events, self.restlessness)
 
     def adapt(self, nis: float, noise: Array, dt_s: float) -> None:
         """Nudge the process noise until innovations are as large as predicted (2 on average).

@@ -15,7 +15,7 @@ from semcal_ros.core.rectification.raw_positions import RasterDrift, camera_key,
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.registration.reference import Region
 
-__all__ = ["Shot", "Stills", "resampleable"]
+__all__ = ["MotionCorrector", "ScanFrame", "resampleable"]
 
 
 # Motions that bend a frame by less are left in it.
@@ -25,7 +25,7 @@ _SAMPLES = 96
 
 
 @dataclass(frozen=True)
-class Shot:
+class ScanFrame:
     """A frame as it came in.
 
     Attributes
@@ -62,7 +62,7 @@ class Shot:
         return np.eye(2) if self.camera is None else self.camera.ideal_from_sem_jacobian
 
 
-class Stills:
+class MotionCorrector:
     """Frames in ideal pixels, as if scanned in the instant of their centre.
 
     Parameters
@@ -75,7 +75,7 @@ class Stills:
         self._rectifier = Rectifier(interpolation)
         self._scanned: dict[tuple[object, ...], Region] = {}
 
-    def of(self, shot: Shot, motion: Array) -> tuple[NDArray[np.generic], Region]:
+    def of(self, shot: ScanFrame, motion: Array) -> tuple[NDArray[np.generic], Region]:
         """The picture without a drift velocity and acceleration (4,) (unit per s and s^2), and the
         rectangle of it that was scanned.
         """
@@ -107,7 +107,7 @@ class Stills:
         return self._scanned[key]
 
 
-def _bent_px(shot: Shot, motion: Array) -> Array:
+def _bent_px(shot: ScanFrame, motion: Array) -> Array:
     """(2,) by how much a motion displaces pixels of a frame at most."""
     if shot.timing is None:
         return np.zeros(2)

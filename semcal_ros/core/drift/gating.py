@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.operations import Widen
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.operations import Inflate
+from semcal_ros.core.drift.state import DriftState
 
-__all__ = ["GATE", "Surprises", "of_a_contradiction", "of_a_pause", "of_another_place"]
+__all__ = ["GATE", "OutlierTest", "of_a_contradiction", "of_a_pause", "of_another_place"]
 
 
 #: Innovations beyond this normalised square happen to a correct filter once in a million frames.
 GATE = 27.6
 
 
-class Surprises:
+class OutlierTest:
     """Shifts that the filter did not expect, one after the other.
 
     One is believed if drift can get so far between two frames, if the unexpected shift before says
@@ -27,7 +27,7 @@ class Surprises:
         self._expected: tuple[float, Array] | None = None
         self._earlier: tuple[tuple[float, Array], ...] = ()
 
-    def forget(self, state: DriftMap | None = None) -> None:
+    def forget(self, state: DriftState | None = None) -> None:
         """A frame came as expected, with that state; None where nothing is known any more."""
         self._earlier = ()
         self._expected = None if state is None else (state.time_s, state.position)
@@ -37,7 +37,9 @@ class Surprises:
         """(2,) the drift that was seen last and not believed."""
         return self._earlier[-1][1] if self._earlier else None
 
-    def believed(self, state: DriftMap, seen: Array, reach: Array, last_s: float) -> Widen | None:
+    def believed(
+        self, state: DriftState, seen: Array, reach: Array, last_s: float
+    ) -> Inflate | None:
         """What makes the filter accept an unexpected drift, or None if it is not to be believed.
 
         Parameters
@@ -64,7 +66,7 @@ class Surprises:
         covariance[:2, :2] = np.eye(2) * float(np.sum((seen - state.position) ** 2))
         if near(state.position):
             covariance[2:4, 2:4] = covariance[:2, :2] / since_s**2
-            return Widen(covariance)
+            return Inflate(covariance)
         paces = [state.velocity] if earlier else []
         known = [self._expected, *earlier] if self._expected is not None else list(earlier)
         if len(known) >= 2 and earlier:
@@ -74,24 +76,24 @@ class Surprises:
             if near(earlier[-1][1] + pace * since_s):
                 turn = float(np.sum((pace - state.velocity) ** 2))
                 covariance[2:4, 2:4] = reach @ reach.T / since_s**2 + np.eye(2) * turn
-                return Widen(covariance)
+                return Inflate(covariance)
         return None
 
 
-def _spread(position: Array, velocity: Array) -> Widen:
+def _spread(position: Array, velocity: Array) -> Inflate:
     """Widened by a (2, 2) covariance of the drift and one of its velocity."""
     covariance = np.zeros((6, 6))
     covariance[:2, :2], covariance[2:4, 2:4] = position, velocity
-    return Widen(covariance)
+    return Inflate(covariance)
 
 
-def of_a_pause(speed: float, pause_s: float) -> Widen:
+def of_a_pause(speed: float, pause_s: float) -> Inflate:
     """After a long time without a frame: the drift may have stopped, or doubled."""
     way = np.eye(2) * (speed * pause_s) ** 2
     return _spread(way, way / pause_s**2)
 
 
-def of_another_place(px_from_unit: Array, reach_px: float, pace_px: float) -> Widen:
+def of_another_place(px_from_unit: Array, reach_px: float, pace_px: float) -> Inflate:
     """After many frames that did not match: it may be another place.
 
     ``reach_px`` is how far away it may be, ``pace_px`` how fast it may drift (px per s).
@@ -102,8 +104,8 @@ def of_another_place(px_from_unit: Array, reach_px: float, pace_px: float) -> Wi
 
 
 def of_a_contradiction(
-    state: DriftMap, key: int | None, nearest: Array, since_s: float
-) -> Widen | None:
+    state: DriftState, key: int | None, nearest: Array, since_s: float
+) -> Inflate | None:
     """Where all shifts that a picture allows are far from the prediction; None where one is not.
 
     ``nearest`` (2,) is the nearest one against keyframe ``key``, NaN where nothing is known;

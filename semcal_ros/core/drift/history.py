@@ -8,7 +8,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.smoother import likely_restlessness, smoothed
+from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["DriftHistory"]
@@ -33,7 +33,7 @@ class DriftHistory:
         self._stretches[-1][1].append(update)
         self._cameras.append(camera)
 
-    def smoothed(self) -> DriftPath:
+    def smooth(self) -> DriftPath:
         """The drift of all frames so far, each with the knowledge of all of its stretch.
 
         How restless it is, is what makes the measurements most likely.
@@ -49,8 +49,8 @@ class DriftHistory:
         for drift, stretch in self._stretches:
             restlessness = drift.restlessness
             if restlessness.psd > 0.0:
-                restlessness = likely_restlessness(drift.start, drift.events, restlessness)
-            states = smoothed(drift.start, drift.events, restlessness)
+                restlessness = estimate_process_noise(drift.start, drift.events, restlessness)
+            states = smooth(drift.start, drift.events, restlessness)
             for update, state in zip(stretch, states, strict=True):
                 camera = self._cameras[len(updates)]
                 scale = scale_covariance(camera, state.position, state.velocity)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.frame import Shot
+from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.registration.fractional_delay import FINE, sampled
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.register import Registration, gray_of, prepare_reference
@@ -47,7 +47,7 @@ class Keyframe:
         Number of frames in the mean.
     """
 
-    shot: Shot
+    shot: ScanFrame
     removed: Array
     mean: NDArray[np.float32]
     region: Region
@@ -97,7 +97,7 @@ class Keyframe:
 
 
 def keyframe_of(
-    shot: Shot, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
+    shot: ScanFrame, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
 ) -> Keyframe:
     """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
     return Keyframe(
@@ -105,7 +105,7 @@ def keyframe_of(
     )
 
 
-def scale_ratio(before: Shot, now: Shot) -> float:
+def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
     """By which factor the px per unit differ, at least 1; infinite where they cannot be
     compared.
     """
@@ -117,7 +117,7 @@ def scale_ratio(before: Shot, now: Shot) -> float:
     return float(max(stretch.max(), 1.0 / stretch.min()))
 
 
-def carried(key: Keyframe, now: Shot) -> Keyframe:
+def carried(key: Keyframe, now: ScanFrame) -> Keyframe:
     """The keyframe as the camera of ``now`` would show it.
 
     Both cameras must be known. Ideal pixels of two magnifications are related by the affine map of

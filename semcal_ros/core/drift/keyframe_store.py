@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.drift.frame import Shot
+from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.keyframe import Keyframe, carried, scale_ratio
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.registration.reference import Reference, RegistrationSettings
 
 __all__ = ["MEANS_PREPARED", "SAME_SCALE", "Candidate", "KeyframeStore"]
@@ -64,7 +64,7 @@ class KeyframeStore:
         self._limits = at_most_bytes, at_most
         self._frames: dict[int, Keyframe] = {}
         self._prepared: tuple[int, Keyframe, Reference] | None = None
-        self._carried: tuple[Keyframe, Shot, Reference] | None = None
+        self._carried: tuple[Keyframe, ScanFrame, Reference] | None = None
         self._first: int | None = None
         self._next = 0
         self.current: int | None = None
@@ -142,7 +142,7 @@ class KeyframeStore:
         """Whether a frame would make the keyframe's mean better."""
         return self._frames[key].averaged < MEANS_PREPARED[-1] and overlap >= _OVERLAP_TO_ADD
 
-    def carried(self, key: int, shot: Shot) -> Reference:
+    def carried(self, key: int, shot: ScanFrame) -> Reference:
         """The reference as the camera of a frame would show it; the latest one is kept, because a
         frame may be looked at several times.
         """
@@ -152,12 +152,12 @@ class KeyframeStore:
             self._carried = known
         return known[2]
 
-    def least_ratio(self, shot: Shot) -> float:
+    def least_ratio(self, shot: ScanFrame) -> float:
         """By which factor the scale of a frame differs from that of the most similar keyframe."""
         return min(scale_ratio(k.shot, shot) for k in self._frames.values())
 
     def candidates(
-        self, state: DriftMap, shot: Shot, enough: float, max_ratio: float
+        self, state: DriftState, shot: ScanFrame, enough: float, max_ratio: float
     ) -> list[Candidate]:
         """What a frame can be registered against, the best first.
 

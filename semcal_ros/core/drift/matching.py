@@ -9,16 +9,21 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.frame import Shot, Stills
+from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame
 from semcal_ros.core.drift.keyframe import keyframe_of
 from semcal_ros.core.drift.keyframe_store import Candidate, KeyframeStore
-from semcal_ros.core.drift.measurement import bends, bow_s2, keyframe_noise, measure_of
-from semcal_ros.core.drift.operations import Measure, Reshear
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.measurement import (
+    acceleration_term_s2,
+    exceeds_tolerance,
+    keyframe_noise,
+    measure_of,
+)
+from semcal_ros.core.drift.operations import CorrectShear, Measure
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.registration.reference import Region
 from semcal_ros.core.registration.register import Registration, register
 
-__all__ = ["Found", "joins", "look"]
+__all__ = ["Match", "is_mergeable", "match_keyframe"]
 
 
 _LOOKS = 4
@@ -29,7 +34,7 @@ _LARGEST_SHEAR = 0.1
 
 
 @dataclass(frozen=True)
-class Found:
+class Match:
     """A registration that holds against a keyframe.
 
     Attributes
@@ -57,9 +62,13 @@ class Found:
     keyframe_time_s: float
 
 
-def look(
-    drift: DriftFilter, store: KeyframeStore, candidate: Candidate, shot: Shot, stills: Stills
-) -> Found | Registration:
+def match_keyframe(
+    drift: DriftFilter,
+    store: KeyframeStore,
+    candidate: Candidate,
+    shot: ScanFrame,
+    stills: MotionCorrector,
+) -> Match | Registration:
     """Register a frame, and again without the shear that was left by a velocity that was wrong.
 
     The noise of a keyframe that nothing was compared with before becomes known to the filter.
@@ -80,7 +89,7 @@ def look(
             # A jump, not a drift: it is for the filter to judge.
             break
         bent = _straightened(drift, store, candidate, state, stills)
-        if not bent and not bends(state.motion - found.removed, shot):
+        if not bent and not exceeds_tolerance(state.motion - found.removed, shot):
             break
         again = _once(drift, store, candidate, shot, stills, state.motion)
         if isinstance(again, Registration):
@@ -89,7 +98,7 @@ def look(
     return found
 
 
-def _removable(motion: Array, shot: Shot) -> bool:
+def _removable(motion: Array, shot: ScanFrame) -> bool:
     """Whether a motion can be that of a specimen during a frame."""
     if shot.timing is None:
         return True
@@ -101,20 +110,20 @@ def _straightened(
     drift: DriftFilter,
     store: KeyframeStore,
     candidate: Candidate,
-    state: DriftMap,
-    stills: Stills,
+    state: DriftState,
+    stills: MotionCorrector,
 ) -> bool:
     """Whether the keyframe was sheared, and now no longer is; only a single frame can be."""
     keyframe = store[candidate.key]
     left = np.append(state.where(candidate.key)[2:], np.zeros(2))
-    if candidate.rescaled or keyframe.averaged > 1 or not bends(left, keyframe.shot):
+    if candidate.rescaled or keyframe.averaged > 1 or not exceeds_tolerance(left, keyframe.shot):
         return False
     removed = keyframe.removed + left
     store.replace(
         candidate.key,
         keyframe_of(keyframe.shot, removed, *stills.of(keyframe.shot, removed), keyframe.time_s),
     )
-    drift.do(Reshear(candidate.key, left, bow_s2(keyframe.shot)))
+    drift.do(CorrectShear(candidate.key, left, acceleration_term_s2(keyframe.shot)))
     return True
 
 
@@ -122,10 +131,10 @@ def _once(
     drift: DriftFilter,
     store: KeyframeStore,
     candidate: Candidate,
-    shot: Shot,
-    stills: Stills,
+    shot: ScanFrame,
+    stills: MotionCorrector,
     motion: Array,
-) -> Found | Registration:
+) -> Match | Registration:
     key = candidate.key
     picture, region = stills.of(shot, motion)
     reference = store.carried(key, shot) if candidate.rescaled else store.reference(key)
@@ -147,10 +156,10 @@ def _once(
     if drift.pending == key:
         drift.settle(keyframe_noise(measure), measure.scan_s)
     time_s = keyframe.time_s
-    return Found(candidate, registration, picture, region, motion, measure, time_s)
+    return Match(candidate, registration, picture, region, motion, measure, time_s)
 
 
-def joins(found: Found, store: KeyframeStore) -> bool:
+def is_mergeable(found: Match, store: KeyframeStore) -> bool:
     """Whether a frame makes the mean of its keyframe better."""
     registration, candidate = found.registration, found.candidate
     shear = np.nan_to_num(registration.joint_px[2:], nan=0.0)

@@ -8,16 +8,16 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.camera_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
-from semcal_ros.core.drift.frame import Shot
-from semcal_ros.core.drift.operations import Carry, Measure
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.operations import CloneKeyframe, Measure
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.registration.register import Registration
 
 __all__ = [
+    "acceleration_term_s2",
     "at_itself",
     "becoming_keyframe",
-    "bends",
-    "bow_s2",
+    "exceeds_tolerance",
     "keyframe_noise",
     "loosened",
     "measure_of",
@@ -33,7 +33,7 @@ _SHEAR_OF_SHIFT = 1e-3
 _SHEAR_PX = 0.1
 
 
-def bends(motion: Array, shot: Shot) -> bool:
+def exceeds_tolerance(motion: Array, shot: ScanFrame) -> bool:
     """Whether drift with a velocity and an acceleration (4,) bends a frame by more than its shift
     is to be known to.
     """
@@ -45,7 +45,7 @@ def bends(motion: Array, shot: Shot) -> bool:
     return float(np.max(np.maximum(shear_px, bow_px))) > _SHEAR_PX
 
 
-def bow_s2(shot: Shot) -> float:
+def acceleration_term_s2(shot: ScanFrame) -> float:
     """By how much the mean of an accelerated drift over a frame is from its middle, per unit of
     acceleration.
     """
@@ -54,8 +54,8 @@ def bow_s2(shot: Shot) -> float:
 
 def measure_of(
     key: int,
-    before: Shot,
-    now: Shot,
+    before: ScanFrame,
+    now: ScanFrame,
     registration: Registration,
     removed: Array,
     averaged: float,
@@ -79,7 +79,7 @@ def measure_of(
     unit = np.linalg.inv(now.px_from_unit)
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
     covariance = share * registration.covariance + np.eye(2) * _SHIFT_FLOOR_PX**2
-    bow = bow_s2(now)
+    bow = acceleration_term_s2(now)
     scan_s = 0.0 if now.timing is None else now.timing.acquisition_time_s
     if now.timing is None or not np.all(np.isfinite(registration.joint_px)):
         shift = unit @ registration.shift_px + bow * removed[2:]
@@ -104,7 +104,7 @@ def keyframe_noise(measure: Measure) -> Array:
     return noise
 
 
-def loosened(measure: Measure, before: Shot, now: Shot) -> Measure:
+def loosened(measure: Measure, before: ScanFrame, now: ScanFrame) -> Measure:
     """The measurement with what a change of magnification leaves open."""
     if before.camera is None or now.camera is None:
         return measure
@@ -114,8 +114,8 @@ def loosened(measure: Measure, before: Shot, now: Shot) -> Measure:
 
 
 def becoming_keyframe(
-    key: int, state: DriftMap, measure: Measure, removed: Array, noise: Array
-) -> Carry:
+    key: int, state: DriftState, measure: Measure, removed: Array, noise: Array
+) -> CloneKeyframe:
     """The measured frame becomes keyframe ``key``.
 
     ``removed`` (4,) is what was taken out of it; by ``noise`` (2, 2) its position as a keyframe may
@@ -130,7 +130,7 @@ def becoming_keyframe(
     else:
         shift = np.append(measure.shift - bow, np.zeros(2))
         full[2:, 2:] = state.own[2:, 2:]
-    return Carry(key, measure.key, shift, measure.time_ratio, full, measure.zoom)
+    return CloneKeyframe(key, measure.key, shift, measure.time_ratio, full, measure.zoom)
 
 
 def at_itself(key: int, measure: Measure, removed: Array) -> Measure:

@@ -12,21 +12,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.process_noise import Restlessness
-from semcal_ros.core.drift.state import EACH, MOVING, OWN, DriftMap
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.state import EACH, MOVING, OWN, DriftState
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
-    "Carry",
-    "Drop",
+    "AddKeyframe",
+    "CloneKeyframe",
+    "CorrectShear",
+    "Inflate",
     "Linear",
+    "Marginalise",
     "Measure",
     "MeasureOutcome",
-    "Move",
     "Operation",
-    "Reshear",
-    "Settle",
-    "Widen",
+    "Predict",
 ]
 
 
@@ -40,14 +40,14 @@ class Linear:
     time_s: float
     keys: tuple[int, ...]
 
-    def of(self, state: DriftMap) -> DriftMap:
+    def of(self, state: DriftState) -> DriftState:
         """The new state."""
         covariance = self.matrix @ state.covariance @ self.matrix.T + self.covariance
         mean = self.matrix @ state.mean + self.offset
-        return DriftMap(self.time_s, mean, 0.5 * (covariance + covariance.T), self.keys)
+        return DriftState(self.time_s, mean, 0.5 * (covariance + covariance.T), self.keys)
 
 
-def _same(state: DriftMap) -> Linear:
+def _same(state: DriftState) -> Linear:
     size = state.mean.size
     return Linear(np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys)
 
@@ -56,21 +56,21 @@ class Operation(ABC):
     """Something that happens to the state and is linear."""
 
     @abstractmethod
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """Its matrices for a state."""
 
-    def __call__(self, state: DriftMap, restlessness: Restlessness) -> DriftMap:
+    def __call__(self, state: DriftState, restlessness: ProcessNoise) -> DriftState:
         """The state after it."""
         return self.linear(state, restlessness).of(state)
 
 
 @dataclass(frozen=True)
-class Move(Operation):
+class Predict(Operation):
     """Time goes on until ``time_s``."""
 
     time_s: float
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described in the module.
 
         Raises
@@ -95,14 +95,14 @@ class Move(Operation):
 
 
 @dataclass(frozen=True)
-class Widen(Operation):
+class Inflate(Operation):
     """Drift, velocity and acceleration become more uncertain: noise of ``covariance`` (6, 6) is
     added.
     """
 
     covariance: Array
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described."""
         step = _same(state)
         step.covariance[:MOVING, :MOVING] = self.covariance
@@ -110,7 +110,7 @@ class Widen(Operation):
 
 
 @dataclass(frozen=True)
-class Settle(Operation):
+class AddKeyframe(Operation):
     """The frame of now becomes keyframe ``key`` without having been measured.
 
     Its picture lies at the drift with its own noise ``noise`` (4, 4); ``removed`` (4,) is the
@@ -124,7 +124,7 @@ class Settle(Operation):
     noise: Array
     scan_s: float
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described."""
         size = state.mean.size
         matrix = np.vstack([np.eye(size), np.eye(EACH, size)])
@@ -138,7 +138,7 @@ class Settle(Operation):
 
 
 @dataclass(frozen=True)
-class Carry(Operation):
+class CloneKeyframe(Operation):
     """The frame of now becomes keyframe ``key``, as it was measured against ``parent``.
 
     ``shift`` (4,) is what was measured: shift, and shear over the frame time; ``time_ratio`` is the
@@ -153,7 +153,7 @@ class Carry(Operation):
     noise: Array
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described."""
         size = state.mean.size
         matrix = np.vstack([np.eye(size), np.zeros((EACH, size))])
@@ -167,14 +167,14 @@ class Carry(Operation):
 
 
 @dataclass(frozen=True)
-class Reshear(Operation):
+class CorrectShear(Operation):
     """Another velocity and acceleration ``removed`` (4,) were taken out of keyframe ``key``."""
 
     key: int
     removed: Array
     bow: float
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described."""
         step = _same(state)
         at = state.of(self.key)
@@ -184,12 +184,12 @@ class Reshear(Operation):
 
 
 @dataclass(frozen=True)
-class Drop(Operation):
+class Marginalise(Operation):
     """Keyframe ``key`` is forgotten."""
 
     key: int
 
-    def linear(self, state: DriftMap, restlessness: Restlessness) -> Linear:
+    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
         """As described."""
         size, at = state.mean.size, state.of(self.key)
         kept = np.delete(np.arange(size), np.arange(at.start, at.stop))
@@ -220,7 +220,7 @@ class MeasureOutcome:
         That of the shear, given the shift; 0 where there is none.
     """
 
-    state: DriftMap
+    state: DriftState
     row: Array
     innovation: Array
     innovation_covariance: Array
@@ -259,7 +259,7 @@ class Measure:
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
-    def row(self, state: DriftMap) -> Array:
+    def row(self, state: DriftState) -> Array:
         """(2 or 4, n) derivative of the measurement by the state."""
         count, at = self.shift.size, state.of(self.key).start
         row = np.zeros((count, state.mean.size))
@@ -270,7 +270,7 @@ class Measure:
         row[:, at : at + count] = -np.diag(factors[:count])
         return row
 
-    def __call__(self, state: DriftMap, restlessness: Restlessness) -> MeasureOutcome:
+    def __call__(self, state: DriftState, restlessness: ProcessNoise) -> MeasureOutcome:
         """The state with the measurement used.
 
         Raises
@@ -305,7 +305,7 @@ class Measure:
         shear_nis = max(both - nis, 0.0)
         return MeasureOutcome(new, row, innovation, expected, gain, nis, shear_nis)
 
-    def _check(self, state: DriftMap) -> None:
+    def _check(self, state: DriftState) -> None:
         if self.key not in state.keys:
             raise InvalidValueError(
                 f"a measurement against keyframe {self.key}", expected=f"one of {state.keys}"

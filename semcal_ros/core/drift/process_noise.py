@@ -13,7 +13,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = ["Restlessness"]
+__all__ = ["ProcessNoise"]
 
 
 # Gauss-Legendre quadrature, and up to how many memories it is used.
@@ -24,7 +24,7 @@ _PARTS = np.append(0.5 * (_NODES + 1.0), 1.0)
 
 
 @dataclass(frozen=True)
-class Restlessness:
+class ProcessNoise:
     """How the drift changes by itself.
 
     Attributes

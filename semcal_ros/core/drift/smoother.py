@@ -1,6 +1,6 @@
 """Drift of a whole recording, with hindsight.
 
-What happened to the :class:`~semcal_ros.core.drift.state.DriftMap` while a recording was tracked is
+What happened to the :class:`~semcal_ros.core.drift.state.DriftState` while a recording was tracked is
 done again with the acceleration noise that makes the measurements most likely, and then undone
 backwards. The recursion is that of Bryson and Frazier (1963; modified by Bierman 1973,
 Int. J. Control 18, 65-75), which needs no inverse of a prediction: positions of keyframes are
@@ -18,11 +18,11 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import Measure, Operation
-from semcal_ros.core.drift.process_noise import Restlessness
-from semcal_ros.core.drift.state import DriftMap
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Event", "Mark", "likely_restlessness", "replayed", "smoothed"]
+__all__ = ["Event", "Mark", "estimate_process_noise", "replay", "smooth"]
 
 
 _OUTLIER_NIS = 25.0
@@ -51,12 +51,12 @@ class _Update:
 
 
 #: What is needed to come back: the matrix of an operation, a measurement, or the state of a frame.
-_Step = Array | _Update | DriftMap
+_Step = Array | _Update | DriftState
 
 
 def _forwards(
-    start: DriftMap, events: Sequence[Event], restlessness: Restlessness
-) -> tuple[list[_Step], DriftMap, float]:
+    start: DriftState, events: Sequence[Event], restlessness: ProcessNoise
+) -> tuple[list[_Step], DriftState, float]:
     """The steps, the last state, and minus twice the log likelihood of the measurements."""
     state, cost, count = start, 0.0, 0
     steps: list[_Step] = []
@@ -82,14 +82,14 @@ def _forwards(
     return steps, state, cost
 
 
-def replayed(start: DriftMap, events: Sequence[Event], restlessness: Restlessness) -> DriftMap:
+def replay(start: DriftState, events: Sequence[Event], restlessness: ProcessNoise) -> DriftState:
     """The state after everything happened again."""
     return _forwards(start, events, restlessness)[1]
 
 
-def smoothed(
-    start: DriftMap, events: Sequence[Event], restlessness: Restlessness
-) -> list[DriftMap]:
+def smooth(
+    start: DriftState, events: Sequence[Event], restlessness: ProcessNoise
+) -> list[DriftState]:
     """States at the marks, each with the knowledge of all measurements.
 
     Parameters
@@ -107,7 +107,7 @@ def smoothed(
         If a time goes back or the restlessness is negative.
     """
     steps, last, _ = _forwards(start, events, restlessness)
-    found: list[DriftMap] = []
+    found: list[DriftState] = []
     # What later measurements say of the state, and how much they know of it.
     told = np.zeros(last.mean.size)
     known = np.zeros((last.mean.size, last.mean.size))
@@ -115,7 +115,7 @@ def smoothed(
         if isinstance(step, _Update):
             told = step.kept.T @ told - step.row.T @ step.inverse @ step.innovation
             known = step.row.T @ step.inverse @ step.row + step.kept.T @ known @ step.kept
-        elif isinstance(step, DriftMap):
+        elif isinstance(step, DriftState):
             mean = step.mean - step.covariance @ told
             covariance = step.covariance - step.covariance @ known @ step.covariance
             covariance = 0.5 * (covariance + covariance.T)
@@ -125,18 +125,18 @@ def smoothed(
     return found[::-1]
 
 
-def likely_restlessness(
-    start: DriftMap,
+def estimate_process_noise(
+    start: DriftState,
     events: Sequence[Event],
-    near: Restlessness,
+    near: ProcessNoise,
     memories: Sequence[float] = (0.0, 2.0, 8.0),
-) -> Restlessness:
+) -> ProcessNoise:
     """The restlessness that makes the measurements most likely.
 
     Parameters
     ----------
     start, events
-        As for :func:`smoothed`; from a long recording the first part is taken.
+        As for :func:`smooth`; from a long recording the first part is taken.
     near
         One whose density is right within some orders of magnitude, greater than 0, and whose
         memory is that of few frames.
@@ -158,12 +158,12 @@ def likely_restlessness(
 
 
 def _likely_psd(
-    start: DriftMap, events: Sequence[Event], near: float, memory_s: float
-) -> tuple[float, Restlessness]:
+    start: DriftState, events: Sequence[Event], near: float, memory_s: float
+) -> tuple[float, ProcessNoise]:
     """Minus twice the log likelihood of the best density, and it."""
 
-    def of(log_psd: float) -> Restlessness:
-        return Restlessness(near * float(np.exp(log_psd)), memory_s)
+    def of(log_psd: float) -> ProcessNoise:
+        return ProcessNoise(near * float(np.exp(log_psd)), memory_s)
 
     def cost(log_psd: float) -> float:
         return _forwards(start, events, of(log_psd))[2]

@@ -27,7 +27,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = ["EACH", "MOVING", "OWN", "DriftMap", "still"]
+__all__ = ["EACH", "MOVING", "OWN", "DriftState", "initial_state"]
 
 
 #: Numbers of drift, velocity and acceleration; with the error of the principal point; of a keyframe.
@@ -35,7 +35,7 @@ MOVING, OWN, EACH = 6, 8, 4
 
 
 @dataclass(frozen=True)
-class DriftMap:
+class DriftState:
     """State at one time.
 
     Attributes
@@ -103,12 +103,12 @@ class DriftMap:
         row[:, :2], row[:, at : at + 2] = np.eye(2), -np.eye(2)
         return row @ self.mean, row @ self.covariance @ row.T
 
-    def without_keyframes(self) -> DriftMap:
+    def without_keyframes(self) -> DriftState:
         """The same drift with nothing to compare pictures with: small, for what needs no more."""
-        return DriftMap(self.time_s, self.mean[:OWN].copy(), self.covariance[:OWN, :OWN].copy())
+        return DriftState(self.time_s, self.mean[:OWN].copy(), self.covariance[:OWN, :OWN].copy())
 
 
-def still(time_s: float, centre_covariance: Array | None = None) -> DriftMap:
+def initial_state(time_s: float, centre_covariance: Array | None = None) -> DriftState:
     """The beginning: no drift, by definition, and no velocity known yet.
 
     ``centre_covariance`` (2, 2) is that of the principal point, px^2; None where it is known.
@@ -116,4 +116,4 @@ def still(time_s: float, centre_covariance: Array | None = None) -> DriftMap:
     covariance = np.zeros((OWN, OWN))
     if centre_covariance is not None:
         covariance[MOVING:, MOVING:] = centre_covariance
-    return DriftMap(time_s, np.zeros(OWN), covariance)
+    return DriftState(time_s, np.zeros(OWN), covariance)

@@ -23,12 +23,17 @@ from semcal_ros.core.drift.camera_uncertainty import (
     centre_covariance,
     scale_covariance,
 )
-from semcal_ros.core.drift.estimates import DriftForecast, DriftOutlook, DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import (
+    DriftForecast,
+    DriftPredictor,
+    DriftSettings,
+    DriftUpdate,
+)
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.frame import Shot, Stills, resampleable
+from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
     GATE,
-    Surprises,
+    OutlierTest,
     of_a_contradiction,
     of_a_pause,
     of_another_place,
@@ -36,14 +41,19 @@ from semcal_ros.core.drift.gating import (
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.keyframe import keyframe_of
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
-from semcal_ros.core.drift.matching import Found, joins, look
-from semcal_ros.core.drift.measurement import at_itself, becoming_keyframe, bow_s2, loosened
-from semcal_ros.core.drift.operations import Drop, Measure, Move
-from semcal_ros.core.drift.state import still
+from semcal_ros.core.drift.matching import Match, is_mergeable, match_keyframe
+from semcal_ros.core.drift.measurement import (
+    acceleration_term_s2,
+    at_itself,
+    becoming_keyframe,
+    loosened,
+)
+from semcal_ros.core.drift.operations import Marginalise, Measure, Predict
+from semcal_ros.core.drift.state import initial_state
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.register import Registration
 
-__all__ = ["DriftForecast", "DriftOutlook", "DriftSettings", "DriftTracker", "DriftUpdate"]
+__all__ = ["DriftForecast", "DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 
 # Multiple of the first step's sigma within which a shift agrees with what was expected.
@@ -79,7 +89,7 @@ class DriftTracker:
         self, settings: DriftSettings | None = None, *, history: DriftHistory | None = None
     ) -> None:
         self.settings = settings or DriftSettings()
-        self._stills = Stills(self.settings.interpolation)
+        self._stills = MotionCorrector(self.settings.interpolation)
         self._history = history
         self.reset()
 
@@ -91,7 +101,7 @@ class DriftTracker:
             limits.registration, limits.max_keyframe_bytes, limits.max_keyframes
         )
         self._misses = 0
-        self._surprises = Surprises()
+        self._surprises = OutlierTest()
         # Camera and time of the frame before.
         self._last: tuple[ScanCamera | None, float] | None = None
         self._doubt = np.zeros((2, 2))
@@ -132,7 +142,7 @@ class DriftTracker:
         picture = resampleable(image)
         height, width = picture.shape[:2]
         fitted = None if camera is None else camera.resized(width, height)
-        shot = Shot(picture, fitted, timing, rectified)
+        shot = ScanFrame(picture, fitted, timing, rectified)
         centre_s = time_s + (timing.centre_offset_s if timing is not None else 0.0)
         if self._last is not None and (
             centre_s < self._last[1] or (self._last[0] is None) != (fitted is None)
@@ -152,9 +162,9 @@ class DriftTracker:
 
     # -- beginning --------------------------------------------------------------------------------
 
-    def _first(self, shot: Shot, centre_s: float) -> DriftUpdate:
+    def _first(self, shot: ScanFrame, centre_s: float) -> DriftUpdate:
         kept = self._history is not None
-        start = still(centre_s, centre_covariance(shot.camera))
+        start = initial_state(centre_s, centre_covariance(shot.camera))
         self._filter = DriftFilter(start, self.settings.acceleration_psd, history=kept)
         if self._history is not None:
             self._history.begin(self._filter)
@@ -165,7 +175,7 @@ class DriftTracker:
             return self._report(shot, f"coasting: {complaint}", None, np.nan)
         return self._report(shot, "keyframe", None, 1.0)
 
-    def _new_key(self, drift: DriftFilter, shot: Shot, removed: Array) -> str:
+    def _new_key(self, drift: DriftFilter, shot: ScanFrame, removed: Array) -> str:
         """This frame becomes a keyframe that was not measured; why it cannot, or an empty
         string.
         """
@@ -174,12 +184,12 @@ class DriftTracker:
         reference = keyframe.reference(self.settings.registration)
         if not reference.complaint:
             key, gone = self._store.add(keyframe, reference)
-            drift.settle_later(key, removed, bow_s2(shot))
+            drift.settle_later(key, removed, acceleration_term_s2(shot))
             for old in gone:
-                drift.do(Drop(old))
+                drift.do(Marginalise(old))
         return reference.complaint
 
-    def _advance(self, drift: DriftFilter, shot: Shot, centre_s: float) -> None:
+    def _advance(self, drift: DriftFilter, shot: ScanFrame, centre_s: float) -> None:
         dt = centre_s - drift.state.time_s
         if drift.measured == 0 and dt > 0.0 and not np.any(drift.state.own[2:, 2:]):
             # Until a second frame sets the pace, all that is known of the velocity is how far drift
@@ -188,13 +198,13 @@ class DriftTracker:
             step = self.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
             drift.first_velocity(step / dt, (0.1 * step) ** 2 / dt**3, dt)
         speed = float(np.hypot(*drift.state.velocity))
-        drift.do(Move(centre_s))
+        drift.do(Predict(centre_s))
         if 0.0 < _PAUSE * drift.restlessness.memory_s < dt:
             drift.do(of_a_pause(speed, dt))
 
     # -- measuring --------------------------------------------------------------------------------
 
-    def _followed(self, drift: DriftFilter, shot: Shot) -> DriftUpdate:
+    def _followed(self, drift: DriftFilter, shot: ScanFrame) -> DriftUpdate:
         limits = self.settings
         self._doubt = np.zeros((2, 2))
         sample = shot.sample
@@ -209,7 +219,7 @@ class DriftTracker:
         # Where nothing matched before, the picture may be that of any of them.
         tried = _CANDIDATES if self._misses == 0 and drift.pending is None else 2 * _CANDIDATES
         for candidate in candidates[:tried]:
-            found = look(drift, self._store, candidate, shot, self._stills)
+            found = match_keyframe(drift, self._store, candidate, shot, self._stills)
             if isinstance(found, Registration):
                 refusal = refusal or (found.reason, found)
                 continue
@@ -221,7 +231,7 @@ class DriftTracker:
         assert refusal is not None
         return self._missed(drift, shot, *refusal, candidates[0].rescaled)
 
-    def _accepted(self, drift: DriftFilter, shot: Shot, found: Found) -> str:
+    def _accepted(self, drift: DriftFilter, shot: ScanFrame, found: Match) -> str:
         """Use a measurement, or say why not."""
         state, measure = drift.state, found.measure
         before = self._store[measure.key].shot
@@ -259,7 +269,9 @@ class DriftTracker:
         drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
         return ""
 
-    def _carried(self, drift: DriftFilter, shot: Shot, found: Found, measure: Measure) -> Measure:
+    def _carried(
+        self, drift: DriftFilter, shot: ScanFrame, found: Match, measure: Measure
+    ) -> Measure:
         """This frame becomes the keyframe of its magnification, by way of one of another; what it
         says of the drift.
         """
@@ -270,19 +282,19 @@ class DriftTracker:
         return at_itself(key, measure, found.removed)
 
     def _rekey(
-        self, drift: DriftFilter, shot: Shot, found: Found, measure: Measure, noise: Array
+        self, drift: DriftFilter, shot: ScanFrame, found: Match, measure: Measure, noise: Array
     ) -> int:
         """Make this frame a keyframe, as it was measured against the one before."""
         keyframe = keyframe_of(shot, found.removed, found.picture, found.region, drift.state.time_s)
         key, gone = self._store.add(keyframe)
         drift.do(becoming_keyframe(key, drift.state, measure, found.removed, noise))
         for old in gone:
-            drift.do(Drop(old))
+            drift.do(Marginalise(old))
         return key
 
     # -- after ------------------------------------------------------------------------------------
 
-    def _kept(self, drift: DriftFilter, shot: Shot, found: Found) -> DriftUpdate:
+    def _kept(self, drift: DriftFilter, shot: ScanFrame, found: Match) -> DriftUpdate:
         """Bookkeeping of a frame that was registered: the keyframe in use, and its mean."""
         self._misses = 0
         self._surprises.forget(drift.state)
@@ -304,7 +316,7 @@ class DriftTracker:
                     measure = loosened(measure, before, shot)
                 self._rekey(drift, shot, found, measure, noise)
                 status = "keyframe"
-        elif joined := self.settings.average and joins(found, self._store):
+        elif joined := self.settings.average and is_mergeable(found, self._store):
             keyframe = self._store[candidate.key]
             better = keyframe.with_frame(found.picture, found.region, registration)
             self._store.replace(candidate.key, better)
@@ -314,7 +326,7 @@ class DriftTracker:
     def _missed(
         self,
         drift: DriftFilter,
-        shot: Shot,
+        shot: ScanFrame,
         reason: str,
         registration: Registration,
         rescaled: bool,
@@ -336,7 +348,7 @@ class DriftTracker:
             return self._restarted(drift, shot, reason)
         return self._report(shot, f"coasting: {reason}", registration, registration.overlap)
 
-    def _restarted(self, drift: DriftFilter, shot: Shot, reason: str) -> DriftUpdate:
+    def _restarted(self, drift: DriftFilter, shot: ScanFrame, reason: str) -> DriftUpdate:
         """Go on from the predicted drift with this frame as keyframe."""
         useless = drift.pending
         complaint = self._new_key(drift, shot, drift.state.motion)
@@ -344,7 +356,7 @@ class DriftTracker:
             if useless is not None and len(self._store) > 2:
                 # Nothing was ever like it.
                 self._store.forget(useless)
-                drift.do(Drop(useless))
+                drift.do(Marginalise(useless))
             self._misses = 0
             self._surprises.forget()
         status = f"coasting: {complaint or reason}"
@@ -352,7 +364,7 @@ class DriftTracker:
 
     def _report(
         self,
-        shot: Shot,
+        shot: ScanFrame,
         status: str,
         registration: Registration | None,
         overlap: float,
@@ -388,7 +400,7 @@ class DriftTracker:
 
     # -- other times ------------------------------------------------------------------------------
 
-    def outlook(self) -> DriftOutlook:
+    def outlook(self) -> DriftPredictor:
         """What is known now of the drift at times after the last frame's.
 
         Raises
@@ -399,4 +411,4 @@ class DriftTracker:
         if self._filter is None or self._last is None:
             raise InvalidValueError("a forecast before the first frame", expected="a frame before")
         state = self._filter.state.without_keyframes()
-        return DriftOutlook(state, self._filter.restlessness, self._last[0])
+        return DriftPredictor(state, self._filter.restlessness, self._last[0])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.inverse_compositional import Alignment, align, tile_energies
+from semcal_ros.core.registration.inverse_compositional import Alignment, align, residual_energies
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["NOTHING", "choose"]
+__all__ = ["NOTHING", "choose_peak"]
 
 
 NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
@@ -21,7 +21,7 @@ _DIFFERENT = 0.05
 _CONTRADICTING = 0.3
 
 
-def choose(
+def choose_peak(
     reference: Reference,
     pyramid: Pyramid,
     peaks: list[CoarsePeak],
@@ -62,7 +62,7 @@ def choose(
         found = align(reference.levels, pyramid, np.array(peak.shift_px))
         if found is None or not found.converged:
             continue
-        theirs = found, tile_energies(level, pyramid, found.shift_px)
+        theirs = found, residual_energies(level, pyramid, found.shift_px)
         if best is None:
             best = (peak, *theirs)
             continue
@@ -88,7 +88,7 @@ def _uncontradicted(
     energies = [
         None
         if found is None or not found.converged
-        else tile_energies(reference.levels[-1], pyramid, found.shift_px)
+        else residual_energies(reference.levels[-1], pyramid, found.shift_px)
         for found in aligned
     ]
     verdict = _paired(energies[0], energies[1], _CONTRADICTING)

@@ -33,15 +33,15 @@ from semcal_ros.core.registration.tile_least_squares import (
 )
 from semcal_ros.core.registration.tiles import (
     PIXELS_FOR_SLOPES,
-    Level,
     Pyramid,
+    PyramidLevel,
     TileSums,
     TileWindow,
     tile_sums,
     tile_window,
 )
 
-__all__ = ["Alignment", "align", "tile_energies"]
+__all__ = ["Alignment", "align", "residual_energies"]
 
 
 _MAX_PASSES = 12
@@ -117,7 +117,7 @@ class Alignment:
 class _Look:
     """Everything about one look at the pixels of one level; shifts in px of the level."""
 
-    level: Level
+    level: PyramidLevel
     window: TileWindow
     geometry: TileGeometry
     sums: TileSums
@@ -138,7 +138,7 @@ class _Look:
         return np.asarray(self.shift + limit * self.fit.step)
 
 
-def align(levels: Sequence[Level], image: Pyramid, start_px: Array) -> Alignment | None:
+def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Alignment | None:
     """Refine a shift.
 
     Parameters
@@ -191,7 +191,7 @@ def align(levels: Sequence[Level], image: Pyramid, start_px: Array) -> Alignment
 
 
 def _look(
-    level: Level, image: Pyramid, shift: Array, mean: float, slopes: Array | None
+    level: PyramidLevel, image: Pyramid, shift: Array, mean: float, slopes: Array | None
 ) -> _Look | None:
     """Sums and fit at a shift in px of the level; ``slopes`` are those of an earlier look."""
     picture = image.at(level.factor)
@@ -366,7 +366,7 @@ def _with_shear(look: _Look, weights: Array) -> tuple[Array, Array]:
     return joint, _robust(look, scores, inverse)
 
 
-def tile_energies(level: Level, image: Pyramid, shift_px: Array) -> Array | None:
+def residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array) -> Array | None:
     """(rows, cols) mean squared residual of each tile of the reference at a shift; NaN where they
     do not overlap with the image.
 

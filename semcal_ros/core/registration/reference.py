@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
-from semcal_ros.core.registration.tiles import Level
+from semcal_ros.core.registration.tiles import PyramidLevel
 
 __all__ = ["Reference", "Region", "RegistrationSettings"]
 
@@ -63,7 +63,7 @@ class Reference:
 
     region: Region
     coarse: CoarseReference
-    levels: tuple[Level, ...]
+    levels: tuple[PyramidLevel, ...]
     noise_variance: float
     complaint: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)

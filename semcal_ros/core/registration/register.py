@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.registration.ambiguity import NOTHING, choose
+from semcal_ros.core.registration.ambiguity import NOTHING, choose_peak
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
 from semcal_ros.core.registration.noise_spectrum import (
     gaussian_taps,
@@ -286,7 +286,7 @@ def register(
     if not peaks:
         return _refused("no shift stands out: featureless, or another place")
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    chosen = choose(prepared, pyramid, peaks, guess, spread)
+    chosen = choose_peak(prepared, pyramid, peaks, guess, spread)
     if isinstance(chosen, str):
         away = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(away))].shift_px) + origin

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.tiles import Level, TileSums, TileWindow
+from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindow
 
 __all__ = ["TileFit", "TileGeometry", "fitted", "geometry_of", "residuals", "well_posed"]
 
@@ -70,7 +70,7 @@ class TileFit:
     step: Array
 
 
-def geometry_of(level: Level, window: TileWindow) -> TileGeometry:
+def geometry_of(level: PyramidLevel, window: TileWindow) -> TileGeometry:
     """Everything about a window; that of the latest one is kept, because drift is slow."""
     known = level.kept.get(window.key)
     if isinstance(known, TileGeometry):

@@ -21,8 +21,8 @@ from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smoothed
 
 __all__ = [
     "PIXELS_FOR_SLOPES",
-    "Level",
     "Pyramid",
+    "PyramidLevel",
     "TileSums",
     "TileWindow",
     "make_level",
@@ -40,7 +40,7 @@ _SHARP_PX = 0.3
 
 
 @dataclass(frozen=True)
-class Level:
+class PyramidLevel:
     """A reference at one resolution, prepared for alignment.
 
     Attributes
@@ -132,7 +132,7 @@ def _tile_side(length: int) -> int:
     return int(sides[np.argmin(length % sides)])
 
 
-def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> Level | None:
+def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel | None:
     """Prepare one resolution of a picture, or None where it is too small for tiles.
 
     ``sigma_px`` is the smoothing in px of the level.
@@ -157,7 +157,7 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> Level | None:
     gram[..., :3, :3] = products @ products.transpose(0, 1, 3, 2)
     gram[..., :3, 3] = gram[..., 3, :3] = products.sum(axis=3, dtype=np.float64)
     gram[..., 3, 3] = side_x * side_y
-    return Level(
+    return PyramidLevel(
         factor, sigma_px, (width, height), (left, top), (side_x, side_y), mean, products, gram
     )
 
@@ -189,7 +189,9 @@ class Pyramid:
         return self._known[1]
 
 
-def tile_window(level: Level, image_size: tuple[int, int], shift: Array) -> TileWindow | None:
+def tile_window(
+    level: PyramidLevel, image_size: tuple[int, int], shift: Array
+) -> TileWindow | None:
     """The tiles that an image of that size shows at a shift; None where there are too few."""
     ranges, middles = [], []
     for axis in (0, 1):
@@ -206,7 +208,7 @@ def tile_window(level: Level, image_size: tuple[int, int], shift: Array) -> Tile
     return TileWindow(ranges[1], ranges[0], middles[1])
 
 
-def _rectangle(level: Level, window: TileWindow) -> tuple[int, int, int, int]:
+def _rectangle(level: PyramidLevel, window: TileWindow) -> tuple[int, int, int, int]:
     """Left, top, width and height of the window in the reference."""
     left = level.origin[0] + window.cols.start * level.side[0]
     top = level.origin[1] + window.rows.start * level.side[1]
@@ -216,7 +218,7 @@ def _rectangle(level: Level, window: TileWindow) -> tuple[int, int, int, int]:
 
 
 def tile_sums(
-    level: Level,
+    level: PyramidLevel,
     window: TileWindow,
     image: AnyImage,
     shift: Array,
@@ -253,7 +255,7 @@ def _tiled(picture: Image, side: tuple[int, int]) -> Image:
     return np.ascontiguousarray(cut).reshape(rows, cols, side[0] * side[1])
 
 
-def _common(level: Level, window: TileWindow, seen: Image) -> Array:
+def _common(level: PyramidLevel, window: TileWindow, seen: Image) -> Array:
     """Products of both pictures' gradients, scaled from enough rows of tiles to all of them."""
     side, band = level.side[1], _band(level.sigma_px)
     rows = len(window.y)

@@ -10,13 +10,13 @@ from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
 
-__all__ = ["NewestWork"]
+__all__ = ["LatestWorker"]
 
 Item = TypeVar("Item", bound=Any)
 Result = TypeVar("Result")
 
 
-class NewestWork(Generic[Item, Result]):
+class LatestWorker(Generic[Item, Result]):
     """Works on the newest of what was submitted; older ones that have not begun are left out.
 
     Items are compared: the newer one is the greater one.

@@ -29,10 +29,10 @@ from rclpy.signals import uninstall_signal_handlers
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.middleware.security import check_security
 
-__all__ = ["OrderlyEnd", "run_node"]
+__all__ = ["DeferredSignals", "run_node"]
 
 
-class OrderlyEnd:
+class DeferredSignals:
     """From now on SIGINT and SIGTERM are only noted, until :meth:`follow` is called.
 
     ROS itself would shut the middleware down at once, and ``destroy_node`` could publish nothing any more. To be made

@@ -11,7 +11,7 @@ from semcal_ros.nodes.common.parameters import CALIBRATION, INTERPOLATION, Setti
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.compressed import compressed_settings
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
-from semcal_ros.nodes.frames.stream import Frame, StreamNode
+from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 
 __all__ = ["CalibratedStreamNode"]
 
@@ -44,7 +44,7 @@ class CalibratedStreamNode(StreamNode):
         """The configuration with the display width of the calibration in force."""
         return self.calibration.config
 
-    def camera(self, frame: Frame, magnification: float) -> ScanCamera | None:
+    def camera(self, frame: StreamFrame, magnification: float) -> ScanCamera | None:
         """Calibrated camera of a frame, or None while there is no calibration."""
         current, seen_at = self.calibration.current, (magnification, *frame.size)
         if self._camera is None or self._camera[0] is not current or self._camera[1] != seen_at:

@@ -22,7 +22,7 @@ from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.confined import read_plain_text
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.latest_worker import NewestWork
+from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
@@ -102,7 +102,7 @@ class CalibrationInput:
         self._loaded: _Loaded | None = None
         self._config = node.config
         self._own_words: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_WORDS)
-        self._parser = NewestWork(node, _parsed, self._on_parsed)
+        self._parser = LatestWorker(node, _parsed, self._on_parsed)
         path = node.settings["calibration"]
         if path:
             self._install(replace(self._read(path), since_ns=0))

@@ -16,9 +16,9 @@ from sensor_msgs.msg import CompressedImage
 
 from semcal_ros.bridge.compressed import CODECS, fill_compressed
 from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
-from semcal_ros.nodes.common.latest_worker import NewestWork
+from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.parameters import Setting
-from semcal_ros.nodes.frames.stream import Frame
+from semcal_ros.nodes.frames.stream import StreamFrame
 
 __all__ = ["CompressedOutput", "compressed_settings"]
 
@@ -84,9 +84,9 @@ class CompressedOutput:
         self._ended = False
         self._submitted = 0
         self._done = 0
-        self._work = NewestWork[_Job, _Done](node, self._compress, self._report)
+        self._work = LatestWorker[_Job, _Done](node, self._compress, self._report)
 
-    def publish(self, image: NDArray[Any], frame: Frame) -> None:
+    def publish(self, image: NDArray[Any], frame: StreamFrame) -> None:
         """Have an image compressed that was made from ``frame``; its memory may be used again afterwards."""
         if self._publisher.get_subscription_count() == 0:
             return

@@ -18,8 +18,8 @@ from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.nodes.common.base import NODE_ERRORS
 from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.services import trigger_service
-from semcal_ros.nodes.frames.pace import TrackingPace
-from semcal_ros.nodes.frames.stream import Frame, StreamNode
+from semcal_ros.nodes.frames.load_monitor import LoadMonitor
+from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measured, measured
 
 __all__ = ["DRIFT_SETTINGS", "FrameDrift", "LiveDrift"]
@@ -97,7 +97,7 @@ class LiveDrift:
 
     def __init__(self, node: StreamNode) -> None:
         self._node = node
-        self._pace = TrackingPace()
+        self._pace = LoadMonitor()
         self._failed = 0
         self._beside = DriftProcess()
         for setting in (*_RESTARTING, _DETAIL):
@@ -126,7 +126,7 @@ class LiveDrift:
         """End what runs beside the stream."""
         self._beside.close()
 
-    def of(self, frame: Frame, camera: ScanCamera) -> FrameDrift:
+    def of(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
         """Drift at a frame; raises as :meth:`DriftTracker.update`."""
         if frame.interval_s is not None:
             self._pace.frame(frame.interval_s)
@@ -149,7 +149,9 @@ class LiveDrift:
         assert self._known is not None
         return _at(self._known, centre_s)
 
-    def _binned(self, frame: Frame, camera: ScanCamera) -> tuple[NDArray[np.generic], ScanCamera]:
+    def _binned(
+        self, frame: StreamFrame, camera: ScanCamera
+    ) -> tuple[NDArray[np.generic], ScanCamera]:
         return binned(frame.image, camera, self._node.settings[_DETAIL.name])
 
     def _beside_is_free(self) -> bool:
@@ -161,7 +163,7 @@ class LiveDrift:
         known = self._known
         return known is not None and centre_s - known.outlook.time_s > _FAR * self._pace.turn_s
 
-    def _times(self, frame: Frame) -> tuple[float, float]:
+    def _times(self, frame: StreamFrame) -> tuple[float, float]:
         """Start and centre of a frame's acquisition, in s since the first one."""
         if self._origin_ns is None:
             # Seconds since 1970 in a float are only good to 0.2 us.

@@ -16,7 +16,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.live_drift import FrameDrift
-from semcal_ros.nodes.frames.stream import Frame
+from semcal_ros.nodes.frames.stream import StreamFrame
 
 __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 
@@ -34,12 +34,12 @@ class ImageOutput:
         self._compressed = CompressedOutput(node, topic)
         self._pixels: NDArray[Any] | None = None
 
-    def memory(self, frame: Frame) -> NDArray[Any]:
+    def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """Where to write the pixels of the image made from ``frame``."""
         self._pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
         return self._pixels
 
-    def publish(self, frame: Frame) -> None:
+    def publish(self, frame: StreamFrame) -> None:
         """Publish what was written."""
         self._publisher.publish(self._message)
         self._node.count_published(frame.stamp_ns)
@@ -60,7 +60,7 @@ class RectifiedOutput:
         # What the message describes, but for its header.
         self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
-    def memory(self, frame: Frame) -> NDArray[Any]:
+    def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """As :meth:`ImageOutput.memory`."""
         return self._image.memory(frame)
 
@@ -68,7 +68,7 @@ class RectifiedOutput:
         """As :meth:`ImageOutput.close`."""
         self._image.close()
 
-    def publish(self, camera: ScanCamera | None, frame: Frame) -> None:
+    def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None where there is none for it."""
         # The description first: a consumer that has the image can then use it at once.
         if self._info.get_subscription_count():
@@ -76,7 +76,7 @@ class RectifiedOutput:
             self._info.publish(self._message)
         self._image.publish(frame)
 
-    def _describe(self, camera: ScanCamera | None, frame: Frame) -> None:
+    def _describe(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         known = self._described
         if known is None or known[0] is not camera or known[1] != frame.size:
             fill_camera_info(self._message, camera, frame.header, *frame.size)
@@ -96,7 +96,7 @@ class DriftOutput:
         self._forecast = 0
         self.trouble = ""
 
-    def publish(self, drift: FrameDrift, frame: Frame) -> None:
+    def publish(self, drift: FrameDrift, frame: StreamFrame) -> None:
         """Publish the drift, in m, at the centre of a frame."""
         pose, twist = self._messages
         # A few matrices per frame, which nobody may want.

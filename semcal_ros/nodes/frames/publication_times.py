@@ -11,7 +11,7 @@ from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
-__all__ = ["SendingTimes"]
+__all__ = ["SourceTimestamps"]
 
 _KEPT = 256
 # Encapsulation, and the stamp with which std_msgs/Header and so every image begins.
@@ -19,7 +19,7 @@ _ENCAPSULATION = 4
 _NS_PER_S = 1_000_000_000
 
 
-class SendingTimes:
+class SourceTimestamps:
     """Publication time of the original of a frame, by header stamp.
 
     A magnification without a stamp is matched by the order of publication. A frame that another node made, such as

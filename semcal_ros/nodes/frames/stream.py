@@ -25,9 +25,9 @@ from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.qos import image_input
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.publication_times import SendingTimes
+from semcal_ros.nodes.frames.publication_times import SourceTimestamps
 
-__all__ = ["Frame", "FrameInput", "StreamNode", "nominal_camera"]
+__all__ = ["FrameInput", "StreamFrame", "StreamNode", "nominal_camera"]
 
 # The same from frame to frame as long as nobody turns the knob.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
@@ -47,7 +47,7 @@ _MIXED = Setting(
 
 
 @dataclass(frozen=True)
-class Frame:
+class StreamFrame:
     """One frame.
 
     Attributes
@@ -99,7 +99,7 @@ class FrameInput:
     def __init__(
         self,
         node: StreamNode,
-        on_frame: Callable[[Frame], None],
+        on_frame: Callable[[StreamFrame], None],
         topic: str | None = None,
         databar_rows: int | None = None,
         group: Any = None,
@@ -112,7 +112,7 @@ class FrameInput:
         self._magnification = MagnificationInput(node, group=group)
         # What another node of the suite made from the microscope's images is not compressed.
         kind = message_class(IMAGE_TYPE if topic else source.type)
-        self._sent = SendingTimes(node, source if topic else None)
+        self._sent = SourceTimestamps(node, source if topic else None)
         self._images = node.listen(
             kind, topic or source.topic, self._on_images, image_input(), group
         )
@@ -178,7 +178,7 @@ class FrameInput:
         self._last_interval_s = (sent_ns - before) * 1e-9 / (missed + 1)
         return self._last_interval_s
 
-    def _frame(self, message: Any, info: MessageInfo, interval_s: float | None) -> Frame:
+    def _frame(self, message: Any, info: MessageInfo, interval_s: float | None) -> StreamFrame:
         node = self._node
         pixels, encoding = decoded_image(message)
         image = without_databar(pixels, self._databar_rows)
@@ -189,7 +189,7 @@ class FrameInput:
         self._mixed += mixed
         node.statistics.note("magnification", "unknown" if g is None else g)
         node.statistics.note("frames_mixed", self._mixed)
-        return Frame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
+        return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
 
 
 class StreamNode(SemNode):
@@ -214,7 +214,7 @@ class StreamNode(SemNode):
         """The configuration by which magnifications are read."""
         return self.config
 
-    def known_magnification(self, frame: Frame) -> float | None:
+    def known_magnification(self, frame: StreamFrame) -> float | None:
         """The magnification of a frame; counts a frame without."""
         self._is_waiting = frame.magnification is None
         if frame.magnification is None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.tracker import DriftOutlook, DriftTracker, DriftUpdate
+from semcal_ros.core.drift.tracker import DriftPredictor, DriftTracker, DriftUpdate
 from semcal_ros.core.errors import SemcalError
 
 __all__ = ["DriftProcess", "Measured", "measured", "serve"]
@@ -39,7 +39,7 @@ class Measured:
     """What a frame told, what is to be expected from then on, and the time that it took."""
 
     update: DriftUpdate
-    outlook: DriftOutlook
+    outlook: DriftPredictor
     cost_s: float
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.operations import Move
+from semcal_ros.core.drift.operations import Predict
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from tests.helpers.drift_scenes import Texture, noisy, small_camera
@@ -49,7 +49,7 @@ def test_a_forecast_is_what_the_filter_itself_would_predict(ahead_s: float) -> N
     feed(tracker, 0, 12)
     outlook = tracker.outlook()
     time_s = outlook.time_s + ahead_s
-    forecast, state = outlook.at(time_s), Move(time_s)(outlook.state, outlook.restlessness)
+    forecast, state = outlook.at(time_s), Predict(time_s)(outlook.state, outlook.restlessness)
     covariance = state.own + scale_covariance(outlook.camera, state.position, state.velocity)
     # Nothing but the order of rounding differs.
     np.testing.assert_allclose(forecast.drift_m, state.position, rtol=1e-12)

@@ -20,7 +20,7 @@ from semcal_ros.core.drift.camera_uncertainty import (
     scale_covariance,
     zoom_of,
 )
-from semcal_ros.core.drift.frame import Shot, Stills, resampleable
+from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
     Keyframe,
     carried,
@@ -28,7 +28,7 @@ from semcal_ros.core.drift.keyframe import (
     scale_ratio,
 )
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
-from semcal_ros.core.drift.state import DriftMap, still
+from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
 from semcal_ros.core.registration.register import Registration, RegistrationSettings, register
@@ -65,7 +65,7 @@ def frame(shift: tuple[float, float], sigma: float, seed: int) -> NDArray[np.flo
 
 def keyframe(picture: NDArray[np.generic]) -> Keyframe:
     height, width = picture.shape[:2]
-    return keyframe_of(Shot(picture, None, None), NOWHERE, picture, (0, 0, width, height), 0.0)
+    return keyframe_of(ScanFrame(picture, None, None), NOWHERE, picture, (0, 0, width, height), 0.0)
 
 
 INNER = (slice(40, -40), slice(40, -40))
@@ -178,9 +178,11 @@ SPECIMEN = DriftingSpecimen(pitch_m=0.05e-6, seed=4)
 STILL = np.zeros(2)
 
 
-def shot_of(camera: ScanCamera, drift_m: Array, seed: int) -> Shot:
+def shot_of(camera: ScanCamera, drift_m: Array, seed: int) -> ScanFrame:
     timing = ScanTiming(0.9, 1, 0.1)
-    return Shot(SPECIMEN.frame(camera, timing, drift_m, STILL, seed, noise=3.0), camera, timing)
+    return ScanFrame(
+        SPECIMEN.frame(camera, timing, drift_m, STILL, seed, noise=3.0), camera, timing
+    )
 
 
 @pytest.mark.parametrize("ratio", [0.6, 0.8, 1.0, 1.3, 2.0])
@@ -189,7 +191,7 @@ def test_a_carried_keyframe_shows_the_drift_in_pixels_of_the_other_camera(ratio:
     # The same instrument, whose axis does not go through the same pixel at every magnification.
     now = replace(small_camera(2000.0 * ratio), px=101.5, py=88.25, ex=91.0, ey=97.0, skew=-0.01)
     drift = np.array([1.1e-6, -0.6e-6])
-    stills = Stills("cubic")
+    stills = MotionCorrector("cubic")
     first = shot_of(before, STILL, 0)
     key = keyframe_of(first, NOWHERE, *stills.of(first, NOWHERE), 0.0)
     shot = shot_of(now, drift, 1)
@@ -213,9 +215,9 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
     now = replace(small_camera(2000.0 * ratio), px=101.5, py=88.25, skew=-0.01)
     bright = np.zeros((192, 192), np.float32)
     bright[20:170, 20:170] = 200.0
-    shot = Shot(bright, small_camera(2000.0), None)
+    shot = ScanFrame(bright, small_camera(2000.0), None)
     key = keyframe_of(shot, NOWHERE, bright, (20, 20, 170, 170), 0.0)
-    other = carried(key, Shot(bright, now, None))
+    other = carried(key, ScanFrame(bright, now, None))
     left, top, right, bottom = other.region
     # The cubic interpolation and the blur before it reach over the edge by less than 1 %.
     np.testing.assert_allclose(other.mean[top:bottom, left:right], 200.0, rtol=0.01)
@@ -230,16 +232,16 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
 
 def test_a_keyframe_is_carried_only_between_cameras() -> None:
     plain = keyframe(frame((0.0, 0.0), 3.0, 0))
-    shot = Shot(plain.shot.image, small_camera(2000.0), None)
+    shot = ScanFrame(plain.shot.image, small_camera(2000.0), None)
     assert carried(plain, shot) is plain
     assert carried(plain, plain.shot) is plain
     assert scale_ratio(plain.shot, shot) == float("inf")
     assert scale_ratio(shot, plain.shot) == float("inf")
     assert scale_ratio(plain.shot, plain.shot) == 1.0
     # Pixels of pictures of another size cannot be compared without a camera.
-    assert scale_ratio(plain.shot, Shot(np.zeros((50, 60)), None, None)) == float("inf")
+    assert scale_ratio(plain.shot, ScanFrame(np.zeros((50, 60)), None, None)) == float("inf")
     # The ratio is that of the direction in which it is largest, and the same both ways.
-    wide = Shot(shot.image, replace(small_camera(2000.0), aspect=1.1), None)
+    wide = ScanFrame(shot.image, replace(small_camera(2000.0), aspect=1.1), None)
     assert scale_ratio(shot, wide) > 1.09
     assert scale_ratio(shot, wide) == pytest.approx(scale_ratio(wide, shot))
 
@@ -252,11 +254,11 @@ def plain_store(**limits: int) -> KeyframeStore:
     return KeyframeStore(RegistrationSettings(), at_most_bytes, at_most)
 
 
-def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float]) -> DriftMap:
-    mean = np.append(drift, np.zeros(still(0.0).mean.size - 2))
+def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float]) -> DriftState:
+    mean = np.append(drift, np.zeros(initial_state(0.0).mean.size - 2))
     for place in places.values():
         mean = np.append(mean, [*place, 0.0, 0.0])
-    return DriftMap(0.0, mean, np.eye(mean.size), tuple(places))
+    return DriftState(0.0, mean, np.eye(mean.size), tuple(places))
 
 
 def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None:
@@ -266,7 +268,7 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
         store.add(keyframe(picture))
     assert store.current == 2
     places = {0: (0.0, 0.0), 1: (80.0, 0.0), 2: (40.0, 0.0)}
-    shot = Shot(picture, None, None)
+    shot = ScanFrame(picture, None, None)
 
     def order(drift: float) -> list[int]:
         state = state_with(places, (drift, 0.0))
@@ -297,14 +299,14 @@ def test_keyframes_of_another_scale_come_last() -> None:
     cameras = [small_camera(2000.0), small_camera(3000.0), small_camera(2000.0)]
     image = np.zeros((192, 192), np.uint8)
     for camera in cameras:
-        shot = Shot(image, camera, None)
+        shot = ScanFrame(image, camera, None)
         store.add(keyframe_of(shot, NOWHERE, image, (0, 0, 192, 192), 0.0))
     # At 3000x everything is in m; 1 um is 12 px.
     places = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (2e-6, 0.0)}
     state = state_with(places, (0.0, 0.0))
 
     def order(magnification: float, max_ratio: float = 2.5) -> list[int]:
-        shot = Shot(image, small_camera(magnification), None)
+        shot = ScanFrame(image, small_camera(magnification), None)
         return [c.key for c in store.candidates(state, shot, 0.6, max_ratio)]
 
     # The one in use, then the one that overlaps more, then the one at 3000x.
@@ -313,7 +315,7 @@ def test_keyframes_of_another_scale_come_last() -> None:
     assert order(3000.0)[0] == 1
     assert order(3000.0, 1.2) == [1]
     assert order(4000.0, 1.2) == []
-    shot = Shot(image, small_camera(4000.0), None)
+    shot = ScanFrame(image, small_camera(4000.0), None)
     assert store.least_ratio(shot) == pytest.approx(4.0 / 3.0)
     found = store.candidates(state, shot, 0.6, 2.5)
     assert all(c.rescaled for c in found)

@@ -11,24 +11,24 @@ from scipy import stats
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.operations import (
-    Carry,
-    Drop,
+    AddKeyframe,
+    CloneKeyframe,
+    CorrectShear,
+    Inflate,
+    Marginalise,
     Measure,
-    Move,
     Operation,
-    Reshear,
-    Settle,
-    Widen,
+    Predict,
 )
-from semcal_ros.core.drift.process_noise import Restlessness
+from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.smoother import (
     Event,
     Mark,
-    likely_restlessness,
-    replayed,
-    smoothed,
+    estimate_process_noise,
+    replay,
+    smooth,
 )
-from semcal_ros.core.drift.state import DriftMap, still
+from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError
 
 
@@ -43,10 +43,10 @@ class Dense:
     """Every number ever as a linear function of one vector of independent standard normal noises.
 
     Nothing of the package but the noise of the differential equation
-    (:meth:`Restlessness.over`) and of a frame (:meth:`Restlessness.within`) is used.
+    (:meth:`ProcessNoise.over`) and of a frame (:meth:`ProcessNoise.within`) is used.
     """
 
-    def __init__(self, restlessness: Restlessness, centre: Array | None = None) -> None:
+    def __init__(self, restlessness: ProcessNoise, centre: Array | None = None) -> None:
         self.restlessness = restlessness
         self.time_s = 0.0
         self.noises = 0
@@ -80,28 +80,28 @@ class Dense:
 
     def do(self, event: Event) -> None:
         drift, pace, turn = self.own[:2], self.own[2:4], self.own[4:]
-        if isinstance(event, Move):
+        if isinstance(event, Predict):
             move, noise = self.restlessness.over(event.time_s - self.time_s)
             stirred = self.noise(np.kron(noise, np.eye(2)))
             self.own = self.sum(np.kron(move, np.eye(2)) @ self.own, stirred)
             self.time_s = event.time_s
-        elif isinstance(event, Widen):
+        elif isinstance(event, Inflate):
             self.own = self.sum(self.own, self.noise(event.covariance))
-        elif isinstance(event, Settle):
+        elif isinstance(event, AddKeyframe):
             where = np.vstack([drift + event.bow * turn, pace])
             gone = -np.append(event.bow * event.removed[2:], event.removed[:2])
             own = self.noise(event.noise + self.restlessness.within(event.scan_s))
             self.places[event.key] = self.sum(where, self.constant(gone), own)
-        elif isinstance(event, Carry):
+        elif isinstance(event, CloneKeyframe):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
             copy = ratio[:, None] * self.places[event.parent]
             zoomed = np.vstack([event.zoom, np.zeros((2, 2))]) @ self.centre
             own = self.noise(event.noise)
             self.places[event.key] = self.sum(copy, zoomed, self.constant(event.shift), own)
-        elif isinstance(event, Reshear):
+        elif isinstance(event, CorrectShear):
             gone = -np.append(event.bow * event.removed[2:], event.removed[:2])
             self.places[event.key] = self.sum(self.places[event.key], self.constant(gone))
-        elif isinstance(event, Drop):
+        elif isinstance(event, Marginalise):
             del self.places[event.key]
         elif isinstance(event, Measure):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
@@ -149,14 +149,14 @@ def covariance_of(rng: np.random.Generator, size: int, unit: float) -> Array:
 def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Event]:
     """What may happen to a recording, in any order."""
     widths = np.repeat([0.0, 1.5 * unit, 0.3 * unit], 2)
-    events: list[Event] = [Widen(np.diag(widths**2))]
+    events: list[Event] = [Inflate(np.diag(widths**2))]
     keys: list[int] = []
     time_s, following = 0.0, 0
 
-    def settle() -> Settle:
+    def settle() -> AddKeyframe:
         noise = covariance_of(rng, 4, unit)
         removed = unit * rng.standard_normal(4)
-        return Settle(following, removed, 0.1 * rng.uniform(), noise, rng.uniform())
+        return AddKeyframe(following, removed, 0.1 * rng.uniform(), noise, rng.uniform())
 
     events += [settle(), Mark()]
     keys.append(following)
@@ -165,7 +165,7 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
         # Two events at one time happen, too.
         if rng.uniform() < 0.8:
             time_s += rng.uniform(0.2, 2.0)
-            events.append(Move(time_s))
+            events.append(Predict(time_s))
         what = rng.choice(
             ["shift", "both", "carry", "copy", "settle", "drop", "widen", "reshear", "coast"],
             p=[0.25, 0.25, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 0.1],
@@ -181,7 +181,7 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
                 # A copy without noise makes the covariance of the state singular.
                 own = covariance_of(rng, 4, unit) if what == "carry" else np.zeros((4, 4))
                 events.append(
-                    Carry(following, key, unit * rng.standard_normal(4), ratio, own, zoom)
+                    CloneKeyframe(following, key, unit * rng.standard_normal(4), ratio, own, zoom)
                 )
                 keys.append(following)
                 following += 1
@@ -190,17 +190,17 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
             keys.append(following)
             following += 1
         elif what == "drop" and len(keys) > 1:
-            events.append(Drop(key))
+            events.append(Marginalise(key))
             keys.remove(key)
         elif what == "widen":
-            events.append(Widen(covariance_of(rng, 6, unit)))
+            events.append(Inflate(covariance_of(rng, 6, unit)))
         elif what == "reshear":
-            events.append(Reshear(key, unit * rng.standard_normal(4), 0.1 * rng.uniform()))
+            events.append(CorrectShear(key, unit * rng.standard_normal(4), 0.1 * rng.uniform()))
         events.append(Mark())
     return events
 
 
-def assert_same(state: DriftMap, mean: Array, covariance: Array, atol: float) -> None:
+def assert_same(state: DriftState, mean: Array, covariance: Array, atol: float) -> None:
     """Equal within a part of the deviations that the truth has."""
     variances = np.diag(covariance).copy()
     # What is known exactly is compared on the scale of the rest in its unit.
@@ -224,7 +224,7 @@ def test_smoothed_states_are_the_exact_conditional_ones(
     seed: int, memory: float, unit: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    restlessness = Restlessness(0.3 * unit**2, memory)
+    restlessness = ProcessNoise(0.3 * unit**2, memory)
     events = random_events(rng, 12, unit)
     # The error of the principal point is in px, whatever the unit of the drift.
     centre = np.array([[4.0, 1.2], [1.2, 2.25]])
@@ -232,7 +232,7 @@ def test_smoothed_states_are_the_exact_conditional_ones(
     for event in events:
         dense.do(event)
     expected = dense.given()
-    states = smoothed(still(0.0, centre), events, restlessness)
+    states = smooth(initial_state(0.0, centre), events, restlessness)
     assert len(states) == len(expected) == sum(isinstance(e, Mark) for e in events)
     for state, (mean, covariance) in zip(states, expected, strict=True):
         # A part in 1e12 of a variance counts as nothing, and sums of 16 digits leave 1e-4 of it; of
@@ -241,40 +241,48 @@ def test_smoothed_states_are_the_exact_conditional_ones(
 
 
 def test_marks_may_repeat_and_nothing_measured_leaves_the_prediction() -> None:
-    restlessness = Restlessness(0.3, 2.0)
-    assert smoothed(still(0.0), [], restlessness) == []
-    events: list[Event] = [Mark(), Move(1.5), Mark(), Mark(), Widen(np.eye(6)), Move(2.0), Mark()]
-    states = smoothed(still(0.0), events, restlessness)
+    restlessness = ProcessNoise(0.3, 2.0)
+    assert smooth(initial_state(0.0), [], restlessness) == []
+    events: list[Event] = [
+        Mark(),
+        Predict(1.5),
+        Mark(),
+        Mark(),
+        Inflate(np.eye(6)),
+        Predict(2.0),
+        Mark(),
+    ]
+    states = smooth(initial_state(0.0), events, restlessness)
     assert [s.time_s for s in states] == [0.0, 1.5, 1.5, 2.0]
-    plain = Move(1.5)(still(0.0), restlessness)
+    plain = Predict(1.5)(initial_state(0.0), restlessness)
     for state in states[1:3]:
         np.testing.assert_allclose(state.covariance, plain.covariance, atol=1e-12)
-    wide = Move(2.0)(Widen(np.eye(6))(plain, restlessness), restlessness)
+    wide = Predict(2.0)(Inflate(np.eye(6))(plain, restlessness), restlessness)
     np.testing.assert_allclose(states[3].covariance, wide.covariance)
 
 
 def test_the_last_state_of_hindsight_is_that_of_the_filter() -> None:
-    restlessness = Restlessness(0.3, 2.0)
+    restlessness = ProcessNoise(0.3, 2.0)
     events = random_events(np.random.default_rng(12), 20, 1.0)
-    last = smoothed(still(0.0), events, restlessness)[-1]
-    state = replayed(still(0.0), events, restlessness)
+    last = smooth(initial_state(0.0), events, restlessness)[-1]
+    state = replay(initial_state(0.0), events, restlessness)
     np.testing.assert_array_equal(last.mean, state.mean)
     np.testing.assert_array_equal(last.covariance, state.covariance)
 
 
 def test_replayed_is_one_thing_after_the_other() -> None:
-    restlessness = Restlessness(0.3, 2.0)
+    restlessness = ProcessNoise(0.3, 2.0)
     for seed in range(8):
         events = random_events(np.random.default_rng(seed), 12, 1.0)
         # With and without operations after the last measurement, and with nothing but operations.
-        for part in (events, events[:-1], events[:-4], events[:2], [], [*events, Move(99.0)]):
-            state = still(0.0)
+        for part in (events, events[:-1], events[:-4], events[:2], [], [*events, Predict(99.0)]):
+            state = initial_state(0.0)
             for event in part:
                 if isinstance(event, Operation):
                     state = event(state, restlessness)
                 elif isinstance(event, Measure):
                     state = event(state, restlessness).state
-            again = replayed(still(0.0), part, restlessness)
+            again = replay(initial_state(0.0), part, restlessness)
             np.testing.assert_array_equal(again.mean, state.mean)
             np.testing.assert_array_equal(again.covariance, state.covariance)
             assert (again.time_s, again.keys) == (state.time_s, state.keys)
@@ -286,7 +294,7 @@ START_PACE = 3.0
 
 
 def simulated(
-    rng: np.random.Generator, times: Array, restlessness: Restlessness, sigma: float
+    rng: np.random.Generator, times: Array, restlessness: ProcessNoise, sigma: float
 ) -> tuple[list[Event], Array]:
     """A path with the exact statistics of the restlessness, seen from one keyframe that has as much
     noise as every frame, and its truth (n, 4).
@@ -295,9 +303,9 @@ def simulated(
     state = rng.standard_normal((3, 2)) * np.array([0.0, START_PACE, turn])[:, None]
     noise = np.diag(np.repeat([sigma**2, 0.0], 2))
     widths = np.repeat([0.0, START_PACE, turn], 2)
-    events: list[Event] = [Widen(np.diag(widths**2))]
+    events: list[Event] = [Inflate(np.diag(widths**2))]
     # The keyframe's velocity is never compared with anything.
-    events += [Settle(0, np.zeros(4), 0.0, noise, 0.0), Mark()]
+    events += [AddKeyframe(0, np.zeros(4), 0.0, noise, 0.0), Mark()]
     key = state[0] + sigma * rng.standard_normal(2)
     truth = [state[:2].ravel()]
     roots: dict[float, tuple[Array, Array]] = {}
@@ -310,18 +318,18 @@ def simulated(
         state = move @ state + root @ rng.standard_normal((3, 2))
         truth.append(state[:2].ravel())
         shift = state[0] - key + sigma * rng.standard_normal(2)
-        events += [Move(float(now)), Measure(0, shift, np.eye(2) * sigma**2), Mark()]
+        events += [Predict(float(now)), Measure(0, shift, np.eye(2) * sigma**2), Mark()]
     return events, np.array(truth)
 
 
 @pytest.mark.parametrize("memory", [0.0, 2.0])
 def test_intervals_cover_the_truth_as_often_as_they_say(memory: float) -> None:
-    restlessness = Restlessness(0.05, memory)
+    restlessness = ProcessNoise(0.05, memory)
     runs, times = 60, np.arange(12.0)
     away, chi2 = [], []
     for seed in range(runs):
         events, truth = simulated(np.random.default_rng(seed), times, restlessness, 0.3)
-        states = smoothed(still(0.0), events, restlessness)
+        states = smooth(initial_state(0.0), events, restlessness)
         # One time of each path, so that all are independent, and not that which is known exactly.
         k = 1 + seed % 11
         error = states[k].mean[:4] - truth[k]
@@ -339,13 +347,13 @@ def test_intervals_cover_the_truth_as_often_as_they_say(memory: float) -> None:
 
 
 def test_hindsight_is_better_than_the_filter_and_says_so() -> None:
-    restlessness = Restlessness(0.05, 2.0)
+    restlessness = ProcessNoise(0.05, 2.0)
     live_error, error, live_sigma, sigma = [], [], [], []
     for seed in range(10):
         events, truth = simulated(np.random.default_rng(seed), np.arange(30.0), restlessness, 0.3)
-        states = smoothed(still(0.0), events, restlessness)
+        states = smooth(initial_state(0.0), events, restlessness)
         for k in (10, 20):
-            state = replayed(still(0.0), events[: 3 + 3 * k], restlessness)
+            state = replay(initial_state(0.0), events[: 3 + 3 * k], restlessness)
             assert state.time_s == states[k].time_s
             # Positions share the noise of the keyframe with everything; velocities do not.
             live_error.append(state.velocity - truth[k, 2:])
@@ -363,12 +371,12 @@ def test_a_stiff_path_is_the_straight_line_fit_through_the_beginning() -> None:
     seen = np.stack([2.0 * times, -times], axis=1) + rng.standard_normal((39, 2))
     # A prior of the velocity that says nothing, and a keyframe without noise.
     events: list[Event] = [
-        Widen(np.diag(np.repeat([0.0, 100.0, 0.0], 2))),
-        Settle(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0),
+        Inflate(np.diag(np.repeat([0.0, 100.0, 0.0], 2))),
+        AddKeyframe(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0),
     ]
     for time, shift in zip(times, seen, strict=True):
-        events += [Move(float(time)), Measure(0, shift, np.eye(2)), Mark()]
-    states = smoothed(still(0.0), events, Restlessness(1e-9))
+        events += [Predict(float(time)), Measure(0, shift, np.eye(2)), Mark()]
+    states = smooth(initial_state(0.0), events, ProcessNoise(1e-9))
     slope = times @ seen / (times @ times)
     # A prior of 100 pulls by a part in 2e6 of the slope, which is 3e-4 of its deviation; a density of
     # 1e-9 bends by less, and rounding costs some digits where the path is that stiff.
@@ -381,13 +389,13 @@ def test_a_stiff_path_is_the_straight_line_fit_through_the_beginning() -> None:
 
 
 def test_a_gap_is_bridged_and_becomes_uncertain() -> None:
-    restlessness = Restlessness(0.01)
+    restlessness = ProcessNoise(0.01)
     events, truth = simulated(np.random.default_rng(3), np.arange(50.0), restlessness, 0.3)
     gap = range(22, 29)
     # Three events before the second frame, then three for each.
     without = [e for k, e in enumerate(events) if not (k % 3 == 1 and k // 3 in gap)]
     assert len(without) == len(events) - len(gap)
-    full, bridged = (smoothed(still(0.0), e, restlessness) for e in (events, without))
+    full, bridged = (smooth(initial_state(0.0), e, restlessness) for e in (events, without))
     sigma = [float(np.sqrt(s.own[0, 0])) for s in bridged]
     # Half of what is stated anyhow is the noise of the keyframe.
     assert sigma[25] > 1.3 * np.sqrt(full[25].own[0, 0])
@@ -407,8 +415,8 @@ def test_the_density_of_a_path_is_found_from_a_guess_that_is_far_off(
 ) -> None:
     found = []
     for seed in range(2):
-        events, _ = simulated(np.random.default_rng(seed), np.arange(50.0), Restlessness(psd), 0.05)
-        likely = likely_restlessness(still(0.0), events, Restlessness(guess), (0.0,))
+        events, _ = simulated(np.random.default_rng(seed), np.arange(50.0), ProcessNoise(psd), 0.05)
+        likely = estimate_process_noise(initial_state(0.0), events, ProcessNoise(guess), (0.0,))
         assert likely.memory_s == 0.0
         found.append(likely.psd)
     # Were every change of pace seen, the logarithm would be known to sqrt(2 / 98) = 0.14; the noise
@@ -420,20 +428,20 @@ def test_the_density_of_a_path_is_found_from_a_guess_that_is_far_off(
 def test_units_do_not_change_what_is_likely() -> None:
     found = []
     for unit in (1.0, 1e-9):
-        restlessness = Restlessness(0.04 * unit**2)
+        restlessness = ProcessNoise(0.04 * unit**2)
         rng = np.random.default_rng(5)
         # The prior of the velocity stays, so that both see the same numbers.
-        events, _ = simulated(rng, np.arange(20.0), Restlessness(0.04), 0.05)
+        events, _ = simulated(rng, np.arange(20.0), ProcessNoise(0.04), 0.05)
         scaled: list[Event] = []
         for event in events:
             if isinstance(event, Measure):
                 event = Measure(event.key, event.shift * unit, event.covariance * unit**2)
-            elif isinstance(event, Widen):
-                event = Widen(event.covariance * unit**2)
-            elif isinstance(event, Settle):
-                event = Settle(event.key, event.removed, 0.0, event.noise * unit**2, 0.0)
+            elif isinstance(event, Inflate):
+                event = Inflate(event.covariance * unit**2)
+            elif isinstance(event, AddKeyframe):
+                event = AddKeyframe(event.key, event.removed, 0.0, event.noise * unit**2, 0.0)
             scaled.append(event)
-        likely = likely_restlessness(still(0.0), scaled, restlessness, (0.0,))
+        likely = estimate_process_noise(initial_state(0.0), scaled, restlessness, (0.0,))
         found.append(likely.psd / unit**2)
     # Equal but for rounding: the search takes the same steps.
     assert found[0] == pytest.approx(found[1], rel=1e-6)
@@ -441,22 +449,25 @@ def test_units_do_not_change_what_is_likely() -> None:
 
 def test_a_long_memory_is_told_from_a_white_acceleration() -> None:
     rng = np.random.default_rng(0)
-    near = Restlessness(1.0, 1.0)
-    for true in (Restlessness(4.0, 8.0), Restlessness(4.0)):
+    near = ProcessNoise(1.0, 1.0)
+    for true in (ProcessNoise(4.0, 8.0), ProcessNoise(4.0)):
         events, _ = simulated(rng, np.arange(40.0), true, 0.02)
         # Forty seconds hold five memories, and noise of 0.02 hides little of changes of pace of 1:
         # the likelihoods differ by far more than they scatter.
-        assert likely_restlessness(still(0.0), events, near, (0.0, 8.0)).memory_s == true.memory_s
+        assert (
+            estimate_process_noise(initial_state(0.0), events, near, (0.0, 8.0)).memory_s
+            == true.memory_s
+        )
 
 
 def test_few_measurements_leave_the_restlessness_as_it_was() -> None:
-    events, _ = simulated(np.random.default_rng(0), np.arange(4.0), Restlessness(0.04), 0.05)
-    near = Restlessness(0.7, 3.0)
-    assert likely_restlessness(still(0.0), events, near) is near
+    events, _ = simulated(np.random.default_rng(0), np.arange(4.0), ProcessNoise(0.04), 0.05)
+    near = ProcessNoise(0.7, 3.0)
+    assert estimate_process_noise(initial_state(0.0), events, near) is near
 
 
 def test_an_outlier_counts_for_no_more_than_its_bound() -> None:
-    restlessness = Restlessness(1e-3)
+    restlessness = ProcessNoise(1e-3)
     events, _ = simulated(np.random.default_rng(1), np.arange(50.0), restlessness, 0.1)
     index = 3 * 30 + 1
     wild = events[index]
@@ -464,7 +475,7 @@ def test_an_outlier_counts_for_no_more_than_its_bound() -> None:
     found = []
     for away in (50.0, 5000.0):
         events[index] = Measure(0, wild.shift + away, wild.covariance)
-        found.append(likely_restlessness(still(0.0), events, restlessness, (0.0,)).psd)
+        found.append(estimate_process_noise(initial_state(0.0), events, restlessness, (0.0,)).psd)
     # A hundred times as far away would make a path that had to follow ten thousand times as
     # restless.
     assert found[1] < 100.0 * found[0]
@@ -474,12 +485,12 @@ def test_an_outlier_counts_for_no_more_than_its_bound() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    events: list[Event] = [Move(2.0), Mark(), Move(1.0)]
-    for function in (smoothed, replayed):
+    events: list[Event] = [Predict(2.0), Mark(), Predict(1.0)]
+    for function in (smooth, replay):
         with pytest.raises(InvalidValueError, match="later time"):
-            function(still(0.0), events, Restlessness(1.0))
+            function(initial_state(0.0), events, ProcessNoise(1.0))
         with pytest.raises(InvalidValueError, match="numbers >= 0"):
-            function(still(0.0), events[:1], Restlessness(-1.0))
+            function(initial_state(0.0), events[:1], ProcessNoise(-1.0))
     for psd in (0.0, -1.0, float("nan")):
         with pytest.raises(InvalidValueError, match="positive density"):
-            likely_restlessness(still(0.0), [], Restlessness(psd))
+            estimate_process_noise(initial_state(0.0), [], ProcessNoise(psd))

@@ -11,23 +11,31 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.operations import Carry, Drop, Measure, Move, Reshear, Settle, Widen
-from semcal_ros.core.drift.process_noise import Restlessness
-from semcal_ros.core.drift.state import DriftMap, still
+from semcal_ros.core.drift.operations import (
+    AddKeyframe,
+    CloneKeyframe,
+    CorrectShear,
+    Inflate,
+    Marginalise,
+    Measure,
+    Predict,
+)
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError
 
-WHITE = Restlessness(0.3)
-FADING = Restlessness(0.3, 1.7)
+WHITE = ProcessNoise(0.3)
+FADING = ProcessNoise(0.3, 1.7)
 # Numbers of a state before those of its keyframes.
-OWN = still(0.0).mean.size
+OWN = initial_state(0.0).mean.size
 
 
-def random_state(seed: int = 0, keys: tuple[int, ...] = (4, 7)) -> DriftMap:
+def random_state(seed: int = 0, keys: tuple[int, ...] = (4, 7)) -> DriftState:
     """A state in which everything correlates with everything."""
     rng = np.random.default_rng(seed)
     size = OWN + 4 * len(keys)
     root = rng.standard_normal((size, size)) + np.eye(size)
-    return DriftMap(1.0, rng.standard_normal(size), root @ root.T, keys)
+    return DriftState(1.0, rng.standard_normal(size), root @ root.T, keys)
 
 
 def square(vector: Array, covariance: Array) -> float:
@@ -38,12 +46,12 @@ def square(vector: Array, covariance: Array) -> float:
 
 
 def test_prediction_moves_with_the_velocity_and_widens() -> None:
-    start = DriftMap(
+    start = DriftState(
         1.0,
         np.array([1.0, 2.0, 0.5, -1.0, 0.0, 0.0]),
         np.diag([4.0, 4.0, 1.0, 1.0, 0.0, 0.0]),
     )
-    later = Move(3.0)(start, WHITE)
+    later = Predict(3.0)(start, WHITE)
     np.testing.assert_allclose(later.mean[:4], [2.0, 0.0, 0.5, -1.0])
     assert later.time_s == 3.0
     # 4 + dt^2 * 1 + q dt^3 / 3, and the velocity's 1 + q dt, with dt = 2.
@@ -57,8 +65,8 @@ def test_prediction_moves_with_the_velocity_and_widens() -> None:
 
 
 def test_a_fading_acceleration_moves_the_drift_by_its_integral() -> None:
-    state = DriftMap(0.0, np.array([0.0, 0.0, 0.0, 0.0, 2.0, -1.0]), np.zeros((6, 6)))
-    later = Move(3.0)(state, Restlessness(0.0, 1.5))
+    state = DriftState(0.0, np.array([0.0, 0.0, 0.0, 0.0, 2.0, -1.0]), np.zeros((6, 6)))
+    later = Predict(3.0)(state, ProcessNoise(0.0, 1.5))
     fade = np.exp(-2.0)
     # a(t) = a exp(-t / 1.5): v = 1.5 a (1 - fade), x = 1.5 a (3 - 1.5 (1 - fade)).
     np.testing.assert_allclose(later.acceleration, [2.0 * fade, -fade])
@@ -67,14 +75,14 @@ def test_a_fading_acceleration_moves_the_drift_by_its_integral() -> None:
     np.testing.assert_allclose(later.position, way * np.array([2.0, -1.0]))
 
 
-@pytest.mark.parametrize("restlessness", [WHITE, FADING, Restlessness(2.0, 40.0)])
-def test_a_prediction_in_two_steps_equals_one(restlessness: Restlessness) -> None:
+@pytest.mark.parametrize("restlessness", [WHITE, FADING, ProcessNoise(2.0, 40.0)])
+def test_a_prediction_in_two_steps_equals_one(restlessness: ProcessNoise) -> None:
     state = random_state()
     if restlessness.memory_s == 0.0:
         # A white acceleration has no value that a prediction could begin with.
-        state = Move(1.1)(state, restlessness)
-    once = Move(4.0)(state, restlessness)
-    twice = Move(4.0)(Move(1.9)(state, restlessness), restlessness)
+        state = Predict(1.1)(state, restlessness)
+    once = Predict(4.0)(state, restlessness)
+    twice = Predict(4.0)(Predict(1.9)(state, restlessness), restlessness)
     np.testing.assert_allclose(once.mean, twice.mean, rtol=1e-12, atol=1e-12)
     # Rounding of numbers near 100.
     np.testing.assert_allclose(once.covariance, twice.covariance, rtol=1e-11, atol=1e-11)
@@ -86,7 +94,7 @@ def test_a_prediction_in_two_steps_equals_one(restlessness: Restlessness) -> Non
 def test_no_time_changes_nothing() -> None:
     state = random_state()
     for restlessness in (WHITE, FADING):
-        same = Move(state.time_s)(state, restlessness)
+        same = Predict(state.time_s)(state, restlessness)
         np.testing.assert_array_equal(same.mean, state.mean)
         np.testing.assert_array_equal(same.covariance, state.covariance)
 
@@ -97,7 +105,7 @@ steps = st.floats(1e-3, 3.5)
 @settings(max_examples=60, deadline=None)
 @given(steps, steps, st.floats(0.5, 1e4), st.floats(1e-20, 1e3))
 def test_transitions_are_a_semigroup(a: float, b: float, memory: float, psd: float) -> None:
-    restlessness = Restlessness(psd, memory)
+    restlessness = ProcessNoise(psd, memory)
     first, first_noise = restlessness.over(a)
     second, second_noise = restlessness.over(b)
     both, both_noise = restlessness.over(a + b)
@@ -127,7 +135,7 @@ def noise_by_quadrature(psd: float, memory_s: float, dt_s: float) -> Array:
 @pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 3.0, 15.0, 60.0])
 def test_noise_is_the_integral_over_the_impulse_responses(ratio: float) -> None:
     dt, psd = 0.7, 0.3
-    move, noise = Restlessness(psd, dt / ratio).over(dt)
+    move, noise = ProcessNoise(psd, dt / ratio).over(dt)
     expected = noise_by_quadrature(psd, dt / ratio, dt)
     unit = np.sqrt(np.diag(expected))
     # Correlations.
@@ -150,7 +158,7 @@ def test_white_noise_is_the_integral_too_and_a_short_memory_comes_near_it() -> N
     np.testing.assert_array_equal(move, [[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     assert np.linalg.eigvalsh(white).min() > -1e-16
     for ratio in (10.0, 20.0):
-        short_move, short = Restlessness(psd, dt / ratio).over(dt)
+        short_move, short = ProcessNoise(psd, dt / ratio).over(dt)
         np.testing.assert_allclose(short_move[:2, :2], move[:2, :2])
         # In the first order of the memory the velocity lacks 1.5 memories of the interval, the
         # drift 3 and their product 2; the second order is that of 3 / ratio^2.
@@ -194,13 +202,13 @@ def test_what_a_frame_adds_of_its_own_is_exact_when_white_and_never_too_small(
         gone = -np.expm1(-left / memory)
         drift, pace = 0.5 * left**2 - memory * left + memory**2 * gone, left - memory * gone
     exact = psd / scan * np.array([np.mean(drift**2), np.mean(pace**2)])
-    stated = np.diag(Restlessness(psd, memory).within(scan))
+    stated = np.diag(ProcessNoise(psd, memory).within(scan))
     np.testing.assert_array_equal(stated[:2], stated[0])
     np.testing.assert_array_equal(stated[2:], stated[2])
     if memory == 0.0:
         # 4000 rectangles for an integral.
         np.testing.assert_allclose(stated[[0, 2]], exact, rtol=1e-5)
-    white = np.diag(Restlessness(psd).within(scan))
+    white = np.diag(ProcessNoise(psd).within(scan))
     assert np.all(stated <= white)
     assert np.all(stated[[0, 2]] > 0.999 * exact)
 
@@ -213,7 +221,7 @@ def test_a_measurement_weighs_by_variance() -> None:
     mean[:4] = 1.0, 2.0, 0.5, -1.0
     variances[:4] = 3.0, 3.0, 1.0, 1.0
     variances[OWN : OWN + 2] = 1.0
-    state = DriftMap(1.0, mean, np.diag(variances), (0,))
+    state = DriftState(1.0, mean, np.diag(variances), (0,))
     # Drift 3 and keyframe 1 make a prior variance of 4; that of the measurement is 4: half way,
     # three quarters of it by the drift and one quarter, backwards, by the keyframe.
     outcome = Measure(0, np.array([3.0, 2.0]), 4.0 * np.eye(2))(state, WHITE)
@@ -266,10 +274,10 @@ def test_units_do_not_matter() -> None:
     # nm or m: 18 orders of magnitude between variances of drift and of shifts in px.
     results = []
     for unit in (1.0, 1e-9):
-        restlessness = Restlessness(0.3 * unit**2, 1.7)
+        restlessness = ProcessNoise(0.3 * unit**2, 1.7)
         state = random_state(5)
-        state = DriftMap(1.0, state.mean * unit, state.covariance * unit**2, state.keys)
-        state = Move(2.5)(state, restlessness)
+        state = DriftState(1.0, state.mean * unit, state.covariance * unit**2, state.keys)
+        state = Predict(2.5)(state, restlessness)
         measure = Measure(4, np.array([1.0, -2.0, 0.3, 0.1]) * unit, np.eye(4) * 0.01 * unit**2)
         outcome = measure(state, restlessness)
         results.append((outcome.state.mean / unit, outcome.state.covariance / unit**2))
@@ -291,13 +299,13 @@ def test_a_covariance_stays_positive_when_a_measurement_is_very_sharp() -> None:
 def test_innovations_are_consistent_and_velocity_is_found(memory: float) -> None:
     rng = np.random.default_rng(5)
     sigma, dt, parts = 0.3, 0.7, 20
-    restlessness = Restlessness(0.05, memory)
+    restlessness = ProcessNoise(0.05, memory)
     truth, pace = np.zeros(2), np.array([1.5, -0.8])
     turn = np.sqrt(restlessness.acceleration_variance) * rng.standard_normal(2)
     variances = [0.0, 4.0, restlessness.acceleration_variance]
-    state = Widen(np.diag(np.repeat(variances, 2)))(still(0.0), restlessness)
+    state = Inflate(np.diag(np.repeat(variances, 2)))(initial_state(0.0), restlessness)
     # A keyframe without noise at the beginning: shifts are drifts.
-    state = Settle(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0)(state, restlessness)
+    state = AddKeyframe(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0)(state, restlessness)
     nis, nees = [], []
     h = dt / parts
     for k in range(1, 400):
@@ -312,7 +320,7 @@ def test_innovations_are_consistent_and_velocity_is_found(memory: float) -> None
                 pace = pace + kick
             truth = truth + 0.5 * h * (before + pace)
         seen = truth + sigma * rng.standard_normal(2)
-        state = Move(k * dt)(state, restlessness)
+        state = Predict(k * dt)(state, restlessness)
         outcome = Measure(0, seen, sigma**2 * np.eye(2))(state, restlessness)
         state = outcome.state
         nis.append(outcome.nis)
@@ -331,14 +339,14 @@ def test_innovations_are_consistent_and_velocity_is_found(memory: float) -> None
 # -- keyframes ----------------------------------------------------------------------------------
 
 
-def sampled(state: DriftMap, count: int, seed: int) -> Array:
+def sampled(state: DriftState, count: int, seed: int) -> Array:
     """(count, n) draws of a state."""
     root = np.linalg.cholesky(state.covariance)
     rng = np.random.default_rng(seed)
     return state.mean + rng.standard_normal((count, state.mean.size)) @ root.T
 
 
-def assert_like_draws(state: DriftMap, draws: Array) -> None:
+def assert_like_draws(state: DriftState, draws: Array) -> None:
     """Mean and covariance of a state are those of draws."""
     unit = np.sqrt(np.diag(state.covariance))
     count = len(draws)
@@ -353,8 +361,8 @@ def test_settle_puts_a_keyframe_where_the_frame_lies() -> None:
     state, removed, bow = random_state(7), np.array([0.3, -0.2, 0.5, 0.1]), 0.4
     noise = np.diag([0.5, 0.2, 0.1, 0.3])
     # Restless enough for what happens within the frame to matter, too.
-    restless = Restlessness(40.0)
-    settled = Settle(9, removed, bow, noise, 0.8)(state, restless)
+    restless = ProcessNoise(40.0)
+    settled = AddKeyframe(9, removed, bow, noise, 0.8)(state, restless)
     assert settled.keys == (4, 7, 9)
     assert settled.of(9) == slice(OWN + 8, OWN + 12)
     draws = sampled(state, 40000, 1)
@@ -374,7 +382,7 @@ def test_carry_copies_the_parent_with_what_was_measured() -> None:
     state = random_state(8)
     shift, noise = np.array([5.0, -3.0, 0.2, 0.1]), np.diag([0.1, 0.2, 0.3, 0.4])
     zoom = np.array([[0.5, 0.1], [0.0, 0.4]])
-    carried = Carry(8, 4, shift, 1.5, noise, zoom)(state, FADING)
+    carried = CloneKeyframe(8, 4, shift, 1.5, noise, zoom)(state, FADING)
     assert carried.keys == (4, 7, 8)
     draws = sampled(state, 40000, 3)
     error = np.random.default_rng(4).standard_normal((40000, 4)) * np.sqrt(np.diag(noise))
@@ -383,7 +391,7 @@ def test_carry_copies_the_parent_with_what_was_measured() -> None:
     where[:, :2] += draws[:, 6:8] @ zoom.T
     assert_like_draws(carried, np.column_stack([draws, where]))
     # Without noise of its own their distance is known exactly.
-    exact = Carry(8, 4, shift, 1.0, np.zeros((4, 4)))(state, FADING)
+    exact = CloneKeyframe(8, 4, shift, 1.0, np.zeros((4, 4)))(state, FADING)
     both = np.hstack([-np.eye(4), np.zeros((4, 4)), np.eye(4)])
     np.testing.assert_allclose(both @ exact.mean[OWN:], shift)
     np.testing.assert_allclose(both @ exact.covariance[OWN:, OWN:] @ both.T, 0.0, atol=1e-13)
@@ -392,7 +400,7 @@ def test_carry_copies_the_parent_with_what_was_measured() -> None:
 def test_reshear_moves_a_keyframe_and_leaves_every_covariance() -> None:
     state = random_state(9)
     removed = np.array([0.3, -0.2, 0.5, 0.1])
-    again = Reshear(7, removed, 0.4)(state, FADING)
+    again = CorrectShear(7, removed, 0.4)(state, FADING)
     change = again.mean - state.mean
     np.testing.assert_allclose(change[state.of(7)], [-0.2, -0.04, -0.3, 0.2], atol=1e-12)
     change[state.of(7)] = 0.0
@@ -400,15 +408,17 @@ def test_reshear_moves_a_keyframe_and_leaves_every_covariance() -> None:
     np.testing.assert_allclose(again.covariance, state.covariance, rtol=1e-15)
     # The same as if it had been taken out when the keyframe was made.
     start, noise = random_state(9, ()), np.eye(4)
-    later = Reshear(1, removed, 0.4)(Settle(1, np.ones(4), 0.4, noise, 0.5)(start, WHITE), WHITE)
-    at_once = Settle(1, np.ones(4) + removed, 0.4, noise, 0.5)(start, WHITE)
+    later = CorrectShear(1, removed, 0.4)(
+        AddKeyframe(1, np.ones(4), 0.4, noise, 0.5)(start, WHITE), WHITE
+    )
+    at_once = AddKeyframe(1, np.ones(4) + removed, 0.4, noise, 0.5)(start, WHITE)
     np.testing.assert_allclose(later.mean, at_once.mean, atol=1e-12)
     np.testing.assert_allclose(later.covariance, at_once.covariance, atol=1e-12)
 
 
 def test_drop_forgets_one_keyframe_and_nothing_else() -> None:
     state = random_state(10, (4, 7, 5))
-    left = Drop(7)(state, FADING)
+    left = Marginalise(7)(state, FADING)
     kept = np.r_[0 : OWN + 4, OWN + 8 : OWN + 12]
     assert left.keys == (4, 5)
     np.testing.assert_allclose(left.mean, state.mean[kept])
@@ -416,7 +426,7 @@ def test_drop_forgets_one_keyframe_and_nothing_else() -> None:
     np.testing.assert_array_equal(left.where(5), state.where(5))
     # Which is what would be without it from the beginning.
     measure = Measure(5, np.array([0.1, 0.2]), np.eye(2))
-    before = Drop(7)(measure(state, FADING).state, FADING)
+    before = Marginalise(7)(measure(state, FADING).state, FADING)
     after = measure(left, FADING).state
     np.testing.assert_allclose(before.mean, after.mean, atol=1e-12)
     np.testing.assert_allclose(before.covariance, after.covariance, atol=1e-12)
@@ -424,7 +434,7 @@ def test_drop_forgets_one_keyframe_and_nothing_else() -> None:
 
 def test_widen_adds_to_the_drift_and_not_to_the_keyframes() -> None:
     state = random_state(11)
-    wider = Widen(np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))(state, FADING)
+    wider = Inflate(np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))(state, FADING)
     np.testing.assert_array_equal(wider.mean, state.mean)
     added = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0] + [0.0] * (OWN + 2))
     np.testing.assert_allclose(wider.covariance - state.covariance, added, atol=1e-12)
@@ -457,7 +467,7 @@ FRAME_NOISE = np.diag([SIGMA**2] * 2 + [SIGMA_PACE**2] * 2)
 BOW = 0.05
 
 
-def simulate(count: int, restlessness: Restlessness, seed: int) -> Stream:
+def simulate(count: int, restlessness: ProcessNoise, seed: int) -> Stream:
     """A stream by small steps of the differential equation."""
     rng = np.random.default_rng(seed)
     parts, h = 40, 1.0 / 40.0
@@ -479,16 +489,16 @@ def simulate(count: int, restlessness: Restlessness, seed: int) -> Stream:
     return Stream(np.arange(float(count)), drift, pace, turn, seen, seen_pace)
 
 
-def begun(restlessness: Restlessness) -> DriftMap:
+def begun(restlessness: ProcessNoise) -> DriftState:
     """The first frame is a keyframe; its velocity and acceleration have their priors."""
     variances = [0.0, SIGMA_START**2, restlessness.acceleration_variance]
-    state = Widen(np.diag(np.repeat(variances, 2)))(still(0.0), restlessness)
-    return Settle(0, np.zeros(4), BOW, FRAME_NOISE, 0.0)(state, restlessness)
+    state = Inflate(np.diag(np.repeat(variances, 2)))(initial_state(0.0), restlessness)
+    return AddKeyframe(0, np.zeros(4), BOW, FRAME_NOISE, 0.0)(state, restlessness)
 
 
 def follow(
-    stream: Stream, restlessness: Restlessness, *, chain: int, with_shear: bool
-) -> tuple[list[DriftMap], dict[int, Array]]:
+    stream: Stream, restlessness: ProcessNoise, *, chain: int, with_shear: bool
+) -> tuple[list[DriftState], dict[int, Array]]:
     """The filter's states after each frame, and where the keyframes truly are.
 
     Every ``chain`` frames the frame becomes the keyframe of those that follow; only three
@@ -498,7 +508,7 @@ def follow(
     truth = {0: np.append(stream.seen[0], stream.seen_pace[0])}
     states.append(state)
     for k in range(1, len(stream.times)):
-        state = Move(float(stream.times[k]))(state, restlessness)
+        state = Predict(float(stream.times[k]))(state, restlessness)
         frame = np.append(stream.seen[k], stream.seen_pace[k])
         # A registration knows only the difference of two pictures.
         count = 4 if with_shear else 2
@@ -510,17 +520,17 @@ def follow(
             shift, noise = np.zeros(4), np.zeros((4, 4))
             shift[:count] = measure.shift
             truth[k] = truth[current] + shift
-            state = Carry(k, current, shift, 1.0, noise)(state, restlessness)
+            state = CloneKeyframe(k, current, shift, 1.0, noise)(state, restlessness)
             current = k
             if len(state.keys) > 3:
                 gone = state.keys[1]
-                state = Drop(gone)(state, restlessness)
+                state = Marginalise(gone)(state, restlessness)
                 del truth[gone]
         states.append(state)
     return states, truth
 
 
-RESTLESS = Restlessness(0.05, 3.0)
+RESTLESS = ProcessNoise(0.05, 3.0)
 
 
 @pytest.mark.parametrize("with_shear", [False, True])
@@ -549,10 +559,10 @@ def test_errors_of_simulated_streams_are_as_stated(with_shear: bool) -> None:
 
 def test_noise_of_a_keyframe_does_not_average_out() -> None:
     # At rest, and known to be: only the noise of the pictures is left.
-    rest = Restlessness(0.0)
-    state = Settle(0, np.zeros(4), 0.0, FRAME_NOISE, 0.0)(still(0.0), rest)
+    rest = ProcessNoise(0.0)
+    state = AddKeyframe(0, np.zeros(4), 0.0, FRAME_NOISE, 0.0)(initial_state(0.0), rest)
     # A drift that may be anywhere but does not move.
-    state = Widen(np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 0.0]))(state, rest)
+    state = Inflate(np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 0.0]))(state, rest)
     for _ in range(400):
         state = Measure(0, np.zeros(2), FRAME_NOISE[:2, :2])(state, rest).state
     # 400 frames leave a 20th of the noise of each; that of the keyframe stays: sigma^2 (1 + 1/400).
@@ -560,21 +570,21 @@ def test_noise_of_a_keyframe_does_not_average_out() -> None:
 
 
 def test_coming_back_to_the_first_keyframe_undoes_what_was_lost_on_the_way() -> None:
-    restlessness = Restlessness(0.5, 3.0)
+    restlessness = ProcessNoise(0.5, 3.0)
     state, current, times = begun(restlessness), 0, 0.0
     sigmas = []
     for k in range(1, 13):
         times += 1.0
-        state = Move(times)(state, restlessness)
+        state = Predict(times)(state, restlessness)
         state = Measure(current, np.zeros(2), FRAME_NOISE[:2, :2])(state, restlessness).state
         # As a picture it weighs a little otherwise than it did when it was measured.
-        state = Carry(k, current, np.zeros(4), 1.0, FRAME_NOISE * 0.2)(state, restlessness)
+        state = CloneKeyframe(k, current, np.zeros(4), 1.0, FRAME_NOISE * 0.2)(state, restlessness)
         current = k
         sigmas.append(float(np.sqrt(state.covariance[0, 0])))
     # Each link adds its noise.
     assert np.all(np.diff(sigmas) > 0.0)
     chained = float(np.sqrt(state.covariance[state.of(6).start, state.of(6).start]))
-    state = Move(times + 1.0)(state, restlessness)
+    state = Predict(times + 1.0)(state, restlessness)
     back = Measure(0, np.zeros(2), FRAME_NOISE[:2, :2])(state, restlessness).state
     sigma = float(np.sqrt(back.covariance[0, 0]))
     # Two pictures at most, as for the first frame after the keyframe.
@@ -592,9 +602,9 @@ def test_the_mean_drift_over_a_frame_is_bowed_by_the_acceleration() -> None:
     scan, acceleration = 1.3, np.array([0.7, -0.4])
     t = (np.arange(100000) + 0.5) / 100000 * scan - 0.5 * scan
     mean = np.mean(0.5 * t**2) * acceleration
-    state = still(0.0)
-    state = DriftMap(0.0, np.insert(np.zeros(OWN - 2), 4, acceleration), state.covariance)
-    state = Settle(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0)(state, WHITE)
+    state = initial_state(0.0)
+    state = DriftState(0.0, np.insert(np.zeros(OWN - 2), 4, acceleration), state.covariance)
+    state = AddKeyframe(0, np.zeros(4), 0.0, np.zeros((4, 4)), 0.0)(state, WHITE)
     measure = Measure(0, mean, np.eye(2), bow=scan**2 / 24.0)
     np.testing.assert_allclose(measure(state, WHITE).innovation[:2], acceleration * 0.0, atol=1e-9)
 
@@ -602,17 +612,17 @@ def test_the_mean_drift_over_a_frame_is_bowed_by_the_acceleration() -> None:
 def test_a_zoom_there_and_back_is_known_better_than_a_zoom() -> None:
     centre = np.array([[4.0, 1.2], [1.2, 2.25]])
     zoom = np.array([[-0.3, 0.02], [0.0, -0.28]])
-    rest = Restlessness(0.0)
+    rest = ProcessNoise(0.0)
     exact, sharp = np.zeros((4, 4)), 1e-6 * np.eye(2)
-    state = Settle(0, np.zeros(4), 0.0, exact, 0.0)(still(0.0, centre), rest)
-    state = Widen(np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 0.0]))(state, rest)
+    state = AddKeyframe(0, np.zeros(4), 0.0, exact, 0.0)(initial_state(0.0, centre), rest)
+    state = Inflate(np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 0.0]))(state, rest)
     np.testing.assert_array_equal(state.centre_error_px[1], centre)
     # Over there nobody knows what was drift and what was the zoom (a prior of 100 tells 0.5 %).
-    there = Carry(1, 0, np.zeros(4), 1.0, exact, zoom)(state, rest)
+    there = CloneKeyframe(1, 0, np.zeros(4), 1.0, exact, zoom)(state, rest)
     there = Measure(1, np.zeros(2), sharp)(there, rest).state
     np.testing.assert_allclose(there.own[:2, :2], zoom @ centre @ zoom.T, rtol=0.01)
     # Back by the same way the error has undone itself.
-    back = Carry(2, 1, np.zeros(4), 1.0, exact, -zoom)(there, rest)
+    back = CloneKeyframe(2, 1, np.zeros(4), 1.0, exact, -zoom)(there, rest)
     at = back.of(2)
     np.testing.assert_allclose(back.covariance[at, at], 0.0, atol=1e-12)
     # Seen from the first keyframe before and after, a specimen at rest tells the error: what a
@@ -632,17 +642,17 @@ def test_a_zoom_there_and_back_is_known_better_than_a_zoom() -> None:
 def test_bad_input_is_refused() -> None:
     state = random_state()
     with pytest.raises(InvalidValueError, match="later time"):
-        Move(0.5)(state, WHITE)
+        Predict(0.5)(state, WHITE)
     with pytest.raises(InvalidValueError, match="later time"):
-        Move(float("nan"))(state, WHITE)
+        Predict(float("nan"))(state, WHITE)
     for wrong in (
-        Restlessness(-1.0),
-        Restlessness(float("nan")),
-        Restlessness(1.0, -2.0),
-        Restlessness(1.0, float("nan")),
+        ProcessNoise(-1.0),
+        ProcessNoise(float("nan")),
+        ProcessNoise(1.0, -2.0),
+        ProcessNoise(1.0, float("nan")),
     ):
         with pytest.raises(InvalidValueError, match="numbers >= 0"):
-            Move(2.0)(state, wrong)
+            Predict(2.0)(state, wrong)
     for shift in ([np.nan, 0.0], [0.0, np.inf], [0.0, 0.0, np.nan, 0.0]):
         with pytest.raises(InvalidValueError, match="finite"):
             Measure(4, np.array(shift), np.eye(len(shift)))(state, WHITE)

@@ -12,7 +12,9 @@ from semcal_ros.doctor.calibration_checks import (
     check_calibration,
     live_size,
 )
-from semcal_ros.doctor.findings import Finding, Level, note, problem
+from semcal_ros.doctor.environment import collect_environment
+from semcal_ros.doctor.environment_checks import ENVIRONMENT_CHECKS, check_domain, check_rclpy
+from semcal_ros.doctor.findings import Finding, Severity, note, problem
 from semcal_ros.doctor.graph_checks import (
     Topic,
     check_nodes,
@@ -21,7 +23,7 @@ from semcal_ros.doctor.graph_checks import (
     check_topic,
     suite_topics,
 )
-from semcal_ros.doctor.observations import Session, Surroundings
+from semcal_ros.doctor.observations import Environment, Session
 from semcal_ros.doctor.stream_checks import (
     check_diagnostics,
     check_images,
@@ -32,14 +34,12 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     magnification_seen,
 )
-from semcal_ros.doctor.surroundings import look_around
-from semcal_ros.doctor.surroundings_checks import SURROUNDINGS_CHECKS, check_domain, check_rclpy
 from semcal_ros.files.calibration_file import Calibration
 
-__all__ = ["examine", "judge"]
+__all__ = ["diagnose", "evaluate"]
 
 
-def examine(
+def diagnose(
     config_name: str, calibration: Path | None, namespace: str, seconds: float
 ) -> list[Finding]:
     """Look at everything and say what was found.
@@ -62,8 +62,8 @@ def examine(
     """
     config = load_config(config_name)
     given = None if calibration is None else (str(calibration), Calibration.load(calibration))
-    around = look_around()
-    found = [finding for check in SURROUNDINGS_CHECKS for finding in check(around)]
+    around = collect_environment()
+    found = [finding for check in ENVIRONMENT_CHECKS for finding in check(around)]
     session = None
     # In a domain that there is none the middleware would end this process.
     needed = [*check_rclpy(around), *check_domain(around)]
@@ -75,11 +75,11 @@ def examine(
     if session is None:
         do = "mend what is said above first"
         return [*found, note("topics", "not looked at, as ROS 2 does not work here", do=do)]
-    return found + judge(session, around, (config_name, config), given, namespace)
+    return found + evaluate(session, around, (config_name, config), given, namespace)
 
 
 def _is_problem(finding: Finding) -> bool:
-    return finding.level is Level.PROBLEM
+    return finding.level is Severity.PROBLEM
 
 
 def _observed(config: MicroscopeConfig, namespace: str, seconds: float) -> Session:
@@ -89,9 +89,9 @@ def _observed(config: MicroscopeConfig, namespace: str, seconds: float) -> Sessi
     return observe(config, suite_topics(config, namespace), namespace, seconds)
 
 
-def judge(
+def evaluate(
     session: Session,
-    around: Surroundings,
+    around: Environment,
     configured: tuple[str, MicroscopeConfig],
     given: tuple[str, Calibration] | None,
     namespace: str,

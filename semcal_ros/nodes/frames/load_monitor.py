@@ -6,7 +6,7 @@ import math
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["TrackingPace"]
+__all__ = ["LoadMonitor"]
 
 _WEIGHT = 0.1
 _SETTLED = 2
@@ -14,14 +14,14 @@ _SETTLED = 2
 _TOO_MUCH, _LITTLE_ENOUGH = 0.6, 0.4
 
 
-class TrackingPace:
+class LoadMonitor:
     """Compares the time that a measurement takes with the interval between frames.
 
     Both are running means. As long as little has been seen there is time enough.
 
     Examples
     --------
-    >>> pace = TrackingPace()
+    >>> pace = LoadMonitor()
     >>> for _ in range(20):
     ...     pace.frame(0.005)
     ...     pace.measured(0.010)

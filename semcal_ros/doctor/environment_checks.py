@@ -8,7 +8,7 @@ from pathlib import Path
 
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
-from semcal_ros.doctor.observations import Surroundings
+from semcal_ros.doctor.observations import Environment
 from semcal_ros.middleware.fastdds_profile import (
     SharedMemory,
     local_only,
@@ -17,7 +17,7 @@ from semcal_ros.middleware.fastdds_profile import (
 )
 
 __all__ = [
-    "SURROUNDINGS_CHECKS",
+    "ENVIRONMENT_CHECKS",
     "check_discovery",
     "check_domain",
     "check_one_ros",
@@ -47,7 +47,7 @@ _SOCKET_BYTES = 32 * 1024**2
 _MB = 1024**2
 
 
-def check_python(seen: Surroundings) -> list[Finding]:
+def check_python(seen: Environment) -> list[Finding]:
     """Whether this Python is one that is supported."""
     version = ".".join(map(str, seen.python))
     if _PYTHON[0] <= seen.python <= _PYTHON[1]:
@@ -57,7 +57,7 @@ def check_python(seen: Surroundings) -> list[Finding]:
     ]
 
 
-def check_packages(seen: Surroundings) -> list[Finding]:
+def check_packages(seen: Environment) -> list[Finding]:
     """Whether what this package asks for is installed and new enough."""
     found = []
     for requirement in seen.required:
@@ -86,7 +86,7 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
-def check_rclpy(seen: Surroundings) -> list[Finding]:
+def check_rclpy(seen: Environment) -> list[Finding]:
     """Whether ROS 2 can be imported, and how to get it."""
     reason = seen.import_errors.get("rclpy")
     if reason is None:
@@ -117,7 +117,7 @@ def check_rclpy(seen: Surroundings) -> list[Finding]:
     ]
 
 
-def check_one_ros(seen: Surroundings) -> list[Finding]:
+def check_one_ros(seen: Environment) -> list[Finding]:
     """Whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
     rclpy, messages = seen.packages.get("ros-rclpy"), seen.packages.get("ros-sensor-msgs")
     if rclpy is None:
@@ -151,12 +151,12 @@ def check_one_ros(seen: Surroundings) -> list[Finding]:
     return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}, ros-sensor-msgs {messages or 'missing'}")]
 
 
-def _wrong_middleware(seen: Surroundings) -> bool:
+def _wrong_middleware(seen: Environment) -> bool:
     named = seen.environment.get("RMW_IMPLEMENTATION", "")
     return bool(named) and named in seen.import_errors.get("rclpy", "")
 
 
-def check_rmw(seen: Surroundings) -> list[Finding]:
+def check_rmw(seen: Environment) -> list[Finding]:
     """Which middleware is used."""
     if _wrong_middleware(seen):
         return [
@@ -181,7 +181,7 @@ def check_rmw(seen: Surroundings) -> list[Finding]:
     ]
 
 
-def check_domain(seen: Surroundings) -> list[Finding]:
+def check_domain(seen: Environment) -> list[Finding]:
     """Whether the domain id is one."""
     given = seen.environment.get("ROS_DOMAIN_ID", "")
     if not given:
@@ -206,7 +206,7 @@ def check_domain(seen: Surroundings) -> list[Finding]:
     return [ok("domain", f"ROS_DOMAIN_ID is {given}; nodes with another number are not seen")]
 
 
-def check_discovery(seen: Surroundings) -> list[Finding]:
+def check_discovery(seen: Environment) -> list[Finding]:
     """Which hosts and processes can be found."""
     reach = seen.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     peers = seen.environment.get("ROS_STATIC_PEERS", "")
@@ -248,14 +248,14 @@ def check_discovery(seen: Surroundings) -> list[Finding]:
     return found or [ok("discovery", f"ROS_AUTOMATIC_DISCOVERY_RANGE is {reached}")]
 
 
-def _memory(seen: Surroundings) -> SharedMemory | None:
+def _memory(seen: Environment) -> SharedMemory | None:
     try:
         return shared_memory(seen.environment)
     except ConfigError:
         return None  # check_profile tells
 
 
-def check_profile(seen: Surroundings) -> list[Finding]:
+def check_profile(seen: Environment) -> list[Finding]:
     """Whether a profile is set and can be used. Whether it is needed depends on the images: `large images`."""
     if seen.rmw and not seen.rmw.startswith("rmw_fastrtps"):
         return []
@@ -287,7 +287,7 @@ def check_profile(seen: Surroundings) -> list[Finding]:
     return [ok("DDS profile", f"{memory.source}{where}: {size}")]
 
 
-def check_shared_memory(seen: Surroundings) -> list[Finding]:
+def check_shared_memory(seen: Environment) -> list[Finding]:
     """Whether /dev/shm has room for the segment of one more process."""
     memory = _memory(seen)
     if memory is None or memory.segment_bytes is None or not seen.rmw.startswith("rmw_fastrtps"):
@@ -308,7 +308,7 @@ def check_shared_memory(seen: Surroundings) -> list[Finding]:
     return [ok("/dev/shm", f"{free / _MB:.0f} MiB are free")]
 
 
-def check_socket_buffers(seen: Surroundings) -> list[Finding]:
+def check_socket_buffers(seen: Environment) -> list[Finding]:
     """Whether images can come from other hosts without loss."""
     have = seen.receive_buffer_bytes
     if have is None or local_only(seen.environment) or have >= _SOCKET_BYTES:
@@ -323,7 +323,7 @@ def check_socket_buffers(seen: Surroundings) -> list[Finding]:
     ]
 
 
-SURROUNDINGS_CHECKS: tuple[Callable[[Surroundings], list[Finding]], ...] = (
+ENVIRONMENT_CHECKS: tuple[Callable[[Environment], list[Finding]], ...] = (
     check_python,
     check_packages,
     check_rclpy,

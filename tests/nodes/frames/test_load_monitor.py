@@ -10,7 +10,7 @@ from semcal_ros.bridge.scan_interval import scan_interval_ns
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig, parse_config
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.frames.pace import TrackingPace
+from semcal_ros.nodes.frames.load_monitor import LoadMonitor
 
 MS = 1_000_000
 CONFIG = """
@@ -27,7 +27,7 @@ def config(stamp: str = "start", scan: str = SCAN) -> MicroscopeConfig:
     return parse_config(CONFIG.format(stamp=stamp, scan=scan))
 
 
-def run(pace: TrackingPace, frames: int, interval_s: float, cost_s: float) -> list[bool]:
+def run(pace: LoadMonitor, frames: int, interval_s: float, cost_s: float) -> list[bool]:
     states = []
     for _ in range(frames):
         pace.frame(interval_s)
@@ -37,11 +37,11 @@ def run(pace: TrackingPace, frames: int, interval_s: float, cost_s: float) -> li
 
 
 def test_a_slow_stream_is_measured_frame_by_frame() -> None:
-    assert all(run(TrackingPace(), 50, 0.5, 0.02))
+    assert all(run(LoadMonitor(), 50, 0.5, 0.02))
 
 
 def test_a_fast_stream_is_not_waited_for_and_comes_back_with_room_to_spare() -> None:
-    pace = TrackingPace()
+    pace = LoadMonitor()
     assert not run(pace, 50, 0.005, 0.01)[-1]
     # Just enough time would make it go to and fro.
     assert not run(pace, 200, 0.020, 0.01)[-1]
@@ -50,19 +50,19 @@ def test_a_fast_stream_is_not_waited_for_and_comes_back_with_room_to_spare() -> 
 
 
 def test_one_hiccup_changes_nothing() -> None:
-    pace = TrackingPace()
+    pace = LoadMonitor()
     run(pace, 50, 0.1, 0.02)
     pace.measured(0.3)
     assert pace.keeps_up
-    assert math.isnan(TrackingPace().cost_s)
+    assert math.isnan(LoadMonitor().cost_s)
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
 def test_times_that_cannot_be_are_refused(value: float) -> None:
     with pytest.raises(InvalidValueError):
-        TrackingPace().frame(value)
+        LoadMonitor().frame(value)
     with pytest.raises(InvalidValueError):
-        TrackingPace().measured(value)
+        LoadMonitor().measured(value)
 
 
 @pytest.mark.parametrize(("stamp", "start_ms"), [("start", 0), ("centre", -500), ("end", -1000)])

@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from importlib import import_module, metadata
 from pathlib import Path
 
-from semcal_ros.doctor.observations import Surroundings
+from semcal_ros.doctor.observations import Environment
 
-__all__ = ["look_around"]
+__all__ = ["collect_environment"]
 
 _MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
 # The middleware is loaded with rclpy and may end the process at once: in one of its own that does no harm.
@@ -25,11 +25,11 @@ _SHM = Path("/dev/shm")
 _INSTALLATIONS = Path("/opt/ros")
 
 
-def look_around() -> Surroundings:
+def collect_environment() -> Environment:
     """What can be said without a ROS graph; imports what the nodes import."""
     rclpy_file, rmw, reason = _probe_ros()
     errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
-    return Surroundings(
+    return Environment(
         python=sys.version_info[:2],
         packages=dict(_packages()),
         required=tuple(_required()),
