@@ -119,7 +119,7 @@ class Follower:
         if live or self.history is None:
             return path_of_updates(self.updates)
         if self._smoothed is None or len(self._smoothed) != len(self.updates):
-            self._smoothed = self.history.smoothed()
+            self._smoothed = self.history.smooth()
         return self._smoothed
 
 

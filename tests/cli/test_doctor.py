@@ -16,7 +16,7 @@ import pytest
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
-from semcal_ros.doctor import surroundings_checks as checks
+from semcal_ros.doctor import environment_checks as checks
 from semcal_ros.doctor.calibration_checks import calibration_seen, check_calibration
 from semcal_ros.doctor.diagnosis import evaluate
 from semcal_ros.doctor.findings import Finding, Severity

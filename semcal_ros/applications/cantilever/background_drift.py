@@ -102,7 +102,7 @@ def follow_background(
         weight = _shifted(still, shift)
         tracker.update(_covered(picture, weight), time_s, plane.camera, plane.timing)
         on_frame()
-    return Background(history.smoothed(), still)
+    return Background(history.smooth(), still)
 
 
 def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:

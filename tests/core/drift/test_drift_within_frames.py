@@ -72,7 +72,7 @@ def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: Sca
         image, camera = frame_of(20_000.0, timing, drift, start, k)
         updates.append(tracker.update(image, start, camera, timing))
     assert all(u.accepted for u in updates)
-    path = history.smoothed()
+    path = history.smooth()
 
     def of(found: list[RasterDrift]) -> np.ndarray:
         parts = zip(starts, found, strict=True)

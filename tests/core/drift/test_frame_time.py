@@ -218,7 +218,7 @@ def tracked(law_px: Law, timing: ScanTiming, frames: int, seed: int) -> FrameTim
         velocity = (last - first) / timing.frame_time_s
         picture = specimen.frame(camera, timing, middle - zero, velocity, 1000 * seed + k)
         updates.append(tracker.update(picture, float(k), camera))
-    return estimate_frame_time(history.smoothed(), updates, shear_of_shift=REMOVED)
+    return estimate_frame_time(history.smooth(), updates, shear_of_shift=REMOVED)
 
 
 @pytest.mark.parametrize(("time_s", "px"), [(0.95, 0.5), (0.4, 1.0)])
