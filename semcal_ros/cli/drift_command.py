@@ -16,18 +16,12 @@ from semcal_ros.cli.common import (
     require_suffix,
 )
 from semcal_ros.cli.drift_common import (
-    GIVE_FRAME_TIME,
-    Follower,
-    camera_of,
     echo_nominal_unit,
     echo_states,
     forecast_text,
     frame_time_option,
     live_option,
     rate_text,
-    start_time_s,
-    timing_seen,
-    with_frame_time,
 )
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.estimates import DriftPath
@@ -35,6 +29,14 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
+from semcal_ros.workflows.follow_drift import (
+    GIVE_FRAME_TIME,
+    Follower,
+    camera_of,
+    start_time_s,
+    timing_seen,
+    with_frame_time,
+)
 
 __all__ = ["command"]
 

@@ -29,13 +29,7 @@ from semcal_ros.cli.common import (
     require_folder,
     require_suffix,
 )
-from semcal_ros.cli.drift_common import (
-    GIVE_FRAME_TIME,
-    camera_of,
-    frame_time_option,
-    start_time_s,
-    with_frame_time,
-)
+from semcal_ros.cli.drift_common import frame_time_option
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
@@ -43,6 +37,12 @@ from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.tables import write_csv
 from semcal_ros.files.video import VIDEO_CODECS, film_of
+from semcal_ros.workflows.follow_drift import (
+    GIVE_FRAME_TIME,
+    camera_of,
+    start_time_s,
+    with_frame_time,
+)
 
 __all__ = ["command"]
 

@@ -15,16 +15,7 @@ from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
-from semcal_ros.cli.drift_common import (
-    GIVE_FRAME_TIME,
-    Follower,
-    camera_of,
-    echo_states,
-    frame_time_option,
-    start_time_s,
-    timing_seen,
-    with_frame_time,
-)
+from semcal_ros.cli.drift_common import echo_states, frame_time_option
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
@@ -32,6 +23,14 @@ from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.files.bags.reader import BagWriter, blank_message
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, open_recording
+from semcal_ros.workflows.follow_drift import (
+    GIVE_FRAME_TIME,
+    Follower,
+    camera_of,
+    start_time_s,
+    timing_seen,
+    with_frame_time,
+)
 
 __all__ = ["command"]
 

@@ -21,13 +21,7 @@ from semcal_ros.cli.common import (
     require_folder,
     require_suffix,
 )
-from semcal_ros.cli.drift_common import (
-    Follower,
-    echo_nominal_unit,
-    echo_states,
-    frame_time_option,
-    with_frame_time,
-)
+from semcal_ros.cli.drift_common import echo_nominal_unit, echo_states, frame_time_option
 from semcal_ros.core.arrays import Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
@@ -36,6 +30,7 @@ from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
 from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
+from semcal_ros.workflows.follow_drift import Follower, with_frame_time
 from semcal_ros.workflows.select_frames import Job, Survey, surveyed
 
 __all__ = ["command"]
@@ -100,9 +95,14 @@ def command(
     microscope = with_frame_time(configured(config, model), frame_time)
     job = Job(model, microscope, at, None if no_drift else Follower())
     with open_recording(recording, microscope, magnification=magnification) as opened:
-        survey = surveyed(
-            opened, job, on_first=lambda f: _check_first(f, output), levels=video is not None
-        )
+        with progress(opened.frame_count, "reading" if no_drift else "drift") as bar:
+            survey = surveyed(
+                opened,
+                job,
+                on_first=lambda f: _check_first(f, output),
+                levels=video is not None,
+                on_frame=bar.update,
+            )
         usable = _usable(survey)
         stack = Stack(survey.size, interpolation)
         grey = _video_levels(survey)

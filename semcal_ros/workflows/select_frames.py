@@ -10,14 +10,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from semcal_ros.cli.common import progress
-from semcal_ros.cli.drift_common import Follower, camera_of, start_time_s, timing_seen
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, Recording
+from semcal_ros.workflows.follow_drift import Follower, camera_of, start_time_s, timing_seen
 
 __all__ = ["Job", "Survey", "surveyed"]
 
@@ -101,7 +100,12 @@ class Survey:
 
 
 def surveyed(
-    opened: Recording, job: Job, *, on_first: Callable[[RecordedFrame], None], levels: bool
+    opened: Recording,
+    job: Job,
+    *,
+    on_first: Callable[[RecordedFrame], None],
+    levels: bool,
+    on_frame: Callable[[], object] = lambda: None,
 ) -> Survey:
     """Read a recording for the first time: choose its frames and track their drift.
 
@@ -118,6 +122,8 @@ def surveyed(
         Called with the first chosen frame, to refuse it before any work is done.
     levels
         Whether black and white are wanted.
+    on_frame
+        Called after each frame that was read, to show progress.
 
     Raises
     ------
@@ -125,40 +131,43 @@ def surveyed(
         There are several magnifications and none is chosen, the chosen one is not there, or time
         runs backwards.
     """
-    survey = _surveyed_once(opened, job, on_first, levels)
+    survey = _surveyed_once(opened, job, on_first, levels, on_frame)
     if job.follower is None:
         return survey
     microscope, note = timing_seen(job.microscope, job.follower, job.model)
     if microscope is not job.microscope:
         again = replace(job, microscope=microscope, follower=Follower())
-        survey = _surveyed_once(opened, again, on_first, levels)
+        survey = _surveyed_once(opened, again, on_first, levels, on_frame)
     survey.timing_note = note
     return survey
 
 
 def _surveyed_once(
-    opened: Recording, job: Job, on_first: Callable[[RecordedFrame], None], levels: bool
+    opened: Recording,
+    job: Job,
+    on_first: Callable[[RecordedFrame], None],
+    levels: bool,
+    on_frame: Callable[[], object],
 ) -> Survey:
     counts: Counter[str] = Counter()
     wanted = None if job.at is None else _label(job.at)
     survey: Survey | None = None
     kind: tuple[object, ...] = ()
-    with progress(opened.frame_count, "drift" if job.follower else "reading") as bar:
-        for index, frame in enumerate(opened.frames()):
-            bar.update(1)
-            label = _label(frame.magnification)
-            counts[label] += 1
-            if label != (wanted or label) or (wanted is None and len(counts) > 1):
-                continue  # to be refused, or of no interest: only the magnification matters
-            if survey is None:
-                on_first(frame)
-                survey, kind = _begun(frame, job), _kind(frame)
-            if _kind(frame) != kind:
-                survey.other_kind += 1
-                continue
-            _add(survey, index, frame, job)
-            if levels:
-                survey.levels.append(_black_white(frame))
+    for index, frame in enumerate(opened.frames()):
+        on_frame()
+        label = _label(frame.magnification)
+        counts[label] += 1
+        if label != (wanted or label) or (wanted is None and len(counts) > 1):
+            continue  # to be refused, or of no interest: only the magnification matters
+        if survey is None:
+            on_first(frame)
+            survey, kind = _begun(frame, job), _kind(frame)
+        if _kind(frame) != kind:
+            survey.other_kind += 1
+            continue
+        _add(survey, index, frame, job)
+        if levels:
+            survey.levels.append(_black_white(frame))
     if survey is None or (wanted is None and len(counts) > 1):
         _refuse_magnifications(opened, job, counts)
     return survey

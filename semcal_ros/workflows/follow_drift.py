@@ -1,0 +1,159 @@
+"""The drift of a recording, frame by frame and with hindsight."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
+from semcal_ros.core.drift.frame_time import LEFT_IN, REMOVED, estimate_frame_time
+from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.files.calibration_file import Calibration
+from semcal_ros.files.recordings import RecordedFrame
+
+__all__ = [
+    "GIVE_FRAME_TIME",
+    "Follower",
+    "camera_of",
+    "start_time_s",
+    "timing_seen",
+    "with_frame_time",
+]
+
+#: What a user can do about a timing that is not configured.
+GIVE_FRAME_TIME = "give the time of one pass as --frame-time or in a configuration"
+
+
+# Drift from frame to frame from which on its shear within them could matter, px.
+_FAST_PX = 0.5
+
+
+def camera_of(
+    frame: RecordedFrame, model: Calibration | None, config: MicroscopeConfig
+) -> ScanCamera:
+    """The calibrated camera of a frame, or the nominal one of the display width."""
+    height, width = frame.image.shape[:2]
+    if model is None:
+        return ScanCamera.nominal(frame.magnification, width, height, config.display_width_m)
+    return model.at(frame.magnification).resized(width, height)
+
+
+def start_time_s(frame: RecordedFrame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
+    """Start of the acquisition in seconds after the first frame's stamp."""
+    return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
+
+
+def with_frame_time(config: MicroscopeConfig, frame_time_s: float | None) -> MicroscopeConfig:
+    """The configuration with the time of one pass that ``--frame-time`` gives, if any.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no finite positive number.
+    """
+    if frame_time_s is None:
+        return config
+    if config.scan is None:
+        return replace(config, scan=ScanTiming(frame_time_s))
+    return replace(config, scan=replace(config.scan, frame_time_s=frame_time_s))
+
+
+class Follower:
+    """Tracks the drift of a recording and looks at it once more with hindsight.
+
+    Parameters
+    ----------
+    hindsight
+        Whether to keep what that takes; without it there is only the drift of now.
+    """
+
+    def __init__(self, *, hindsight: bool = True) -> None:
+        self.history = DriftHistory() if hindsight else None
+        self.tracker = DriftTracker(history=self.history)
+        self.updates: list[DriftUpdate] = []
+        self._smoothed: DriftPath | None = None
+
+    def update(
+        self, frame: RecordedFrame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
+    ) -> DriftUpdate:
+        """Drift at the next frame."""
+        update = self.tracker.update(frame.image, time_s, camera, scan)
+        if self.history is not None:
+            self.updates.append(update)
+        return update
+
+    def path(self, *, live: bool) -> DriftPath:
+        """Drift of all frames.
+
+        Parameters
+        ----------
+        live
+            What was known at each frame when it came, without hindsight.
+        """
+        if live or self.history is None:
+            return path_of_updates(self.updates)
+        if self._smoothed is None or len(self._smoothed) != len(self.updates):
+            self._smoothed = self.history.smooth()
+        return self._smoothed
+
+
+def timing_seen(
+    config: MicroscopeConfig, follower: Follower, model: Calibration | None
+) -> tuple[MicroscopeConfig, str]:
+    """What drift tells of a raster whose timing is not configured.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    follower
+        Has tracked the recording with it.
+    model
+        Calibration, or None where distortion was left in.
+
+    Returns
+    -------
+    tuple
+        The configuration, with ``scan`` where that could be seen; a note for the user, empty where
+        there is nothing to tell.
+    """
+    if config.scan is not None or len(follower.updates) < 2:
+        return config, ""
+    path = follower.path(live=False)
+    shear_of_shift = LEFT_IN if model is None else REMOVED
+    found = estimate_frame_time(path, follower.updates, shear_of_shift=shear_of_shift)
+    if found.observable:
+        seen = _with_sigma(found.frame_time_s, found.sigma_s)
+        note = f"the configuration has no scan; the frames are sheared as if one pass took {seen} s"
+        return replace(config, scan=ScanTiming(found.frame_time_s)), note
+    step_px = _largest_step_px(follower.updates)
+    if not step_px > _FAST_PX:
+        return config, ""
+    return config, (
+        f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may "
+        f"shear the frames, too; {GIVE_FRAME_TIME}"
+    )
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """With as many decimals as one digit of the uncertainty has."""
+    digits = int(np.clip(-np.floor(np.log10(sigma)), 0, 9)) if sigma > 0.0 else 3
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}"
+
+
+def _largest_step_px(updates: Sequence[DriftUpdate]) -> float:
+    """Drift from one frame to the next in px of it, but for a tenth of the frames."""
+    pairs = [
+        (before, now)
+        for before, now in itertools.pairwise(updates)
+        if before.accepted and now.accepted
+    ]
+    steps = [np.hypot(*(b.px_from_unit @ (b.drift_m - a.drift_m))) for a, b in pairs]
+    return float(np.quantile(steps, 0.9)) if steps else 0.0
