@@ -22,10 +22,10 @@ from semcal_ros.nodes.common.qos import overridable, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.common.services import service_queue
 
-__all__ = ["BagPlayer", "Pacer", "main"]
+__all__ = ["BagPlayer", "main"]
 
 
-class Pacer:
+class _Pacer:
     """Position in a recording that advances with a wall clock, which is an argument.
 
     Parameters
@@ -105,7 +105,7 @@ class BagPlayer(SemNode):
         self._clock_publisher = (
             self.create_publisher(ClockMessage, "/clock", 10) if self.settings["clock"] else None
         )
-        self._pacer = Pacer(self.settings["rate"], paused=self.settings["start_paused"])
+        self._pacer = _Pacer(self.settings["rate"], paused=self.settings["start_paused"])
         # Shutting the context down from the replay's own thread would make that thread wait for itself.
         self._end = self.create_guard_condition(self._leave)
         self.settings.on_change("rate", self._set_rate)

@@ -270,7 +270,7 @@ class _Declared(Exception):
 
 def _settings(executable: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The settings that a node declares, by name; the node itself is not started."""
-    from semcal_ros.nodes import base
+    from semcal_ros.nodes.common import base
 
     found: dict[str, Any] = {}
 

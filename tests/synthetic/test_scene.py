@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import semcal_ros.synthetic as synthetic
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -329,22 +326,3 @@ def test_a_frame_during_a_change_of_magnification_shows_both() -> None:
     np.testing.assert_array_equal(whole.image, after)
     with pytest.raises(InvalidValueError, match="before"):
         scene.set_magnification(3000.0, 1.0)
-
-
-# -- layering -------------------------------------------------------------------------------------
-
-
-def test_synthetic_needs_core_and_numerics_only() -> None:
-    allowed = {"numpy", "scipy", "cv2", "math", "dataclasses", "collections", "functools"}
-    allowed |= {"types", "typing", "__future__"}
-    for path in Path(synthetic.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                assert node.level == 0, path.name
-                names = [node.module or ""]
-            for name in names:
-                project = name.startswith(("semcal_ros.core", "semcal_ros.synthetic"))
-                assert project or name.split(".")[0] in allowed, f"{path.name} imports {name}"
