@@ -1,11 +1,35 @@
-"""The array types of the method."""
+"""Array types of the method, and the few operations on arrays that every room needs.
+
+The unknowns of an adjustment have units that differ by many orders of magnitude (metres beside
+pixels beside radians), so that its normal matrix must be scaled before it is solved or inverted;
+otherwise rounding decides. Scaling a symmetric positive definite matrix to ones on its diagonal
+comes within a factor of its size of the best condition that any diagonal scaling reaches
+(van der Sluis 1969, doi:10.1007/BF02165096).
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Collection
 
-__all__ = ["AnyImage", "Array", "Array32", "Image", "Indices", "Mask"]
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "RESAMPLED_TYPES",
+    "AnyImage",
+    "Array",
+    "Array32",
+    "Image",
+    "Indices",
+    "Mask",
+    "check_image",
+    "equilibrate",
+    "invert_scaled",
+    "mad_sigma",
+    "solve_scaled",
+]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -15,3 +39,138 @@ Indices = NDArray[np.intp]
 Image = NDArray[np.float32]
 #: Pixels of any depth, (h, w) or (h, w, 3).
 AnyImage = NDArray[np.generic]
+
+#: Types of pixels that OpenCV resamples without a conversion.
+RESAMPLED_TYPES = ("uint8", "uint16", "float32")
+
+# Standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
+_SIGMAS_PER_MAD = 1.4826
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+def equilibrate(matrix: Array) -> tuple[Array, Array]:
+    """Scale symmetric matrices to ones on the diagonal.
+
+    Parameters
+    ----------
+    matrix
+        (..., n, n) symmetric, with a diagonal that is not negative.
+
+    Returns
+    -------
+    The scaled matrices ``scale[i] * matrix[i, j] * scale[j]``, (..., n, n), and ``scale``,
+    (..., n). A row whose diagonal is zero stays zero.
+    """
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, _TINY))
+    return matrix * (scale[..., :, None] * scale[..., None, :]), scale
+
+
+def solve_scaled(matrix: Array, right: Array, damping: float = 0.0) -> Array:
+    """Solve positive definite systems whose unknowns have very different units.
+
+    Parameters
+    ----------
+    matrix
+        (..., n, n) symmetric.
+    right
+        (..., n), or (n, k) for several right-hand sides of one matrix.
+    damping
+        Added to the ones on the diagonal of the scaled matrix (Marquardt's damping).
+
+    Returns
+    -------
+    The solution in the shape of ``right``.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a matrix is singular.
+    """
+    scaled, scale = equilibrate(matrix)
+    if damping:
+        diagonal = np.arange(scale.shape[-1])
+        scaled[..., diagonal, diagonal] += damping
+    if right.ndim == matrix.ndim:
+        return scale[..., None] * np.linalg.solve(scaled, scale[..., None] * right)
+    return scale * np.linalg.solve(scaled, (scale * right)[..., None])[..., 0]
+
+
+def invert_scaled(matrix: Array, rcond: float | None = None) -> Array:
+    """Invert a symmetric matrix whose rows have very different units.
+
+    Parameters
+    ----------
+    matrix
+        (..., n, n) symmetric, with a diagonal that is not negative.
+    rcond
+        With a value, the pseudo-inverse of the scaled matrix: directions whose eigenvalue is below
+        this fraction of the largest one are left out instead of being inverted.
+
+    Returns
+    -------
+    The inverse, (..., n, n).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Without ``rcond``, if a matrix is singular.
+    """
+    scaled, scale = equilibrate(matrix)
+    if rcond is None:
+        inverse = np.linalg.inv(scaled)
+    else:
+        inverse = np.linalg.pinv(scaled, rcond=rcond, hermitian=True)
+    return inverse * (scale[..., :, None] * scale[..., None, :])
+
+
+def mad_sigma(deviations: ArrayLike) -> float:
+    """1-sigma of normally distributed deviations, from their median absolute value.
+
+    Up to half of the values may be outliers. Where the centre is not known to be zero, subtract the
+    median first.
+    """
+    return _SIGMAS_PER_MAD * float(np.median(np.abs(deviations)))
+
+
+def check_image(
+    image: ArrayLike,
+    *,
+    channels: Collection[int] = (1, 3),
+    types: Collection[str] | None = None,
+    least_side: int = 1,
+    do: str = "",
+) -> AnyImage:
+    """The image as an array, if it is one.
+
+    Parameters
+    ----------
+    image
+        (h, w), or (h, w, 3).
+    channels
+        Numbers of channels that are allowed: 1, 3 or both.
+    types
+        Names of the allowed types of pixels; None for all integers and floats.
+    least_side
+        Height and width must be at least this, px.
+    do
+        The next step for the user, for the error.
+
+    Raises
+    ------
+    InvalidValueError
+        For any other shape or type.
+    """
+    pixels = np.asarray(image)
+    count = 1 if pixels.ndim == 2 else pixels.shape[2] if pixels.ndim == 3 else 0
+    fits = count in channels and (pixels.ndim == 2 or count == 3)
+    known = pixels.dtype.kind in "uif" if types is None else pixels.dtype.name in types
+    if fits and known and min(pixels.shape[:2]) >= least_side:
+        return pixels
+    shapes = " or ".join({1: "(h, w)", 3: "(h, w, 3)"}[n] for n in sorted(channels))
+    size = f", at least {least_side} x {least_side} px" if least_side > 1 else ""
+    raise InvalidValueError(
+        f"an image of shape {pixels.shape} and type {pixels.dtype}",
+        expected=f"{shapes} of {'integers or floats' if types is None else ', '.join(types)}{size}",
+        do=do,
+    )

@@ -6,6 +6,10 @@ Programs catch :class:`SemcalError`; the command line prints ``str(error)`` and 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
 __all__ = [
     "BagError",
     "CalibrationError",
@@ -13,10 +17,33 @@ __all__ = [
     "ConfigError",
     "InvalidValueError",
     "MessageError",
+    "Rejection",
     "SemcalError",
     "StructureError",
     "TiffError",
 ]
+
+
+Status = TypeVar("Status", bound=Enum)
+
+
+@dataclass(frozen=True)
+class Rejection(Generic[Status]):
+    """Why data were not used: the answer for data that nothing is wrong with but their contents.
+
+    Misuse raises an error; an image without a grid, or a shift that cannot be believed, is an
+    answer like any other.
+
+    Attributes
+    ----------
+    status
+        What kind of reason it is. Programs decide by this.
+    reason
+        The reason in words, with its numbers, for people.
+    """
+
+    status: Status
+    reason: str
 
 
 class SemcalError(Exception):
