@@ -26,7 +26,7 @@ from semcal_ros.synthetic import (
     drift_preset,
     preset,
 )
-from semcal_ros.workflows.calibrate import CollectedViews, collect_views, find_views, named_frames
+from semcal_ros.workflows.find_grid import CollectedViews, collect_views, find_views, named_frames
 
 PixelSize = tuple[float, float]
 

@@ -38,7 +38,8 @@ from semcal_ros.synthetic import (
     calibration_plan,
     preset,
 )
-from semcal_ros.workflows.calibrate import calibrate_found, find_views
+from semcal_ros.workflows.calibrate import calibrate_found
+from semcal_ros.workflows.find_grid import find_views
 
 CONTINUOUS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0, 7500.0, 10000.0)
 DISCRETE = (500.0, 1000.0, 2000.0, 5000.0)

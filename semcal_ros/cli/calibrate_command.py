@@ -16,12 +16,8 @@ from semcal_ros.cli.common import (
 )
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.workflows.calibrate import (
-    RecordingCalibration,
-    calibrate_found,
-    find_views,
-    named_frames,
-)
+from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_found
+from semcal_ros.workflows.find_grid import find_views, named_frames
 
 __all__ = ["command"]
 
@@ -87,9 +83,7 @@ def command(
     microscope = configured(config)
     with open_recording(recording, microscope, magnification=magnification) as opened:
         with progress(opened.frame_count, "finding corners") as bar:
-            found, rejected = find_views(
-                named_frames(opened), on_progress=lambda n: bar.update(n) and None
-            )
+            found, rejected = find_views(named_frames(opened), on_progress=bar.update)
         notes = opened.notes
     with progress(None, "adjusting"):
         done = calibrate_found(

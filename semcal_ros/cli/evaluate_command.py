@@ -20,7 +20,7 @@ from semcal_ros.cli.common import (
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.workflows.calibrate import collect_views, find_views, named_frames
+from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 
 __all__ = ["command"]
 
@@ -51,9 +51,7 @@ def command(
         open_recording(recording, microscope, magnification=magnification) as opened,
         progress(opened.frame_count, "finding corners") as bar,
     ):
-        found, rejected = find_views(
-            named_frames(opened), on_progress=lambda n: bar.update(n) and None
-        )
+        found, rejected = find_views(named_frames(opened), on_progress=bar.update)
     collected = collect_views(
         found,
         rejected,

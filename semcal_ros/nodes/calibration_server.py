@@ -27,7 +27,7 @@ from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_process import CalibrationProcess
 from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, Stage, without_images
-from semcal_ros.workflows.calibrate import FoundView
+from semcal_ros.workflows.find_grid import FoundView
 
 __all__ = ["CalibrationServer", "main"]
 

@@ -11,7 +11,8 @@ import pytest
 from semcal_ros import Calibration, calibrate
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import Detector, calibration_plan, preset
-from semcal_ros.workflows.calibrate import calibrate_found, find_views
+from semcal_ros.workflows.calibrate import calibrate_found
+from semcal_ros.workflows.find_grid import find_views
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 PLAN = calibration_plan(

@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from semcal_ros.core.errors import CalibrationError, SemcalError
-from semcal_ros.workflows.calibrate import FoundView, calibrate_found
+from semcal_ros.workflows.calibrate import calibrate_found
+from semcal_ros.workflows.find_grid import FoundView
 
 __all__ = ["CalibrationJob", "JobResult", "Stage", "serve", "without_images"]
 
