@@ -55,18 +55,12 @@ exec "$python" "$0" "$@"
 '''
 import sys
 
-from semcal_ros.nodes.{node} import main
+# Processes that a node starts run this file again, under another name; they need no ROS.
+if __name__ == "__main__":
+    from semcal_ros.nodes.{node} import main
 
-sys.exit(main())
+    sys.exit(main())
 """
-
-# ament finds packages by this variable alone; a ROS installation's setup script would set it.
-AMENT_PTH = (
-    "import os, sys; "
-    "_v = os.environ.get('AMENT_PREFIX_PATH', ''); "
-    "sys.prefix in _v.split(os.pathsep) or os.environ.update("
-    "AMENT_PREFIX_PATH=os.pathsep.join(filter(None, (sys.prefix, _v))))\n"
-)
 
 
 class InstallData(install_data):
@@ -80,16 +74,10 @@ class InstallData(install_data):
         folder = data / "lib" / NAME
         folder.mkdir(parents=True, exist_ok=True)
         for node in NODES:
-            self._write(folder / node, LAUNCHER.format(node=node), 0o755)
-        # A wheel keeps the files for site-packages in "purelib" beside "data".
-        purelib = data.parent / "purelib"
-        purelib.mkdir(exist_ok=True)
-        self._write(purelib / f"{NAME}_ament.pth", AMENT_PTH, 0o644)
-
-    def _write(self, path: Path, text: str, mode: int) -> None:
-        path.write_text(text, encoding="ascii")
-        path.chmod(mode)
-        self.outfiles.append(str(path))
+            path = folder / node
+            path.write_text(LAUNCHER.format(node=node), encoding="ascii")
+            path.chmod(0o755)
+            self.outfiles.append(str(path))
 
 
 class WithData(Distribution):

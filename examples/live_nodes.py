@@ -10,6 +10,8 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
 
+from semcal_ros.middleware.ament_prefix import add_environment_prefix
+
 END_S = 60.0
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 MALLOC_VARIABLES = (
@@ -25,6 +27,7 @@ class LiveNodes:
         # A domain of its own, so that an example neither hears nor disturbs anybody else's robots.
         os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        add_environment_prefix()
         prefix = Path(get_package_prefix("semcal_ros"))
         profile = str(prefix / "share" / "semcal_ros" / "dds" / "fastdds_large_images.xml")
         # Shared memory for whole images, and memory that is used again. A profile of the user's own stays.

@@ -9,6 +9,7 @@ import click
 
 import semcal_ros
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.middleware.ament_prefix import add_environment_prefix
 
 __all__ = ["main"]
 
@@ -68,6 +69,7 @@ def _semcal() -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command; returns its exit status (0, or 2 for bad input)."""
+    add_environment_prefix()
     given = sys.argv[1:] if args is None else args
     try:
         _semcal(args=given or ["--help"], prog_name="semcal", standalone_mode=False)

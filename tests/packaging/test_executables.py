@@ -110,21 +110,44 @@ def test_nothing_else_is_in_the_executables_folder() -> None:
     assert found - {"semcal"} == set(NODES)
 
 
-def test_the_index_is_found_without_any_environment() -> None:
-    """A plain shell, as after a login: nothing is set but PATH."""
+FIND = "from ament_index_python import get_package_prefix as p; print(p('semcal_ros'))"
+COMMAND = f"from semcal_ros.cli import main; main(['at', '--help']); {FIND}"
+NODE = f"""
+from semcal_ros.nodes.common.run import run_node
+def factory():
+    {FIND}
+run_node(factory, [])
+"""
+
+
+@pytest.mark.parametrize("program", [COMMAND, NODE], ids=["command", "node"])
+def test_commands_and_executables_find_the_index_in_a_plain_shell(
+    program: str, tmp_path: Path
+) -> None:
+    """As after a login: only PATH and HOME are set."""
+    source = str(Path(__file__).resolve().parents[2])
     done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "from ament_index_python import get_package_prefix as p; print(p('semcal_ros'))",
-        ],
+        [sys.executable, "-c", program],
+        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "PYTHONPATH": source},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stdout.strip().endswith(get_package_prefix("semcal_ros")), done.stderr
+
+
+def test_other_programs_of_the_interpreter_are_left_alone() -> None:
+    """Nothing of the suite runs when the interpreter starts."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.environ.get('AMENT_PREFIX_PATH'))"],
         env={"PATH": "/usr/bin:/bin"},
         capture_output=True,
         text=True,
         check=False,
         timeout=60,
     )
-    assert done.stdout.strip() == get_package_prefix("semcal_ros"), done.stderr
+    assert done.stdout.strip() == "None", done.stderr
 
 
 def test_semcal_is_a_command_of_the_environment() -> None:

@@ -32,7 +32,7 @@ MAY_IMPORT = {
     },
     "doctor": {"core", "config", "middleware", "bridge", "files"},
     "cli": {
-        *("core", "applications", "synthetic", "config", "bridge"),
+        *("core", "applications", "synthetic", "config", "middleware", "bridge"),
         *("files", "report", "workflows", "nodes", "doctor"),
     },
 }

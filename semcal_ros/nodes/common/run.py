@@ -27,6 +27,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import uninstall_signal_handlers
 
 from semcal_ros.core.errors import ConfigError, SemcalError
+from semcal_ros.middleware.ament_prefix import add_environment_prefix
 from semcal_ros.middleware.security import check_security
 
 __all__ = ["DeferredSignals", "run_node"]
@@ -88,6 +89,7 @@ def run_node(
     Exit status: 0, or 2 after one line on stderr if the node cannot start with what it was given.
     """
     sys.setswitchinterval(_SWITCH_S)
+    add_environment_prefix()
     try:
         try:
             check_security()
