@@ -41,7 +41,7 @@ test: lint ## everything that is checked: style, types, tests
 	@$(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal $(PYTEST_ARGS) tests
 
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
-	@$(VENV_PYTHON) examples/demo.py
+	@$(VENV_PYTHON) -m examples.demo
 
 # Where what they compare with cannot be installed, the tables say so.
 bench: setup ## the benchmarks, as a table (installs what they compare with into .venv)

@@ -4,27 +4,28 @@
     python benchmarks/run.py --quick          smaller and fewer
     python benchmarks/run.py drift rectify    only these parts
 
-========================  ==========================================================================
-calibration.py            calibration methods (joint with and without residual field, the paper's,
-                          interpolations of separate calibrations, cv2.calibrateCamera) on five
-                          simulated microscopes and the reference recordings, judged at magnifications
-                          that none of them saw; the corner finder beside OpenCV's
-drift.py                  registration beside phase correlation, ECC, scikit-image, imreg_dft and
-                          pystackreg where they are installed, and the Cramer-Rao bound; the time of
-                          the tracker, and what it leaves of a drift inside of the frames
-drift_soak.py             20 000 frames out and back (not among these: run it by itself)
-coverage.py               how often the stated uncertainty of a calibration holds the truth
-rectify.py                rectification beside a bare cv2.remap; its map beside the exact inverse
-live.py                   one frame through core and node, and the stream over DDS, beside a bare
-                          remap and copy (its parts: live_callback.py, live_stream.py)
-========================  ==========================================================================
+===========  =======================================================================================
+calibration  calibration methods (joint with and without residual field, the paper's, interpolations
+             of separate calibrations, cv2.calibrateCamera) on five simulated microscopes and the
+             reference recordings, judged at magnifications that none of them saw; the corner finder
+             beside OpenCV's
+coverage     how often the stated uncertainty of a calibration holds the truth
+drift        registration beside phase correlation, ECC, scikit-image, imreg_dft and pystackreg
+             where they are installed, and the Cramer-Rao bound; the time of the tracker, and what
+             it leaves of a drift inside of the frames
+rectify      rectification beside a bare cv2.remap; its map beside the exact inverse
+live         one frame through core and node, and the stream over DDS, beside a bare remap and copy
+===========  =======================================================================================
 
-Everything but one column is measured on simulated data whose truth is known, with fixed seeds. Accuracy is in px
-and stands beside a bound wherever there is one. A time is the ratio
-of two medians, taken turn by turn in one run, so that it means something on another machine or on a
-busy one. Ratios of a few percent are still chance. Nothing here passes or fails.
+Not among these: ``python -m benchmarks.drift.soak``, 20 000 frames out and back.
 
-Each part runs in a process of its own and can be started alone: python benchmarks/drift.py --quick
+Everything but one column is measured on simulated data whose truth is known, with fixed seeds.
+Accuracy is in px and stands beside a bound wherever there is one. A time is the ratio of two
+medians, taken turn by turn in one run, so that it means something on another machine or on a busy
+one. Ratios of a few percent are still chance. Nothing here passes or fails.
+
+Each part runs in a process of its own and can be started alone from the root of the repository:
+``python -m benchmarks.drift --quick``.
 """
 
 from __future__ import annotations
@@ -41,7 +42,14 @@ import cv2
 import numpy as np
 import scipy
 
-PARTS = ("calibration", "coverage", "drift", "rectify", "live")
+ROOT = Path(__file__).resolve().parents[1]
+PARTS = {
+    "calibration": "benchmarks.calibration",
+    "coverage": "benchmarks.calibration.coverage",
+    "drift": "benchmarks.drift",
+    "rectify": "benchmarks.rectification",
+    "live": "benchmarks.live",
+}
 
 
 def main() -> int:
@@ -62,8 +70,8 @@ def main() -> int:
     failed = []
     for part in options.parts or PARTS:
         start = time.monotonic()
-        command = [sys.executable, str(Path(__file__).with_name(f"{part}.py"))]
-        done = subprocess.run(command + ["--quick"] * options.quick, check=False)
+        command = [sys.executable, "-m", PARTS[part], *(["--quick"] if options.quick else [])]
+        done = subprocess.run(command, cwd=ROOT, check=False)
         if done.returncode:
             failed.append(part)
         print(f"[{part}: {time.monotonic() - start:.0f} s]", flush=True)

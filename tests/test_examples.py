@@ -16,19 +16,19 @@ from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 # They make their recordings and calibrations themselves.
 pytestmark = pytest.mark.timeout(400)
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def ran(name: str, *arguments: object) -> str:
     """What an example prints."""
-    command = [sys.executable, str(EXAMPLES / name), "--quick", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", f"examples.{name}", "--quick", *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def test_cantilever(tmp_path: Path) -> None:
-    printed = ran("cantilever.py", "--only", "whole", "--output", tmp_path / "out")
+    printed = ran("cantilever", "--only", "whole", "--output", tmp_path / "out")
     out = tmp_path / "out" / "whole"
     truth = json.loads((out / "bending" / "truth.json").read_text())["frames"]
     with (out / "bending.csv").open(encoding="utf-8") as file:
@@ -49,7 +49,7 @@ def test_cantilever(tmp_path: Path) -> None:
 
 def test_nano_ball(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ran("nano_ball.py", "--output", out)
+    ran("nano_ball", "--output", out)
     result = json.loads((out / "summary.json").read_text())
     # As asked of the whole example.
     assert result["points_on_ball"] >= 264
@@ -63,7 +63,7 @@ def test_nano_ball(tmp_path: Path) -> None:
 
 def test_visual_servo(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ran("visual_servo.py", "--output", out)
+    ran("visual_servo", "--output", out)
     results = json.loads((out / "results.json").read_text())
     final = {name: result["final_true_px"] for name, result in results.items()}
     # Two steps of the magnification are too few to learn the axis well; what they leave is under a pixel.
@@ -74,7 +74,7 @@ def test_visual_servo(tmp_path: Path) -> None:
 
 def test_visual_servo_on_a_replay(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ran("visual_servo.py", "--replay", "--output", out)
+    ran("visual_servo", "--replay", "--output", out)
     rows = json.loads((out / "replay.json").read_text())
     assert [row["magnification"] for row in rows] == [500.0, 1600.0, 5000.0]
     # The first frame has none before it, and on a busy machine late frames are passed over.

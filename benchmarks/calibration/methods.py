@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from calibration_opencv import OpenCv
-from calibration_views import HEIGHT_SIGMA_M, Array, Case, PixelSize
 from numpy.polynomial import Polynomial
 from scipy.interpolate import PchipInterpolator
 
+from benchmarks.calibration.cases import HEIGHT_SIGMA_M, Array, Case, PixelSize
+from benchmarks.calibration.opencv import OpenCv
 from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import fit_poses

@@ -1,7 +1,7 @@
 """A stream through stream_corrector over DDS: publisher, node and subscriber in processes of their own.
 
-    python benchmarks/live_stream.py 512 200 --seconds 600
-    python benchmarks/live_stream.py 4096 10 --seconds 600
+    python -m benchmarks.live.stream 512 200 --seconds 600
+    python -m benchmarks.live.stream 4096 10 --seconds 600
 
 Latency is from the moment before a frame is published to the moment at which its corrected image is
 in the hands of a Python subscriber. A frame counts as lost on the way where its number in the
@@ -27,9 +27,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from live_scenes import Config, calibration, pictures
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+from benchmarks.live.scenes import Config, calibration, pictures
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 PROFILE = REPOSITORY / "dds" / "fastdds_large_images.xml"
 DDS_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 # As the comment in the profile recommends: large buffers are reused instead of faulted in anew.
@@ -207,9 +208,12 @@ def process(role: str, plan: Plan, folder: Path, environment: dict[str, str]) ->
         for key, value in given.items():
             command += ["-p", f"{key}:={value}"]
     else:
-        command = [sys.executable, __file__, "--role", role, json.dumps(asdict(plan))]
+        command = [sys.executable, "-m", "benchmarks.live.stream"]
+        command += ["--role", role, json.dumps(asdict(plan))]
     with open(output, "wb") as stream, open(folder / f"{role}.err", "wb") as errors:
-        made = subprocess.Popen(command, stdout=stream, stderr=errors, env=environment)
+        made = subprocess.Popen(
+            command, cwd=REPOSITORY, stdout=stream, stderr=errors, env=environment
+        )
     try:
         yield made
     finally:

@@ -6,7 +6,7 @@
    scale of the display, with the interpolated calibration, and with the continuous one.
 3. What is judged is where the target really is.
 
-    python examples/visual_servo.py [--quick] [--live | --replay] [--preset jsm820] [--drift slow] [--fixed-axis]
+    python -m examples.visual_servo [--quick] [--live | --replay] [--preset jsm820] [--drift slow] [--fixed-axis]
 
 With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
 With --replay the frames of the continuous case become a recording, which bag_player replays to the nodes: what
@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
-from visual_servo_loop import Case, Run, Task, servo_run
 
+from examples.visual_servo.loop import Case, Run, Task, servo_run
 from semcal_ros import Calibration
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -164,7 +164,7 @@ def main() -> int:
     print(f"calibrated {options.preset} ({time.monotonic() - began:.0f} s)", flush=True)
     continuous.save(options.output / "cal.yaml")
     if options.live:
-        from visual_servo_live import live
+        from examples.visual_servo.live import live
 
         magnifications = [g for g, _ in schedule(options.quick)]
         chosen = options.preset, options.drift, options.seed
@@ -174,7 +174,7 @@ def main() -> int:
     settings = ServoSettings(axis_sigma_px=0.0) if options.fixed_axis else ServoSettings()
     task = Task(scope, START, GOAL, schedule(options.quick), options.drift, options.seed, settings)
     if options.replay:
-        from visual_servo_replay import replayed
+        from examples.visual_servo.replay import replayed
 
         run = servo_run(task, cases_of(scope, continuous, discrete)[-1])
         replayed(options.output, run, scope, GOAL, options.rate)
@@ -191,7 +191,7 @@ def main() -> int:
         f"the continuous calibration itself knows that place at 5000x to {sigma.max():.2f} px (1 sigma)"
     )
     (options.output / "results.json").write_text(json.dumps(results, indent=1))
-    from visual_servo_picture import picture
+    from examples.visual_servo.picture import picture
 
     picture(options.output / "visual_servo.png", runs)
     print(

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from drift_methods import METHODS, Answer, Method
-from drift_truth import Pair
+
+from benchmarks.drift.methods import METHODS, Answer, Method
+from benchmarks.drift.pairs import Pair
 
 # Farther off than this is no measurement but another place.
 WRONG_PX = 1.0

@@ -4,8 +4,8 @@ After section 4.4 of Malti et al. (2012). The virtual SEM records the chess grid
 calibrated, the ball is reconstructed with that calibration and compared with the truth, which nothing before has
 seen.
 
-    .venv/bin/python examples/nano_ball.py            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
-    .venv/bin/python examples/nano_ball.py --quick    # 120 frames
+    .venv/bin/python -m examples.nano_ball            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
+    .venv/bin/python -m examples.nano_ball --quick    # 120 frames
 """
 
 from __future__ import annotations

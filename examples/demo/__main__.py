@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from demo_picture import overview
-from live_suite import LiveSuite, Received
 
+from examples.demo.live_suite import LiveSuite, Received
+from examples.demo.overview import overview
 from semcal_ros import Calibration
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView

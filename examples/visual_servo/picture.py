@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from visual_servo_loop import Run
+
+from examples.visual_servo.loop import Run
 
 COLOURS = {"uncalibrated": "C3", "interpolated": "C1", "continuous": "C0"}
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from calibration_views import Array, lattice
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from table import interleaved, show
 
+from benchmarks.calibration.cases import Array, lattice
+from benchmarks.table import interleaved, show
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.synthetic import calibration_plan, preset
 

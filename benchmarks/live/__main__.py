@@ -1,6 +1,6 @@
 """One frame from message to message, and the stream over DDS, beside the least that must be done.
 
-live_callback.py measures what happens inside of a process, live_stream.py what three processes see
+callback.py measures what happens inside of a process, stream.py what three processes see
 of each other; this makes one table and a plot of both.
 """
 
@@ -13,12 +13,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-from live_callback import COLUMNS
-from live_stream import DDS_VARIABLES, MALLOC
-from table import show
+from benchmarks.live.callback import COLUMNS
+from benchmarks.live.stream import DDS_VARIABLES, MALLOC
+from benchmarks.table import show
 
-HERE = Path(__file__).resolve().parent
-PLOT = HERE.parent / "bench_output" / "live.png"
+REPOSITORY = Path(__file__).resolve().parents[2]
+PLOT = REPOSITORY / "bench_output" / "live.png"
 SIZES = (512, 1024, 2048, 4096)
 # Frames per second over DDS, and seconds; so many that the busiest process has time to spare.
 RATES = {512: 60.0, 1024: 25.0, 2048: 8.0, 4096: 3.0}
@@ -26,13 +26,13 @@ SECONDS = 15.0
 
 
 def asked(command: list[str], extra: dict[str, str] | None = None) -> dict[str, object] | None:
-    """JSON that a script of this folder prints, or None if it fails."""
+    """JSON that a module of this folder prints, or None if it fails."""
     environment = {k: v for k, v in os.environ.items() if k not in (*DDS_VARIABLES, *MALLOC)}
     # As the nodes set it for themselves: small matrices do not want threads that wait in loops.
     environment |= {"OPENBLAS_NUM_THREADS": "1", **(extra or {})}
-    script, *rest = command
     done = subprocess.run(
-        [sys.executable, str(HERE / script), *rest],
+        [sys.executable, "-m", *command],
+        cwd=REPOSITORY,
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
@@ -45,7 +45,7 @@ def callbacks(sizes: tuple[int, ...], quick: bool) -> list[list[object]]:
     rows: list[list[object]] = []
     for size in sizes:
         for depth in (8, 16):
-            command = ["live_callback.py", str(size), str(depth)] + ["--quick"] * quick
+            command = ["benchmarks.live.callback", str(size), str(depth)] + ["--quick"] * quick
             found = asked(command, MALLOC) or {}
             floor = found.get("floor")
             in_ms = 1e3 * floor if isinstance(floor, float) else None
@@ -64,7 +64,7 @@ def streams(sizes: tuple[int, ...], floors: dict[int, float], quick: bool) -> li
     }
     for size in sizes:
         for name, options in variants.items():
-            command = ["live_stream.py", str(size), str(RATES[size]), "--seconds", seconds]
+            command = ["benchmarks.live.stream", str(size), str(RATES[size]), "--seconds", seconds]
             found = asked(command + options) or {}
 
             def times(key: str, found: dict = found, size: int = size) -> float | None:

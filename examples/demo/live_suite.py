@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from live_nodes import LiveNodes
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray
 
+from examples.live_nodes import LiveNodes
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 

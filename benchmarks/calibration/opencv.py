@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from calibration_views import Array, Case, PixelSize
 
+from benchmarks.calibration.cases import Array, Case, PixelSize
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.errors import CalibrationError
 

@@ -14,14 +14,14 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
-from live_nodes import LiveNodes
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
-from visual_servo_loop import Run
 
+from examples.live_nodes import LiveNodes
+from examples.visual_servo.loop import Run
 from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live_nodes import LiveNodes
 from rclpy.qos import QoSProfile
-from visual_servo_loop import LATENCY_S, Run
 
+from examples.live_nodes import LiveNodes
+from examples.visual_servo.loop import LATENCY_S, Run
 from semcal_ros.applications.servoing import PlanePose
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated

@@ -20,9 +20,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from live_scenes import CONFIG, calibration, pictures
-from table import interleaved
 
+from benchmarks.live.scenes import CONFIG, calibration, pictures
+from benchmarks.table import interleaved
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
 

@@ -201,7 +201,7 @@ def pixel_size_m(microscope: VirtualMicroscope, g: float) -> PixelSize:
 
 def reference_folder() -> Path:
     """Where the reference recordings are looked for."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
     return Path(os.environ.get("SEMCAL_REFERENCE_DATA") or beside)
 
 

@@ -7,8 +7,8 @@ from itertools import cycle
 
 import cv2
 import numpy as np
-from table import interleaved, quick_from_command_line, show
 
+from benchmarks.table import interleaved, quick_from_command_line, show
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.raw_positions import RasterDrift

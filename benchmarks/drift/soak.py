@@ -1,6 +1,6 @@
 """A long stream that drifts out and back: does the estimate wander, does the memory grow?
 
-    python benchmarks/drift_soak.py [--frames 20000]
+    python -m benchmarks.drift.soak [--frames 20000]
 
 A periodic random texture is shifted exactly, by the phase of its Fourier coefficients. The path
 leads out by 300 px of pictures that are 128 px wide, and back to where it began: over new ground,
@@ -14,8 +14,8 @@ import resource
 
 import numpy as np
 from numpy.typing import NDArray
-from table import show
 
+from benchmarks.table import show
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.tracker import DriftTracker
 

@@ -1,7 +1,7 @@
 """Registration of two noisy pictures beside other libraries and the Cramer-Rao bound.
 
 Gold on carbon, the chess grid, a fine random texture and a few bright particles, blurred by a beam of
-1 px sigma, are seen at exactly known shifts (drift_truth.py), given white noise and rounded to 8 or
+1 px sigma, are seen at exactly known shifts (pairs.py), given white noise and rounded to 8 or
 16 bits. Noise is stated in dB: 20 log10 of the picture's standard deviation over that of the noise.
 
 The bound is that of a shift between two pictures which both have noise, computed from the scene
@@ -17,15 +17,30 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import drift_raster
-import drift_scores
 import numpy as np
-from drift_methods import METHODS, PREDICTION_PX, UNIT, Answer, Method, phase_correlate_pictures
-from drift_scores import WRONG_PX, Score
-from drift_truth import KINDS, MAGNIFICATION, Pair, Scene, Views, large_shifts, small_shifts
-from live_scenes import pictures
-from table import interleaved, quick_from_command_line, show
 
+from benchmarks.drift import raster as drift_raster
+from benchmarks.drift import scores as drift_scores
+from benchmarks.drift.methods import (
+    METHODS,
+    PREDICTION_PX,
+    UNIT,
+    Answer,
+    Method,
+    phase_correlate_pictures,
+)
+from benchmarks.drift.pairs import (
+    KINDS,
+    MAGNIFICATION,
+    Pair,
+    Scene,
+    Views,
+    large_shifts,
+    small_shifts,
+)
+from benchmarks.drift.scores import WRONG_PX, Score
+from benchmarks.live.scenes import pictures
+from benchmarks.table import interleaved, quick_from_command_line, show
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.synthetic import preset

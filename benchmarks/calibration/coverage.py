@@ -15,8 +15,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from joblib import Parallel, delayed
-from table import quick_from_command_line, show
 
+from benchmarks.table import quick_from_command_line, show
 from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views

@@ -1,6 +1,6 @@
 """Ways to find the shift between two pictures, all called alike.
 
-A method is given a :class:`~drift_truth.Pair` and answers with the shift (x, y) and its 1-sigma
+A method is given a :class:`~benchmarks.drift.pairs.Pair` and answers with the shift (x, y) and its 1-sigma
 where it states one, or None where it refuses. Libraries that are not installed leave a method
 without a function.
 """
@@ -14,9 +14,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from drift_truth import Array, Gray, Pair
 from numpy.typing import NDArray
 
+from benchmarks.drift.pairs import Array, Gray, Pair
 from semcal_ros.core.registration.register import (
     Reference,
     Registration,

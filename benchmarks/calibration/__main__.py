@@ -18,15 +18,7 @@ import sys
 from collections.abc import Mapping
 from statistics import median
 
-from calibration_methods import (
-    JOINT,
-    JOINT_FIELD,
-    METHODS,
-    Judged,
-    Work,
-    judged,
-)
-from calibration_views import (
+from benchmarks.calibration.cases import (
     DRIFT,
     DRIFT_FRAMES,
     HEIGHT_SIGMA_M,
@@ -38,8 +30,16 @@ from calibration_views import (
     reference_folder,
     simulated,
 )
-from corners import corners
-from table import quick_from_command_line, show, text
+from benchmarks.calibration.corners import corners
+from benchmarks.calibration.methods import (
+    JOINT,
+    JOINT_FIELD,
+    METHODS,
+    Judged,
+    Work,
+    judged,
+)
+from benchmarks.table import quick_from_command_line, show, text
 
 Results = Mapping[str, Judged]
 Column = dict[str, float | None]

@@ -1,0 +1,1 @@
+"""Benchmarks, a folder per subject; ``python benchmarks/run.py`` runs all of them."""

@@ -1,0 +1,1 @@
+"""Calibration methods and the corner finder beside others, and whether stated uncertainties hold."""

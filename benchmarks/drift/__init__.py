@@ -1,0 +1,1 @@
+"""Registration and drift tracking beside other methods and the Cramer-Rao bound."""

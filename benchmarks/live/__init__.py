@@ -1,0 +1,1 @@
+"""The live stream: one frame inside of a process, and all of it over DDS."""

@@ -1,0 +1,1 @@
+"""Rectification beside a bare remap."""

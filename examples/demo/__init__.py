@@ -1,0 +1,1 @@
+"""The whole suite at work; ``make demo`` runs it."""

@@ -1,0 +1,1 @@
+"""Visual servoing of the stage."""
