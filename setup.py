@@ -35,6 +35,7 @@ RUNTIME = (
     "matplotlib>=3.6",
     "numpy>=1.26",
     "opencv-python-headless>=4.8",
+    "pydantic>=2.6",
     "pyyaml>=6.0",
     "rosbags>=0.11.7",
     "scipy>=1.11",

@@ -6,14 +6,16 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from tqdm import tqdm
 
-from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.calibration_file import Calibration
+
+if TYPE_CHECKING:
+    from semcal_ros.config.config import MicroscopeConfig
 
 __all__ = [
     "config_option",
@@ -46,6 +48,9 @@ overwrite_option = click.option(
 
 def configured(name: str, model: Calibration | None = None) -> MicroscopeConfig:
     """The configuration that the ``--config`` option names, with the display width of a calibration."""
+    # Imported on demand: a command without recordings starts without pydantic.
+    from semcal_ros.config.config import load_config
+
     config = load_config(name)
     return config if model is None else replace(config, display_width_m=model.display_width_m)
 

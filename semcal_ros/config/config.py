@@ -1,17 +1,30 @@
 """``msg_configs`` files: how one microscope's own topics, fields and units map onto the suite.
 
-``msg_configs/generic.yaml`` documents every key.
+The classes below are the one declaration of such a file: its keys, defaults and limits. pydantic
+checks a file against them, and the ``description`` of a field is what an error names as expected.
+``msg_configs/generic.yaml`` and ``doc/msg_configs.md`` explain every key; tests compare them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic.dataclasses import dataclass
 
 from semcal_ros.config.files import config_names, find_config_file, read_config_text
-from semcal_ros.config.parse import parse_mapping
-from semcal_ros.config.schema import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, IMAGE_TYPES
+from semcal_ros.config.yaml_text import load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 
@@ -23,38 +36,90 @@ __all__ = [
     "MagnificationConfig",
     "MicroscopeConfig",
     "config_names",
+    "config_schema",
     "load_config",
     "parse_config",
 ]
 
-StampMoment = Literal["start", "centre", "end"]
+IMAGE_TYPE: Final = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE_TYPE: Final = "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
+"""Message types in which frames are accepted."""
+
 Quantity = Literal["magnification", "pixel_size", "field_width"]
+StampMoment = Literal["start", "centre", "end"]
 
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
+_MAX_SEEN = 80  # characters of a wrong value in an error, which is one line
+_DO = "compare with msg_configs/generic.yaml"
 
 
-@dataclass(frozen=True)
+def _whole(value: Any) -> Any:
+    # JSON Schema counts 4.0 as an integer, and so do people.
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _unit(value: Any) -> Any:
+    # YAML reads the unit 1 as a number; True equals 1 too.
+    return "1" if isinstance(value, (int, float)) and value == 1 and value is not True else value
+
+
+def _largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(sorted(sizes, reverse=True))
+
+
+# `strict`: no text for a number and no bool for an integer.
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Whole = BeforeValidator(_whole)
+# 255 characters are the longest name that DDS takes.
+_Name = Annotated[str, Field(strict=True, min_length=1, max_length=255)]
+_Topic = Annotated[
+    _Name, Field(pattern=r"^(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$")
+]
+_Type = Annotated[_Name, Field(pattern=r"^[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*$")]
+_FieldPath = Annotated[
+    _Name,
+    Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?(\.[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?)*$"),
+]
+_Frame = Annotated[_Name, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_/-]*$")]
+# Upper limits of lengths and times only catch a wrong unit: nothing real comes near them.
+_DisplayWidth = Annotated[_Number, Field(gt=0.0, le=100.0)]
+_SquareSize = Annotated[_Number, Field(gt=0.0, le=1.0)]
+
+_FILE = ConfigDict(extra="forbid")
+_TOPIC = "a ROS topic name such as image_raw"
+
+
+@dataclass(frozen=True, config=_FILE)
 class ImageConfig:
     """The image stream.
 
     Parameters
     ----------
     topic, type
-        Where the frames arrive, and one of :data:`IMAGE_TYPES`; a relative topic is resolved in the node's namespace.
-        The topic of compressed images is given in full, such as ``image_raw/compressed``.
+        Where the frames arrive, and one of :data:`IMAGE_TYPES`; a relative topic is resolved in the
+        node's namespace. The topic of compressed images is given in full, such as
+        ``image_raw/compressed``.
     stamp
         The moment of the acquisition that the header stamp means.
     databar_rows
         Rows at the bottom that show text instead of the specimen.
     """
 
-    topic: str = "image_raw"
-    type: str = IMAGE_TYPE
-    stamp: StampMoment = "start"
-    databar_rows: int = 0
+    topic: _Topic = Field(default="image_raw", description=_TOPIC)
+    type: Literal["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"] = Field(
+        default=IMAGE_TYPE, description=" or ".join(IMAGE_TYPES)
+    )
+    stamp: StampMoment = Field(
+        default="start",
+        description="start, centre or end, the moment of the acquisition that is stamped",
+    )
+    databar_rows: Annotated[int, Field(strict=True, ge=0, le=100_000), _Whole] = Field(
+        default=0, description="the number of rows of the data bar, 0 or more"
+    )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_FILE)
 class MagnificationConfig:
     """The topic that says how large the field of view is.
 
@@ -73,13 +138,25 @@ class MagnificationConfig:
         Image width that the topic's pixel size refers to, px; None: the width of the frames.
     """
 
-    quantity: Quantity = "magnification"
-    topic: str = "magnification"
-    type: str = "std_msgs/msg/Float64"
-    field: str = "data"
-    unit: str = "1"
-    display_width_m: float | None = None
-    image_width_px: int | None = None
+    quantity: Quantity = Field(
+        default="magnification", description="magnification, pixel_size or field_width"
+    )
+    topic: _Topic = Field(default="magnification", description=_TOPIC)
+    type: _Type = Field(
+        default="std_msgs/msg/Float64", description="a message type such as std_msgs/msg/Float64"
+    )
+    field: _FieldPath = Field(
+        default="data", description="a path of field names such as data, vector.x or position[0]"
+    )
+    unit: Annotated[Literal["1", "m", "mm", "um", "nm", "pm"], BeforeValidator(_unit)] = Field(
+        default="1", description="1 for a magnification; m, mm, um, nm or pm for a length"
+    )
+    display_width_m: _DisplayWidth | None = Field(
+        default=None, description="a positive display width in m"
+    )
+    image_width_px: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] | None = Field(
+        default=None, description="a positive number of pixels"
+    )
 
     @property
     def si_per_unit(self) -> float:
@@ -87,7 +164,29 @@ class MagnificationConfig:
         return _METRES.get(self.unit, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_FILE)
+class _ScanKeys:
+    """The keys of :class:`~semcal_ros.core.camera.scan_timing.ScanTiming` in a file."""
+
+    frame_time_s: Annotated[_Number, Field(gt=0.0, le=1e6)] = Field(
+        description="the positive time of one pass over the frame in s"
+    )
+    averages: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] = Field(
+        default=1, description="the number of averaged passes, 1 to 1000000"
+    )
+    flyback_fraction: Annotated[_Number, Field(ge=0.0, lt=1.0)] = Field(
+        default=0.0, description="a number in [0, 1)"
+    )
+
+
+def _scan_timing(value: Any) -> ScanTiming:
+    if isinstance(value, ScanTiming):
+        return value
+    keys = TypeAdapter(_ScanKeys).validate_python(value)
+    return ScanTiming(keys.frame_time_s, keys.averages, keys.flyback_fraction)
+
+
+@dataclass(frozen=True, config=_FILE)
 class MicroscopeConfig:
     """One microscope.
 
@@ -96,8 +195,8 @@ class MicroscopeConfig:
     name
         Name of the microscope, for reports and diagnostics.
     display_width_m
-        Display width D of the calibration, m: its magnification is D / (field width). It is the one
-        by which everything is keyed.
+        Display width D of the calibration, m: its magnification is D / (field width). Calibrations
+        and parameters are keyed by this magnification.
     image, magnification
         The two input streams.
     scan
@@ -108,13 +207,25 @@ class MicroscopeConfig:
         Frame for images that the suite itself makes (virtual microscope, imported files).
     """
 
-    name: str
-    display_width_m: float
-    image: ImageConfig = ImageConfig()
-    magnification: MagnificationConfig = MagnificationConfig()
-    scan: ScanTiming | None = None
-    squares_m: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
-    frame_id: str = "sem_optical"
+    name: Annotated[str, Field(strict=True, min_length=1, max_length=100)] = Field(
+        description="a name of at most 100 characters"
+    )
+    display_width_m: _DisplayWidth = Field(
+        description="a positive display width in m, such as 0.12"
+    )
+    image: ImageConfig = Field(default=ImageConfig(), description="a mapping of image settings")
+    magnification: MagnificationConfig = Field(
+        default=MagnificationConfig(), description="a mapping of magnification settings"
+    )
+    scan: (
+        Annotated[ScanTiming, PlainValidator(_scan_timing, json_schema_input_type=_ScanKeys)] | None
+    ) = Field(default=None, description="a mapping of scan settings")
+    squares_m: Annotated[
+        tuple[_SquareSize, ...], Field(min_length=1), AfterValidator(_largest_first)
+    ] = Field(
+        default=(25e-6, 10e-6, 5e-6, 2e-6, 1e-6), description="a list of positive square sizes in m"
+    )
+    frame_id: _Frame = Field(default="sem_optical", description="a frame name such as sem_optical")
 
     @property
     def start_offset_s(self) -> float:
@@ -133,6 +244,25 @@ class MicroscopeConfig:
         return self.start_offset_s + (self.scan.centre_offset_s if self.scan else 0.0)
 
 
+_MAPPINGS = {"image": ImageConfig, "magnification": MagnificationConfig, "scan": _ScanKeys}
+# A file has to say these although the classes have defaults: a number of another quantity looks
+# much like a magnification.
+_REQUIRED = {"": "magnification", "magnification": "quantity"}
+_UNKNOWN = ("unexpected_keyword_argument", "invalid_key")
+
+Location = tuple[str | int, ...]
+
+
+@lru_cache(maxsize=1)
+def _checker() -> TypeAdapter[MicroscopeConfig]:
+    return TypeAdapter(MicroscopeConfig)
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of a configuration file, for editors that complete and check."""
+    return _checker().json_schema()
+
+
 def load_config(name_or_path: str | Path) -> MicroscopeConfig:
     """Read a configuration.
 
@@ -145,8 +275,8 @@ def load_config(name_or_path: str | Path) -> MicroscopeConfig:
     Raises
     ------
     ConfigError
-        There is no such file, it is no YAML, or a key is missing, unknown or wrong; the message
-        names the key.
+        There is no such file, it is not valid YAML, or a key is missing, unknown or wrong; the
+        message names the key.
     """
     path = find_config_file(name_or_path)
     return parse_config(read_config_text(path), source=str(path))
@@ -157,63 +287,85 @@ def parse_config(text: str, *, source: str = "configuration") -> MicroscopeConfi
 
     ``source`` is named in the errors, which are those of :func:`load_config`.
     """
-    values = parse_mapping(text, source)
-    scan = values.get("scan")
-    return MicroscopeConfig(
-        name=values["name"],
-        display_width_m=float(values["display_width_m"]),
-        image=_image(values.get("image", {})),
-        magnification=_magnification(values["magnification"], source),
-        scan=None if scan is None else _scan(scan),
-        **_optional(values),
-    )
+    values = load_yaml(text, source)
+    found = {}
+    try:
+        config = _checker().validate_python(values)
+    except ValidationError as error:
+        for problem in error.errors(include_url=False, include_context=False):
+            found[problem["loc"]] = (problem["type"], problem["input"])
+    for location, kind in _omissions(values):
+        found.setdefault(location, (kind, None))
+    if found:
+        # A misspelt key causes a missing one as well: name the misspelt one.
+        first = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _path(at)))
+        raise _refusal(source, first, *found[first])
+    _check_magnification(values["magnification"], config.magnification, source)
+    return config
 
 
-def _optional(values: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    if "squares_m" in values:
-        sizes = (float(size) for size in values["squares_m"])
-        found["squares_m"] = tuple(sorted(sizes, reverse=True))
-    if "frame_id" in values:
-        found["frame_id"] = values["frame_id"]
-    return found
+def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
+    """Keys that only a file must have, and keys without a value."""
+    if not isinstance(values, dict):
+        return
+    mappings = {"": values, **{key: values[key] for key in _MAPPINGS if key in values}}
+    for parent, mapping in mappings.items():
+        if not isinstance(mapping, dict):
+            continue
+        above = (parent,) if parent else ()
+        if _REQUIRED.get(parent, parent) not in {parent, *mapping}:
+            yield (*above, _REQUIRED[parent]), "missing"
+        yield from (((*above, key), "none") for key, value in mapping.items() if value is None)
 
 
-def _scan(values: dict[str, Any]) -> ScanTiming:
-    return ScanTiming(
-        frame_time_s=float(values["frame_time_s"]),
-        averages=int(values.get("averages", 1)),
-        flyback_fraction=float(values.get("flyback_fraction", 0.0)),
-    )
+def _refusal(source: str, location: Location, kind: str, value: Any) -> ConfigError:
+    """What is wrong with the value of one key, in one line."""
+    nested = len(location) > 1 and location[0] in _MAPPINGS
+    mapping: Any = _MAPPINGS[str(location[0])] if nested else MicroscopeConfig
+    fields = mapping.__pydantic_fields__
+    path = _path(location)
+    if kind in _UNKNOWN:
+        return ConfigError(
+            f"{source}: unknown key {_cut(path)}", expected="one of " + ", ".join(fields), do=_DO
+        )
+    key = location[1 if nested else 0] if location else ""
+    expected = fields[key].description if location else "a mapping of settings"
+    if kind == "missing":
+        return ConfigError(f"{source}: key {path} is missing", expected=expected, do=_DO)
+    where = f"key {path}" if path else "the whole file"
+    return ConfigError(f"{source}: {where} is {_shown(value)}", expected=expected, do=_DO)
 
 
-def _image(values: dict[str, Any]) -> ImageConfig:
-    return ImageConfig(**{**values, "databar_rows": int(values.get("databar_rows", 0))})
+def _path(location: Location) -> str:
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).lstrip(".")
 
 
-def _magnification(values: dict[str, Any], source: str) -> MagnificationConfig:
-    is_length = values["quantity"] != "magnification"
-    given = values.get("unit", "" if is_length else "1")
-    unit = given if isinstance(given, str) else "1"
-    if is_length != (unit in _METRES):
+def _cut(text: str) -> str:
+    return text if len(text) <= _MAX_SEEN else text[:_MAX_SEEN] + "..."
+
+
+def _shown(value: Any) -> str:
+    try:
+        return _cut(repr(value))
+    except ValueError:  # Python does not print integers of more than 4300 digits
+        return "an enormous number"
+
+
+def _check_magnification(given: dict[str, Any], read: MagnificationConfig, source: str) -> None:
+    """Refuse a unit or a key that does not belong to the quantity."""
+    is_length = read.quantity != "magnification"
+    if is_length != (read.unit in _METRES):
         raise ConfigError(
-            f"{source}: key magnification.unit is {unit!r} for the quantity {values['quantity']}",
+            f"{source}: key magnification.unit is {given.get('unit', 'missing')!r} for the quantity "
+            f"{read.quantity}",
             expected="m, mm, um, nm or pm" if is_length else "1",
             do="state the unit of the number in the topic",
         )
-    _refuse_unused(values, "display_width_m", "magnification", source)
-    _refuse_unused(values, "image_width_px", "pixel_size", source)
-    converted: dict[str, Any] = {"unit": unit}
-    for key, convert in (("display_width_m", float), ("image_width_px", int)):
-        if key in values:
-            converted[key] = convert(values[key])
-    return MagnificationConfig(**{**values, **converted})
-
-
-def _refuse_unused(values: dict[str, Any], key: str, quantity: str, source: str) -> None:
-    if key in values and values["quantity"] != quantity:
-        raise ConfigError(
-            f"{source}: key magnification.{key} with the quantity {values['quantity']}",
-            expected=f"it only with the quantity {quantity}",
-            do="remove the key or correct the quantity",
-        )
+    for key, quantity in (("display_width_m", "magnification"), ("image_width_px", "pixel_size")):
+        if key in given and read.quantity != quantity:
+            raise ConfigError(
+                f"{source}: key magnification.{key} with the quantity {read.quantity}",
+                expected=f"it only with the quantity {quantity}",
+                do="remove the key or correct the quantity",
+            )

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -15,10 +18,11 @@ from semcal_ros.config.config import (
     ImageConfig,
     MagnificationConfig,
     config_names,
+    config_schema,
     load_config,
     parse_config,
 )
-from semcal_ros.config.schema import CONFIG_SCHEMA
+from semcal_ros.config.yaml_text import load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 
@@ -72,11 +76,46 @@ def test_names_of_the_repository_are_found() -> None:
     assert {"generic", "jsm820", "virtual_sem", "pixel_size_nm"} <= set(config_names())
 
 
+def _declared_keys() -> dict[str, dict[str, Any]]:
+    """Dotted keys of the JSON schema, with what it says of each."""
+    schema = config_schema()
+
+    def walk(mapping: dict[str, Any], above: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        for name, key in mapping["properties"].items():
+            yield above + name, {**key, "required": name in mapping.get("required", [])}
+            inner = [key, *key.get("anyOf", [])]
+            for reference in (part["$ref"] for part in inner if "$ref" in part):
+                yield from walk(schema["$defs"][reference.rpartition("/")[2]], f"{name}.")
+
+    return dict(walk(schema, ""))
+
+
 def test_generic_shows_every_key() -> None:
     text = (CONFIGS / "generic.yaml").read_text(encoding="utf-8")
-    for name, schema in CONFIG_SCHEMA["properties"].items():
-        for key in [name, *schema.get("properties", {})]:
-            assert f"{key}:" in text, key
+    for key in _declared_keys():
+        assert f"{key.rpartition('.')[2]}:" in text, key
+
+
+def test_the_manual_lists_the_declared_keys_with_their_defaults_and_units() -> None:
+    manual = (CONFIGS.parent / "doc" / "msg_configs.md").read_text(encoding="utf-8")
+    rows = [re.split(r"(?<!\\)\|", line) for line in manual.splitlines() if line.startswith("| `")]
+    table = {
+        row[1].strip(" `"): (row[2].strip(" `"), row[3].strip()) for row in rows if len(row) == 6
+    }
+    declared = _declared_keys()
+    mappings = {key.partition(".")[0] for key in declared if "." in key}
+    assert set(table) == set(declared) - {"image", "magnification"}
+    units = {"m": "m", "s": "s", "px": "px", "rows": "px"}
+    for key, (default, unit) in table.items():
+        said = declared[key]
+        if key not in mappings:
+            assert unit == units.get(key.rpartition("_")[2], ""), key
+        if said["required"] or key == "magnification.quantity":
+            assert default.startswith("required"), key
+        elif said.get("default") is None:
+            assert default.startswith(("none", "width of the frames")), key
+        else:
+            assert load_yaml(default, key) == load_yaml(str(said["default"]), key), key
 
 
 def test_generic_states_the_defaults() -> None:
@@ -219,7 +258,7 @@ def test_a_missing_key_is_named(path: str) -> None:
         ("", "None"),
         ("- 1", "list|\\[1\\]"),
         ("name: [", "line"),
-        ("name: a\nname: b\n", "given twice in line 2"),
+        ("name: a\nname: b\n", "duplicate key .* in line 2"),
         ("name: !!python/object/apply:os.getcwd []", "line 1"),
         ("{" * 3000, "YAML"),
         ("a: !!float x", "ValueError"),

@@ -19,8 +19,8 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     from rclpy.node import Node
 
+
 from semcal_ros.bridge.parameters import PARAMETER_KINDS
-from semcal_ros.config.schema import CONFIG_SCHEMA
 from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import Setting
 from tests.helpers.node_scenes import make_calibration
@@ -197,14 +197,6 @@ def test_every_key_of_the_calibration_file_is_described() -> None:
     }
     text = _text("calibration_file.md")
     assert {key for key in keys if f"`{key}`" not in text} == set()
-
-
-def test_every_key_of_a_configuration_is_described() -> None:
-    described = set(re.findall(r"^\| `([\w.]+)` \|", _text("msg_configs.md"), re.MULTILINE))
-    for key, value in CONFIG_SCHEMA["properties"].items():
-        names = [f"{key}.{inner}" for inner in value.get("properties", ())]
-        # A mapping with required keys of its own may be left out; it is a row then.
-        assert set(names or [key]) <= described
 
 
 def test_the_notebook_snippet_runs(tmp_path: Path) -> None:
