@@ -117,10 +117,11 @@ def invert_scaled(matrix: Array, rcond: float | None = None) -> Array:
         Without ``rcond``, if a matrix is singular.
     """
     scaled, scale = equilibrate(matrix)
-    if rcond is None:
-        inverse = np.linalg.inv(scaled)
-    else:
-        inverse = np.linalg.pinv(scaled, rcond=rcond, hermitian=True)
+    inverse = (
+        np.linalg.inv(scaled)
+        if rcond is None
+        else np.linalg.pinv(scaled, rcond=rcond, hermitian=True)
+    )
     return inverse * (scale[..., :, None] * scale[..., None, :])
 
 
