@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -42,7 +42,6 @@ _PRIOR = (-0.25, 0.35)
 _TINY = 1e-30
 _TUKEY = 4.685
 _ROUNDS = 12
-_MAD = 1.4826
 _LEAST = 6
 
 
@@ -267,7 +266,7 @@ def _robust(
         normal = (rows * total[:, None]).T @ rows + np.diag(prior)
         solution = np.asarray(np.linalg.solve(normal, (rows * total[:, None]).T @ seen))
         residual = (seen - rows @ solution) / sigma
-        scale = max(_MAD * float(np.median(np.abs(residual))), 0.8)
+        scale = max(mad_sigma(residual), 0.8)
         # The first rounds do not yet know what is an outlier.
         far = residual / (scale * _TUKEY * (2.0 if turn < 3 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)

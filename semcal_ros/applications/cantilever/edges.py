@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 
 __all__ = ["EdgeFit", "EdgeModel", "StepFit", "best_width", "fit_edges", "fit_step", "same_width"]
 
@@ -244,7 +244,7 @@ def same_width(moved: Array, noise: Array) -> Mask:
     away = np.zeros(len(moved))
     # Focus or charging may change the width of all of it.
     away[both] = (change[both] - np.median(change[both])) / sigma[both]
-    scale = max(1.4826 * float(np.median(np.abs(away[both]))), 1.0)
+    scale = max(mad_sigma(away[both]), 1.0)
     odd = ~both | (np.abs(away) > _SAME_WIDTH * scale)
     near = odd.copy()
     near[1:] |= odd[:-1]

@@ -15,7 +15,7 @@ from semcal_ros.applications.cantilever.edges import (
     fit_step,
 )
 from semcal_ros.applications.cantilever.plane import Axis
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["REACH_PX", "PixelSamples", "UndeformedBeam", "measure_undeformed_beam"]
@@ -155,9 +155,8 @@ def _refined(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
         return axis
     middle, half = across.mean(axis=1)[good], 0.5 * (across[:, 1] - across[:, 0])[good]
     # What lies on an edge here and there must not turn the axis.
-    usual = np.abs(half - np.median(half)) < 4.0 * max(
-        1.4826 * float(np.median(np.abs(half - np.median(half)))), 1e-12
-    )
+    deviation = half - np.median(half)
+    usual = np.abs(deviation) < 4.0 * max(mad_sigma(deviation), 1e-12)
     along = model.centres_m[good][usual]
     if len(along) < 3:
         return axis

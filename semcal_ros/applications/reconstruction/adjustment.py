@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.applications.reconstruction.types import Observations, camera_table
-from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.arrays import Array, Indices, invert_scaled, solve_scaled
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
@@ -262,9 +262,7 @@ def _stepped(
     reduced, moved = _reduced(_damped(pose, damping), inverse, coupling, free)
     right = right_pose.ravel()[free] - moved @ right_point.ravel()
     step = np.zeros(6 * len(pose))
-    diagonal = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-    step[free] = np.linalg.solve(reduced / np.outer(diagonal, diagonal), right / diagonal)
-    step[free] /= diagonal
+    step[free] = solve_scaled(reduced, right)
     left = right_point - (coupling.T @ step).reshape(-1, 3)
     by_view = step.reshape(-1, 6)
     return _State(
@@ -338,9 +336,7 @@ def _finished(
     pose, point, coupling, _, _ = problem.normal(state, sigma)
     inverse = _inverted(_damped(point, 1e-12))
     reduced, moved = _reduced(pose, inverse, coupling, free)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-    poses = np.linalg.pinv(reduced * np.outer(scale, scale), rcond=1e-14, hermitian=True)
-    poses = poses * np.outer(scale, scale)
+    poses = invert_scaled(reduced, rcond=1e-14)
     # About the middle of the points: where the whole lies along the beam is not determined.
     through = moved.reshape(len(free), -1, 3)
     through = through - through.mean(axis=1, keepdims=True)

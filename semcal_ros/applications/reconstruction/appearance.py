@@ -16,11 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Image
+from semcal_ros.core.arrays import Image, mad_sigma
 
 __all__ = ["Appearance", "appearance_of", "bytes_for_tracking"]
 
-_MAD_TO_SIGMA = 1.4826
 # Of a difference of neighbours across the diagonal, sum of squares of its kernel.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
 
@@ -85,4 +84,4 @@ def _widely(image: Image, sigma_px: float) -> Image:
 def _noise(grey: Image) -> float:
     """Noise of a pixel from second differences, which smooth texture hardly reaches (Immerkaer 1996)."""
     rough = cv2.filter2D(grey, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
-    return _MAD_TO_SIGMA * float(np.median(np.abs(rough)))
+    return mad_sigma(rough)

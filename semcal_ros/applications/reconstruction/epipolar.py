@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["AffineEpipolar", "epipolar_of", "robust_epipolar"]
 
 
 _LEAST_POINTS = 5
-_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +107,7 @@ def robust_epipolar(
             break
         normal, offset = _plane(joint[inliers])
         distance = np.abs(joint @ normal + offset)
-        sigma = _MAD_TO_SIGMA * float(np.median(distance[inliers]))
+        sigma = mad_sigma(distance[inliers])
         better = distance <= min(tolerance, max(4.0 * sigma, 0.1 * tolerance))
         if np.array_equal(better, inliers):
             break

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.applications.reconstruction.types import Tracks
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["AffineStructure", "factorize"]
@@ -142,7 +142,7 @@ class _Growing:
 
     def _scale(self) -> float:
         error, used = self._residuals()
-        sigma = 1.4826 * float(np.median(np.abs(error[used])))
+        sigma = mad_sigma(error[used])
         # A share of the points is fitted exactly, or nearly; keep the scale away from zero.
         return max(sigma, 1e-12 * float(np.abs(self.cameras).max()))
 

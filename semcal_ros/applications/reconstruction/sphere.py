@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
 __all__ = ["SphereFit", "fit_sphere"]
 
 
 _TRIALS = 500
-_MAD_TO_SIGMA = 1.4826
 _LEAST = 8
 
 
@@ -90,7 +89,7 @@ def fit_sphere(
         step = _step(points[inliers], weight[inliers], centre, radius)
         centre, radius = centre + step[:3], radius + float(step[3])
         distance = np.linalg.norm(points - centre, axis=1) - radius
-        sigma = _MAD_TO_SIGMA * float(np.median(np.abs(distance[inliers])))
+        sigma = mad_sigma(distance[inliers])
         limit = min(max(4.0 * sigma, 1e-9), tolerance)
         chosen = np.abs(distance) <= limit
         if np.count_nonzero(chosen) < _LEAST:

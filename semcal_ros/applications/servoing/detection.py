@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.applications.servoing.sides import refine_quads
 from semcal_ros.applications.servoing.target import NestedTarget, dictionary
-from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.arrays import Array, Mask, check_image
 
 __all__ = ["TargetView", "find_target"]
 
@@ -87,12 +86,7 @@ def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
     InvalidValueError
         If the image is no two-dimensional array of at least 32 x 32 px.
     """
-    grey = np.asarray(image)
-    if grey.ndim != 2 or min(grey.shape) < 32 or grey.dtype.kind not in "uif":
-        raise InvalidValueError(
-            f"an image of shape {grey.shape} and type {grey.dtype}",
-            expected="grey levels of at least 32 x 32 px",
-        )
+    grey = check_image(image, channels=(1,), least_side=32)
     picture = np.ascontiguousarray(grey, dtype=np.float32)
     if not np.all(np.isfinite(picture)):
         return _none("image: holds values that are not finite")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.normal_equations import (
     NormalEquations,
     Problem,
@@ -20,7 +20,6 @@ from semcal_ros.core.calibration.normal_equations import (
     reduced_normal_equations,
     residuals,
     retract,
-    scaled_solve,
     schur_complement,
     view_costs,
 )
@@ -94,7 +93,7 @@ class _Step:
 def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
     information, gradient, back_camera, back_right = schur_complement(problem, normal, damping)
     matrix, right = reduced_normal_equations(problem, state.theta, information, gradient)
-    change = scaled_solve(matrix, right, damping)
+    change = solve_scaled(matrix, right, damping)
     camera_change = (problem.designs @ change)[problem.group]
     pose = back_right - np.einsum("vpq,vq->vp", back_camera, camera_change)
     new = retract(problem, state, change, pose)
@@ -216,7 +215,9 @@ def _result(
     normal = normal_equations(problem, state)
     information, gradient, back_camera, _ = schur_complement(problem, normal, 0.0)
     matrix, _ = reduced_normal_equations(problem, state.theta, information, gradient)
-    covariance = _covariance(matrix)
+    # A direction that neither data nor prior hold gets no spurious certainty from rounding.
+    covariance = invert_scaled(matrix, rcond=1e-15)
+    covariance = 0.5 * (covariance + covariance.T)
     spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)
     height_row = back_camera[:, 5]
     own = np.linalg.inv(normal.matrix[:, 10:, 10:])[:, 5, 5]
@@ -252,11 +253,3 @@ def _no_result(problem: Problem, state: State) -> BundleResult:
         converged=False,
         reason="a point has no projection at the start",
     )
-
-
-def _covariance(matrix: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
-    # pinv: a direction that neither data nor prior hold gets no spurious certainty from rounding.
-    inverse = np.linalg.pinv(matrix * np.outer(scale, scale), rcond=1e-15, hermitian=True)
-    inverse = 0.5 * (inverse + inverse.T)
-    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
@@ -19,7 +19,6 @@ from semcal_ros.core.calibration.normal_equations import (
     Problem,
     State,
     reduced_normal_equations,
-    scaled_solve,
 )
 from semcal_ros.core.calibration.problem import (
     Functions,
@@ -244,7 +243,7 @@ def _covariance_with_reserve(
         reduced = reduced_normal_equations(
             problem, state.theta, result.information, result.gradient
         )
-        covariance, moved = result.covariance, scaled_solve(*reduced, 0.0)
+        covariance, moved = result.covariance, solve_scaled(*reduced)
     else:
         system = field_system(setup, problem, result, field.field)
         # This one is scaled to the variance that the residuals show.
@@ -401,4 +400,4 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
     gradient[index] = 0.0
     theta = theta_of(fit.functions)
     matrix, right = reduced_normal_equations(fit.problem, theta, information, gradient)
-    return with_coefficients(fit.functions, theta + scaled_solve(matrix, right, 0.0)), None
+    return with_coefficients(fit.functions, theta + solve_scaled(matrix, right)), None

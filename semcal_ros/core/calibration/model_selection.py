@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.problem import Setup, variance_factor
@@ -107,14 +107,11 @@ class _Candidates:
         rights = (transposed @ self.summary.right[:, :, None])[:, :, 0]
         matrix = matrices.sum(axis=0) + np.diag(precision)
         right = rights.sum(axis=0) + precision * mean
-        scale = 1.0 / np.sqrt(np.diag(matrix))
         # The inner magnifications are predicted from the others, the two outermost ones from all.
         inner = np.ones((len(matrices), 1, 1))
         inner[[0, -1]] = 0.0
-        left_out = (matrix - inner * matrices) * np.outer(scale, scale)
-        remaining = (right - inner[:, 0] * rights) * scale
-        solution = np.linalg.solve(left_out, remaining[:, :, None])[:, :, 0]
-        cameras = np.einsum("mpk,mk->mp", designs, solution * scale)
+        solution = solve_scaled(matrix - inner * matrices, right - inner[:, 0] * rights)
+        cameras = np.einsum("mpk,mk->mp", designs, solution)
         quadratic = np.einsum("mp,mpq,mq->m", cameras, self.summary.information, cameras)
         linear = np.einsum("mp,mp->m", cameras, self.summary.right)
         return float(np.sum(0.5 * quadratic - linear))

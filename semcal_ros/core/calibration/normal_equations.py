@@ -32,7 +32,6 @@ __all__ = [
     "reduced_normal_equations",
     "residuals",
     "retract",
-    "scaled_solve",
     "schur_complement",
     "view_costs",
     "whiten",
@@ -281,14 +280,6 @@ def reduced_normal_equations(
     matrix[np.diag_indices_from(matrix)] += problem.prior_sigma**-2.0
     right = right - (theta - problem.prior_mean) * problem.prior_sigma**-2.0
     return matrix, right
-
-
-def scaled_solve(matrix: Array, right: Array, damping: float) -> Array:
-    """Solution of a positive definite system whose unknowns have very different units."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
-    scaled = matrix * np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += damping
-    return np.asarray(scale * np.linalg.solve(scaled, scale * right), dtype=np.float64)
 
 
 def retract(problem: Problem, state: State, change: Array, pose: Array) -> State:

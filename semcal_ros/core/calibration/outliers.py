@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
@@ -54,8 +55,6 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
     )
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    scaled = matrix * np.outer(scale, scale)
     g = setup.magnifications
     nominal = setup.nominal_px_per_m(g)
     variance = max(variance_factor(problem, result), 1.0)
@@ -65,8 +64,8 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
             continue
         column = np.where(np.arange(len(g)) >= k, nominal, 0.0)
         pull = result.information[:, :, 0] * column[:, None]
-        cross = scale * np.einsum("mpk,mp->k", problem.designs, pull)
-        solved = np.linalg.solve(scaled, np.stack([cross, scale * right], axis=1))
+        cross = np.einsum("mpk,mp->k", problem.designs, pull)
+        solved = solve_scaled(matrix, np.stack([cross, right], axis=1))
         information = float(pull[:, 0] @ column) - cross @ solved[:, 0]
         information += setup.priors.scale_jump**-2.0
         gradient = float(result.gradient[:, 0] @ column) - cross @ solved[:, 1]

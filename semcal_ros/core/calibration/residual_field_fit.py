@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
@@ -108,17 +108,17 @@ class FieldSystem:
     def solve(self, keep: Mask, prior: Array) -> Array:
         """Theta followed by the coefficients of the field, from the members that are kept."""
         matrix, right = self.assembled(keep, prior)
-        scale = 1.0 / np.sqrt(np.diag(matrix))
-        factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
-        return np.asarray(scale * cho_solve(factor, scale * right), dtype=np.float64)
+        scaled, scale = equilibrate(matrix)
+        factor = cho_factor(scaled, check_finite=False)
+        return scale * cho_solve(factor, scale * right)
 
     def covariance(self, prior: Array) -> Array:
         """Covariance of what :meth:`solve` gives from all members."""
         matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
-        scale = 1.0 / np.sqrt(np.diag(matrix))
-        factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
+        scaled, scale = equilibrate(matrix)
+        factor = cho_factor(scaled, check_finite=False)
         inverse = cho_solve(factor, np.eye(len(scale)))
-        return np.asarray(0.5 * (inverse + inverse.T) * np.outer(scale, scale), dtype=np.float64)
+        return 0.5 * (inverse + inverse.T) * np.outer(scale, scale)
 
     def costs(self, solution: Array) -> Array:
         """(N,) cost of each member, but for a constant."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.core.arrays import Array, Image
+from semcal_ros.core.arrays import Array, Image, check_image
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
@@ -116,13 +116,7 @@ def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
     InvalidValueError
         If it is not a two-dimensional image of numbers, or is too small.
     """
-    values = np.asarray(image)
-    if values.ndim != 2 or values.dtype.kind not in "uif":
-        raise InvalidValueError(
-            f"an image of shape {values.shape} and type {values.dtype}",
-            expected="one channel of integers or floats, shape (h, w)",
-            do="convert colour images to grey first",
-        )
+    values = check_image(image, channels=(1,), do="convert colour images to grey first")
     if not 0 <= databar_rows <= values.shape[0] - SMALLEST_SIDE or values.shape[1] < SMALLEST_SIDE:
         raise InvalidValueError(
             f"an image of {values.shape[1]} x {values.shape[0]} px"

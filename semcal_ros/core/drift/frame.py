@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import RESAMPLED_TYPES, Array, check_image
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift, camera_key, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.registration.reference import Region
@@ -156,12 +155,5 @@ def resampleable(image: NDArray[np.generic]) -> NDArray[np.generic]:
     InvalidValueError
         If it is no picture.
     """
-    shape = image.shape
-    if image.dtype.kind not in "uif" or not (
-        len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
-    ):
-        raise InvalidValueError(
-            f"an image of shape {shape} and type {image.dtype}",
-            expected="(h, w) or (h, w, 3) of integers or floats",
-        )
-    return image if image.dtype.name in ("uint8", "uint16", "float32") else image.astype(np.float32)
+    pixels = check_image(image)
+    return pixels if pixels.dtype.name in RESAMPLED_TYPES else pixels.astype(np.float32)

@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
-from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.arrays import Array, Indices, invert_scaled
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.keyframe_store import MEANS_PREPARED
 from semcal_ros.core.errors import InvalidValueError
@@ -298,8 +298,7 @@ def _solved(
         normal += np.einsum("nij,nik->jk", a, wa) - wa.sum(0).T @ inner @ wa.sum(0)
         right += np.einsum("nij,ni->j", a, wy) - wa.sum(0).T @ inner @ wy.sum(0)
         parts.append((members, inner, w, wa))
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    covariance = invert_scaled(normal)
     mean = covariance @ right
     left = seen.shear - design @ mean
     scores, squares = np.zeros((len(left), 5)), np.zeros(len(left))

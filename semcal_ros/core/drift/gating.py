@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.drift.operations import Inflate
 from semcal_ros.core.drift.state import DriftState
 
@@ -115,9 +115,7 @@ def of_a_contradiction(
         return None
     expected, covariance = state.shift_from(key)
     away = nearest - expected
-    unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    scaled = covariance / np.outer(unit, unit) + 1e-9 * np.eye(2)
-    if float(away / unit @ np.linalg.solve(scaled, away / unit)) <= GATE:
+    if float(away @ solve_scaled(covariance, away, damping=1e-9)) <= GATE:
         return None
     spread = np.eye(2) * float(away @ away)
     return _spread(spread, spread / since_s**2)

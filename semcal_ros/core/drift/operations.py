@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, equilibrate, invert_scaled
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import EACH, MOVING, OWN, DriftState
 from semcal_ros.core.errors import InvalidValueError
@@ -286,10 +286,8 @@ class Measure:
         mixed = state.covariance @ row.T
         expected = row @ mixed + noise
         expected = 0.5 * (expected + expected.T)
-        unit = np.sqrt(np.diag(expected))
         # Metres and metres per second differ by orders of magnitude.
-        scaled = np.linalg.inv(expected / np.outer(unit, unit))
-        inverse = scaled / np.outer(unit, unit)
+        inverse = invert_scaled(expected)
         gain = mixed @ inverse
         # Joseph's form stays symmetric and positive when the measurement is much sharper than the
         # prediction.
@@ -313,12 +311,9 @@ class Measure:
         values = np.append(self.shift, self.covariance)
         good = bool(np.all(np.isfinite(values)))
         if good:
-            variances = np.diag(self.covariance)
-            good = bool(np.all(variances > 0.0))
+            good = bool(np.all(np.diag(self.covariance) > 0.0))
         if good:
-            unit = np.sqrt(variances)
-            scaled = self.covariance / np.outer(unit, unit)
-            good = float(np.linalg.eigvalsh(scaled)[0]) > 0.0
+            good = float(np.linalg.eigvalsh(equilibrate(self.covariance)[0])[0]) > 0.0
         if not good:
             raise InvalidValueError(
                 f"measured shift {self.shift.tolist()} with covariance {self.covariance.tolist()}",

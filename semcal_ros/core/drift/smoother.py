@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.drift.operations import Measure, Operation
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import DriftState
@@ -68,10 +68,8 @@ def _forwards(
         elif isinstance(event, Measure):
             outcome = event(state, restlessness)
             state = outcome.state
-            unit = np.sqrt(np.diag(outcome.innovation_covariance))
-            scaled = np.linalg.inv(outcome.innovation_covariance / np.outer(unit, unit))
             kept = np.eye(state.mean.size) - outcome.gain @ outcome.row
-            inverse = scaled / np.outer(unit, unit)
+            inverse = invert_scaled(outcome.innovation_covariance)
             steps.append(_Update(outcome.row, outcome.innovation, inverse, kept))
             count += 1
             if count > 2:

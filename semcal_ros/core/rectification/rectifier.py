@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import AnyImage, Array32
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array32, check_image
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -37,7 +37,6 @@ _INTERPOLATIONS = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos4": cv2.INTER_LANCZOS4,
 }
-_DTYPES = ("uint8", "uint16", "float32")
 # Both maps of a band fit a second-level cache; OpenCV resamples so few pixels in one thread.
 _BAND_PIXELS = 1 << 15
 _KEPT_MAPS = 2
@@ -222,13 +221,7 @@ def _helpers() -> ThreadPoolExecutor:
 
 
 def _check_image(image: AnyImage) -> None:
-    if image.dtype.name not in _DTYPES or not (
-        image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-    ):
-        raise InvalidValueError(
-            f"an image of shape {image.shape} and type {image.dtype}",
-            expected="(h, w) or (h, w, 3) of " + ", ".join(_DTYPES),
-        )
+    check_image(image, types=RESAMPLED_TYPES)
     if max(image.shape) > _LARGEST_SIDE:
         raise InvalidValueError(
             f"an image of {image.shape[1]} x {image.shape[0]} px",

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
@@ -351,11 +351,10 @@ def _with_shear(look: _Look, weights: Array) -> tuple[Array, Array]:
     pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
     whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
-    scaled = information / np.outer(scale, scale)
+    scaled, scale = equilibrate(information)
     if len(look.window.y) < _LEAST_ROWS or np.linalg.cond(scaled) > 1e6:
         return np.full(4, np.nan), np.full((4, 4), np.inf)
-    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = (powers[:, :, None] * look.fit.scores[:, None, :]).reshape(-1, 4)
     step = -inverse @ scores.sum(axis=0)
     joint = np.append(look.shift + step[:2], step[2:])

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array, Image, Indices, Mask
+from semcal_ros.core.arrays import Array, Image, Indices, Mask, mad_sigma
 from semcal_ros.core.registration.tiles import Pyramid
 
 __all__ = ["CoarsePeak", "CoarseReference", "coarse_peaks"]
@@ -177,7 +177,7 @@ def _peaks_at(
     if not top > 0.0:
         return []
     searched = score[::4, ::2][geometry.allowed[::4, ::2]]
-    spread = 1.4826 * float(np.median(np.abs(searched - np.median(searched))))
+    spread = mad_sigma(searched - np.median(searched))
     local = cv2.dilate(score, np.ones((5, 5), np.uint8)) <= score
     rows, cols = np.nonzero(local & (score >= np.float32(0.5 * top)))
     highest = np.argsort(-score[rows, cols], kind="stable")

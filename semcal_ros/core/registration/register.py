@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.core.arrays import AnyImage, Array
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.ambiguity import NOTHING, choose_peak
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
@@ -47,7 +47,6 @@ _SMALLEST_LEVEL_PX = 160
 _SATURATION_SAMPLES = 256
 # Of the noise's variance; chance makes less of pictures of 96 px and more.
 _LEAST_SIGNAL = 0.06
-_NATIVE = ("uint8", "uint16", "float32")
 
 
 @dataclass(frozen=True)
@@ -109,15 +108,10 @@ def gray_of(image: ArrayLike) -> AnyImage:
     InvalidValueError
         If it is no picture.
     """
-    picture = np.asarray(image)
-    if picture.ndim == 3 and picture.shape[2] == 3:
-        return np.asarray(picture.mean(axis=2, dtype=np.float32))
-    if picture.ndim != 2 or picture.dtype.kind not in "uif":
-        raise InvalidValueError(
-            f"an image of shape {picture.shape} and type {picture.dtype}",
-            expected="a 2-D image, or one with three channels, of numbers",
-        )
-    return picture if picture.dtype.name in _NATIVE else picture.astype(np.float32)
+    picture = check_image(image)
+    if picture.ndim == 3:
+        return picture.mean(axis=2, dtype=np.float32)
+    return picture if picture.dtype.name in RESAMPLED_TYPES else picture.astype(np.float32)
 
 
 def _cropped(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindow
 
 __all__ = ["TileFit", "TileGeometry", "fitted", "geometry_of", "residuals", "well_posed"]
@@ -97,9 +97,7 @@ def _eliminated(gram: Array, ramps: Array) -> TileGeometry:
     normal = whole[2:, :, 2:, :].reshape(2 * count, 2 * count)
     mixed = whole[:2, 0, 2:, :].reshape(2, 2 * count)
     plain = np.diag(whole[:2, 0, :2, 0])
-    unit = np.sqrt(np.diag(normal)) + 1e-30
-    scaled = np.linalg.pinv(normal / np.outer(unit, unit), rcond=1e-9, hermitian=True)
-    inverse = np.asarray(scaled / np.outer(unit, unit), dtype=np.float64)
+    inverse = invert_scaled(normal, rcond=1e-9)
     explained = mixed @ inverse
     left = plain - np.sum(explained * mixed, axis=1)
     kept = np.asarray(np.sqrt(np.maximum(left, 0.0) / np.maximum(plain, 1e-30)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.projection import ProjectionJacobians, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -122,9 +122,9 @@ def rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
         error = (view.image_xy - straight.project_ideal(points)).ravel()
         known = np.isfinite(error) & np.all(np.isfinite(columns), axis=1)
         normal = columns[known].T @ columns[known] + pull.T @ pull
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        right = unit * (columns[known].T @ error[known])
-        step = unit * np.linalg.lstsq(normal * np.outer(unit, unit), right, rcond=None)[0]
+        scaled, scale = equilibrate(normal)
+        right = scale * (columns[known].T @ error[known])
+        step = scale * np.linalg.lstsq(scaled, right, rcond=None)[0]
         squares.setdefault(float(view.magnification), []).append(
             (error[known] - columns[known] @ step) ** 2
         )

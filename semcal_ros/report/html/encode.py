@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
+from semcal_ros.core.arrays import check_image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.numbers import plain
 
@@ -92,12 +93,7 @@ def as_bytes_image(image: NDArray[Any]) -> NDArray[np.uint8]:
         For an array that is no image: wrong number of dimensions or channels, empty, or without
         finite pixels.
     """
-    array = np.asarray(image)
-    gray = array.ndim == 2
-    if not (gray or (array.ndim == 3 and array.shape[2] == 3)) or array.size == 0:
-        raise InvalidValueError(
-            f"an image of shape {array.shape}", expected="(height, width) or (height, width, 3)"
-        )
+    array = check_image(image)
     if array.dtype == np.uint8:
         return np.asarray(array, dtype=np.uint8)
     values = array.astype(np.float64)
