@@ -18,20 +18,11 @@ from std_srvs.srv import Trigger
 
 from tests.helpers.dds_keystore import Keystore, Rights, read_policy, rights
 from tests.helpers.node_scenes import make_calibration, write_recording
+from tests.helpers.project import NODES
 from tests.helpers.ros_process import LATCHED, NodeProcess, Peer, running
 
 POLICY = Path(__file__).resolve().parents[2] / "security" / "semcal_policy.xml"
 GRANTED = read_policy(POLICY)
-NODES = (
-    "bag_player",
-    "calibration_server",
-    "drift_compensator",
-    "parameter_server",
-    "rectifier",
-    "stream_corrector",
-    "virtual_sem",
-    "visual_servo",
-)
 # Subscribed with use_sim_time only, published with `clock`, or compressed on demand.
 SOMETIMES = {"rt/clock", "rt/sem/image_rect/compressed", "rt/sem/image_stabilized/compressed"}
 OWN_SERVICES = (

@@ -24,11 +24,10 @@ from semcal_ros.bridge.parameters import PARAMETER_KINDS
 from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import Setting
 from tests.helpers.node_scenes import make_calibration
+from tests.helpers.project import NODES, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 DOC = ROOT / "doc"
 PAGES = [ROOT / "README.md", *sorted(DOC.glob("*.md"))]
-NODES = tuple(re.findall(r'^    "(\w+)",$', (ROOT / "setup.py").read_text("utf-8"), re.MULTILINE))
 COMMANDS = {
     path.stem.removesuffix("_command")
     for path in (ROOT / "semcal_ros" / "cli").glob("*_command.py")

@@ -16,16 +16,8 @@ from ament_index_python import get_package_prefix, get_package_share_directory
 from rclpy.context import Context
 from rclpy.node import Node
 
-NODES = (
-    "bag_player",
-    "calibration_server",
-    "drift_compensator",
-    "parameter_server",
-    "rectifier",
-    "stream_corrector",
-    "virtual_sem",
-    "visual_servo",
-)
+from tests.helpers.project import NODES
+
 # A process must import numpy, cv2 and rclpy and be discovered: 2 s alone, more on a busy machine.
 START_S = 60.0
 STOP_S = 20.0

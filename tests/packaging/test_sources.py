@@ -1,8 +1,9 @@
-"""House rules that a reader relies on: small modules, explicit __all__, one version."""
+"""House rules that a reader relies on: an explicit __all__, one version, every dependency declared."""
 
 from __future__ import annotations
 
 import ast
+import importlib.metadata
 import re
 import subprocess
 import sys
@@ -12,45 +13,44 @@ from pathlib import Path
 import pytest
 
 import semcal_ros
+from tests.helpers.project import NODES, PYPROJECT, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "semcal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+# Packages of ROS come from a distribution or from requirements/ros-*.txt.
+ROS = re.compile(r"rclpy|rcl_interfaces|ament_index_python|std_srvs|launch\w*|\w+_msgs")
+# Distributions without a rosdep key, by what package.xml says of them.
+NO_ROSDEP_KEY = {"apsw", "backports.zstd", "tifffile"}
+ROSDEP_KEYS = {
+    "opencv-python-headless": "python3-opencv",
+    "pillow": "python3-pil",
+    "pyyaml": "python3-yaml",
+    "rosbags": "python3-rosbags-pip",
+    "trimesh": "python3-trimesh-pip",
+}
 
 
-def _name(path: Path) -> str:
-    return str(path.relative_to(ROOT))
-
-
-@pytest.mark.parametrize("path", MODULES, ids=_name)
-def test_a_module_is_short(path: Path) -> None:
-    limit = 250 if "nodes" in path.relative_to(PACKAGE).parts else 400
-    assert len(path.read_text(encoding="utf-8").splitlines()) < limit
-
-
-@pytest.mark.parametrize(
-    "path",
-    [path for path in MODULES if not path.stem.startswith("_") or path.stem == "__init__"],
-    ids=_name,
-)
-def test_a_public_module_says_what_it_offers(path: Path) -> None:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    if all(isinstance(node, ast.Expr) for node in tree.body):
-        return  # only a docstring: a folder of modules
+def _says_what_it_offers(path: Path) -> bool:
+    """Whether a module assigns ``__all__``, or holds nothing that could be offered."""
+    body = [
+        node
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if not isinstance(node, ast.Expr)
+        and not (isinstance(node, ast.ImportFrom) and node.module == "__future__")
+    ]
     names = {
         target.id
-        for node in tree.body
+        for node in body
         if isinstance(node, ast.Assign | ast.AnnAssign)
         for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
         if isinstance(target, ast.Name)
     }
-    body = [
-        node
-        for node in tree.body
-        if not isinstance(node, ast.Expr)
-        and not (isinstance(node, ast.ImportFrom) and node.module == "__future__")
-    ]
-    assert "__all__" in names or not body
+    return "__all__" in names or not body
+
+
+def test_public_modules_say_what_they_offer() -> None:
+    public = [p for p in MODULES if not p.stem.startswith("_") or p.stem == "__init__"]
+    assert [str(p.relative_to(ROOT)) for p in public if not _says_what_it_offers(p)] == []
 
 
 @pytest.mark.parametrize("folder", ["benchmarks", "examples"])
@@ -65,20 +65,70 @@ def test_scripts_find_what_they_import(folder: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def _version_of_setup() -> str:
-    tree = ast.parse((ROOT / "setup.py").read_text(encoding="utf-8"))
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "VERSION":
-            return str(ast.literal_eval(node.value))
-    raise AssertionError("setup.py assigns no VERSION")
-
-
 def test_all_versions_agree() -> None:
     package_xml = ElementTree.parse(ROOT / "package.xml").findtext("version")
-    released = re.findall(
-        r"^(\d+\.\d+\.\d+) \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE
+    changelog = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    released = re.findall(r"^(\d+\.\d+\.\d+) \(", changelog, re.MULTILINE)
+    citation = re.findall(
+        r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
     )
-    assert _version_of_setup() == semcal_ros.__version__ == package_xml == released[0]
+    assert [semcal_ros.__version__] == citation
+    assert semcal_ros.__version__ == package_xml == released[0]
+
+
+def test_package_xml_says_the_same_as_pyproject() -> None:
+    project, package = PYPROJECT["project"], ElementTree.parse(ROOT / "package.xml").getroot()
+    assert package.findtext("name") == project["name"]
+    for tag, key in (("maintainer", "maintainers"), ("author", "authors")):
+        people = [{"name": p.text, "email": p.get("email")} for p in package.iter(tag)]
+        assert people == project[key]
+    assert {url.text for url in package.iter("url")} <= set(project["urls"].values())
+
+
+def test_the_executables_are_the_modules_with_a_main() -> None:
+    modules = {
+        path.stem
+        for path in (PACKAGE / "nodes").rglob("*.py")
+        if "\ndef main(" in path.read_text(encoding="utf-8")
+    }
+    assert modules == set(NODES)
+    targets = PYPROJECT["project"]["entry-points"]["semcal_ros.nodes"]
+    assert targets == {node: f"semcal_ros.nodes.{node}:main" for node in NODES}
+
+
+def _declared() -> set[str]:
+    """Names of the distributions that pyproject.toml asks for, in lower case."""
+    return {re.split(r"[\s<>=!;\[]", d)[0].lower() for d in PYPROJECT["project"]["dependencies"]}
+
+
+def test_every_import_is_declared_and_nothing_else() -> None:
+    homes = importlib.metadata.packages_distributions()
+    standard = sys.stdlib_module_names | {"semcal_ros", "compression"}  # the latter: Python 3.14
+    imported = {
+        name.partition(".")[0]
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    needed = {n for n in imported - standard if not ROS.fullmatch(n)}
+    assert {home.lower() for n in needed for home in homes[n]} == _declared()
+
+
+def test_declared_dependencies_have_exact_versions() -> None:
+    pinned = (ROOT / "requirements" / "base.txt").read_text(encoding="utf-8").lower()
+    assert [name for name in _declared() if not re.search(rf"(?m)^{name}==", pinned)] == []
+
+
+def test_package_xml_names_what_pyproject_asks_for() -> None:
+    depends = {node.text for node in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
+    keys = {ROSDEP_KEYS.get(name, f"python3-{name}") for name in _declared() - NO_ROSDEP_KEY}
+    assert keys == {name for name in depends if name and name.startswith("python3-")}
 
 
 def test_package_xml_names_what_ros_imports_need() -> None:
