@@ -49,8 +49,8 @@ from semcal_ros.doctor.stream_checks import (
 )
 from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
 from tests.helpers.node_scenes import make_calibration
+from tests.helpers.project import NODES, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 OK, NOTE, PROBLEM = Severity.OK, Severity.NOTE, Severity.PROBLEM
 MIB = 1024**2
 CONFIG = MicroscopeConfig("test", 0.12)

@@ -1,8 +1,10 @@
-"""What the project declares about itself in pyproject.toml."""
+"""What the project declares about itself in pyproject.toml, and what its modules import."""
 
 from __future__ import annotations
 
+import ast
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,26 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["NODES", "PYPROJECT", "ROOT"]
+__all__ = ["NODES", "PYPROJECT", "ROOT", "runtime_imports"]
 
 ROOT = Path(__file__).resolve().parents[2]
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 NODES: tuple[str, ...] = tuple(PYPROJECT["project"]["entry-points"]["semcal_ros.nodes"])
 """Names of the ROS executables."""
+
+
+def runtime_imports(path: Path) -> Iterator[str]:
+    """Full names of all that a module imports at run time, inside functions too."""
+    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            pending.extend(node.orelse)
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            # `from semcal_ros import x` names the part in the alias.
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        pending.extend(ast.iter_child_nodes(node))

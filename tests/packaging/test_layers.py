@@ -6,12 +6,12 @@ import ast
 import graphlib
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.project import ROOT, runtime_imports
+
 PACKAGE = ROOT / "semcal_ros"
 
 # Room -> rooms it may import, itself aside. Read from the bottom: every arrow goes down.
@@ -104,23 +104,6 @@ def _sources(layer: str) -> list[Path]:
     return sorted((PACKAGE / layer).rglob("*.py"))
 
 
-def _imports(path: Path) -> Iterator[str]:
-    """Full names of all that a module imports at run time, inside functions too."""
-    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
-    while pending:
-        node = pending.pop()
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            pending.extend(node.orelse)
-            continue
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            # `from semcal_ros import x` names the part in the alias.
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        pending.extend(ast.iter_child_nodes(node))
-
-
 def _rooms(folder: Path) -> set[str]:
     """Names of the modules and packages of a folder."""
     found = {path.stem for path in folder.glob("*.py")}
@@ -148,7 +131,7 @@ def test_a_room_imports_only_rooms_below(folder: Path, table: dict[str, set[str]
     wrong = []
     for room, below in table.items():
         for path in [*(folder / room).rglob("*.py"), *folder.glob(f"{room}.py")]:
-            for name in _imports(path):
+            for name in runtime_imports(path):
                 other = name.removeprefix(prefix).partition(".")[0]
                 if name.startswith(prefix) and other not in below | {room}:
                     wrong.append(f"{path.relative_to(ROOT)}: {name}")
@@ -161,7 +144,7 @@ def test_a_layer_imports_only_its_libraries(layer: str) -> None:
     wrong = [
         f"{path.relative_to(ROOT)}: {name}"
         for path in _sources(layer)
-        for name in _imports(path)
+        for name in runtime_imports(path)
         if name.partition(".")[0] not in allowed
     ]
     assert not wrong
@@ -172,7 +155,7 @@ def test_ros_is_imported_by_nodes_and_the_listener_only() -> None:
         f"{path.relative_to(ROOT)}: {name}"
         for path in PACKAGE.rglob("*.py")
         if not any(path.is_relative_to(place) for place in ROS_PLACES)
-        for name in _imports(path)
+        for name in runtime_imports(path)
         if name.partition(".")[0] in {"rclpy", "ament_index_python", "std_srvs", "launch"}
         or name.partition(".")[0].endswith("_msgs")
     ]
@@ -199,7 +182,7 @@ def test_core_has_no_files_clocks_or_logging() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}: {name}"
         for path in _sources("core")
-        for name in _imports(path)
+        for name in runtime_imports(path)
         if name.partition(".")[0] in NOT_IN_CORE
     ]
     calls = [

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import semcal_ros
-from tests.helpers.project import NODES, PYPROJECT, ROOT
+from tests.helpers.project import NODES, PYPROJECT, ROOT, runtime_imports
 
 PACKAGE = ROOT / "semcal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -104,18 +104,7 @@ def _declared() -> set[str]:
 def test_every_import_is_declared_and_nothing_else() -> None:
     homes = importlib.metadata.packages_distributions()
     standard = sys.stdlib_module_names | {"semcal_ros", "compression"}  # the latter: Python 3.14
-    imported = {
-        name.partition(".")[0]
-        for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        for name in (
-            [alias.name for alias in node.names]
-            if isinstance(node, ast.Import)
-            else [node.module or ""]
-            if isinstance(node, ast.ImportFrom)
-            else []
-        )
-    }
+    imported = {name.partition(".")[0] for path in MODULES for name in runtime_imports(path)}
     needed = {n for n in imported - standard if not ROS.fullmatch(n)}
     assert {home.lower() for n in needed for home in homes[n]} == _declared()
 
