@@ -535,7 +535,7 @@ def doctor(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
 def no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module("semcal_ros.doctor.diagnosis")
     seen = around(import_errors={"rclpy": "No module named 'rclpy'"}, rclpy_file="", rmw="")
-    monkeypatch.setattr(module, "look_around", lambda: seen)
+    monkeypatch.setattr(module, "collect_environment", lambda: seen)
 
 
 def test_without_ros_it_says_so_and_checks_the_rest(
