@@ -19,8 +19,8 @@ PACKAGE = ROOT / "semcal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # Packages of ROS come from a distribution or from requirements/ros-*.txt.
 ROS = re.compile(r"rclpy|rcl_interfaces|ament_index_python|std_srvs|launch\w*|\w+_msgs")
-# Distributions without a rosdep key, by what package.xml says of them.
-NO_ROSDEP_KEY = {"apsw", "backports.zstd", "tifffile"}
+# Distributions that rosdep cannot install, as package.xml says.
+NO_ROSDEP_KEY = {"apsw", "backports.zstd", "pydantic", "tifffile"}
 ROSDEP_KEYS = {
     "opencv-python-headless": "python3-opencv",
     "pillow": "python3-pil",
