@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from semcal_ros.core.errors import ConfigError
+from semcal_ros.text_files import read_text_file
 
 __all__ = ["config_directories", "config_names", "find_config_file", "read_config_text"]
 
 _SUFFIXES = (".yaml", ".yml")
-_MAX_BYTES = 1024 * 1024
+_MAX_BYTES = 1024 * 1024  # the commented template has 3 kB; this only keeps other files out
 
 
 def config_directories() -> tuple[Path, ...]:
@@ -87,13 +88,4 @@ def _existing_file(path: Path) -> Path | None:
 
 def read_config_text(path: Path) -> str:
     """Text of a configuration file; raises :class:`ConfigError` where it cannot be read."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(
-                f"{path}: {path.stat().st_size} bytes",
-                expected=f"a text of at most {_MAX_BYTES} bytes",
-            )
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "no UTF-8 text"
-        raise ConfigError(f"{path}: {reason}", expected="a readable YAML file") from error
+    return read_text_file(path, _MAX_BYTES, error=ConfigError, expected="a readable YAML file")

@@ -12,14 +12,12 @@ from ruamel.yaml.events import AliasEvent
 
 from semcal_ros.core.errors import ConfigError
 
-__all__ = ["load_yaml"]
+__all__ = ["CONSTRUCTOR_ERRORS", "load_yaml"]
 
 _MAX_REASON = 80  # a longer one would not fit on a line beside the name of the file
 # A configuration is nested 3 deep. Without a limit 3000 brackets keep the parser busy for seconds.
 _MAX_DEPTH = 16
-# A value that does not fit its tag, such as ``!!bool maybe``, surfaces as any of these.
-_YAML_ERRORS = (
-    YAMLError,
+CONSTRUCTOR_ERRORS = (
     ValueError,
     TypeError,
     LookupError,
@@ -28,6 +26,7 @@ _YAML_ERRORS = (
     RecursionError,
     AssertionError,
 )
+"""What surfaces, beside the errors of a YAML library, where a value does not fit its tag: ``!!bool maybe``."""
 
 
 class _PlainComposer(Composer):
@@ -68,6 +67,6 @@ def load_yaml(text: str, source: str) -> Any:
         line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
         reason = " ".join((error.problem or "not valid YAML").split())[:_MAX_REASON]
         seen = f"{source}: {reason}{line}"
-    except _YAML_ERRORS as error:
+    except (YAMLError, *CONSTRUCTOR_ERRORS) as error:
         seen = f"{source}: {type(error).__name__} while reading YAML"
     raise ConfigError(seen, expected="a YAML file", do="compare with msg_configs/generic.yaml")

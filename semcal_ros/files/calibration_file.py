@@ -22,13 +22,15 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_text
-from semcal_ros.files.confined import check_plain_yaml, read_plain_text
+from semcal_ros.files.plain_yaml import load_plain_yaml
+from semcal_ros.text_files import read_text_file
 
-__all__ = ["FILE_VERSION", "Calibration"]
+__all__ = ["FILE_VERSION", "Calibration", "read_calibration_text"]
 
 
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
+# A residual field of 3000 coefficients fills 49 MB with its covariance; ours have a few hundred.
 _MAX_TEXT = 64 * 1024 * 1024
 _MAX_REASON = 400
 _HEADER = (
@@ -38,17 +40,7 @@ _HEADER = (
 # What the rounding of a file's numbers may leave below zero, per coefficient.
 _NEGATIVE_CORRELATION = 1e-7
 # libyaml where it was built in: 20 times faster on the covariance.
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-# A value that its tag does not fit, such as ``!!bool maybe``, surfaces as any of these.
-_YAML_ERRORS = (
-    yaml.YAMLError,
-    ValueError,
-    LookupError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-)
 
 
 class Calibration(CalibrationModel):
@@ -78,7 +70,7 @@ class Calibration(CalibrationModel):
             If the file is missing, unreadable, corrupt, foreign or of a newer version.
         """
         name = os.fspath(path)
-        return cls.loads(read_plain_text(Path(name), _MAX_TEXT), source=name)
+        return cls.loads(read_calibration_text(Path(name)), source=name)
 
     @classmethod
     def loads(cls, text: str, *, source: str = "calibration") -> Calibration:
@@ -89,7 +81,11 @@ class Calibration(CalibrationModel):
         CalibrationFileError
             As :meth:`load`.
         """
-        data = _parsed(text, source)
+        if len(text) > _MAX_TEXT:
+            raise CalibrationFileError(
+                f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
+            )
+        data = load_plain_yaml(text, source)
         try:
             _check_kind(data, source)
             _check_schema(data, source)
@@ -149,22 +145,21 @@ class Calibration(CalibrationModel):
             ) from error
 
 
-def _parsed(text: str, source: str) -> Any:
-    if len(text) > _MAX_TEXT:
-        raise CalibrationFileError(
-            f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
-        )
-    check_plain_yaml(text, source)
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except _YAML_ERRORS as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark is not None else ""
-        raise CalibrationFileError(
-            f"{source}: not valid YAML{where}",
-            expected="a complete calibration file",
-            do="restore the file or calibrate again",
-        ) from error
+def read_calibration_text(path: Path, max_bytes: int = _MAX_TEXT) -> str:
+    """Text of a calibration file.
+
+    Raises
+    ------
+    CalibrationFileError
+        The file is missing, unreadable, not a regular file, too large, or not UTF-8 text.
+    """
+    return read_text_file(
+        path,
+        max_bytes,
+        error=CalibrationFileError,
+        expected="a readable calibration file",
+        do="check the path, or make one with `semcal calibrate`",
+    )
 
 
 def _check_kind(data: Any, source: str) -> None:

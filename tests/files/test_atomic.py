@@ -49,3 +49,24 @@ def test_mode_of_the_old_file_and_symlinks_are_kept(tmp_path: Path) -> None:
 def test_missing_folder_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         atomic_write_text(tmp_path / "no" / "a.yaml", "x")
+
+
+def test_only_files_are_replaced(tmp_path: Path) -> None:
+    """As root, too: a device or a pipe is gone for everybody once a file is moved over it."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name in ("pipe", "folder"):
+        before = (tmp_path / name).lstat()
+        with pytest.raises(OSError, match="regular file|directory"):
+            atomic_write_bytes(tmp_path / name, b"new")
+        assert (tmp_path / name).lstat() == before
+    # No file can be made in /proc, whoever asks.
+    with pytest.raises(OSError, match="/proc"):
+        atomic_write_bytes(Path("/proc/semcal.yaml"), b"new")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_name_as_long_as_file_systems_take_is_written(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 250 + ".yaml")
+    atomic_write_bytes(path, b"new")
+    assert path.read_bytes() == b"new"

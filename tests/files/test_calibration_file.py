@@ -97,7 +97,7 @@ def test_missing_and_binary_files(tmp_path):
         Calibration.load(tmp_path)
     binary = tmp_path / "x.yaml"
     binary.write_bytes(b"\xff\xfe\x00\x80" * 100)
-    with pytest.raises(CalibrationFileError, match="not a text file"):
+    with pytest.raises(CalibrationFileError, match="not UTF-8 text"):
         Calibration.load(binary)
 
 

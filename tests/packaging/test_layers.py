@@ -18,12 +18,13 @@ PACKAGE = ROOT / "semcal_ros"
 MAY_IMPORT = {
     "core": set(),
     "applications": {"core"},
-    "config": {"core"},
+    "text_files": {"core"},
+    "config": {"core", "text_files"},
     "middleware": {"core"},
     # The target of the visual servo is drawn as it is defined.
     "synthetic": {"core", "applications"},
     "bridge": {"core", "config"},
-    "files": {"core", "applications", "config", "bridge"},
+    "files": {"core", "text_files", "applications", "config", "bridge"},
     "report": {"core", "applications", "files"},
     "workflows": {"core", "applications", "config", "bridge", "files"},
     "nodes": {

@@ -27,7 +27,8 @@ from semcal_ros.core.errors import BagError, CalibrationFileError
 from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
 from semcal_ros.files.bags.messages import blank_message, jazzy_types
 from semcal_ros.files.bags.writer import BagWriter
-from semcal_ros.files.confined import check_plain_yaml
+from semcal_ros.files.plain_yaml import check_plain_yaml
+from semcal_ros.text_files import read_text_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -45,6 +46,8 @@ __all__ = [
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"
+# One file with three topics takes 1.4 kB.
+_MAX_METADATA = 16 * 1024 * 1024
 _MAX_UNROLLED = 1000
 _IDL_RULE = "=" * 80 + "\n"
 
@@ -114,8 +117,11 @@ def _locate(path: Path) -> Path:
     files = _storage_files(path)
     metadata = path / "metadata.yaml"
     if metadata.exists():
+        text = read_text_file(
+            metadata, _MAX_METADATA, error=BagError, expected="metadata as a recorder writes them"
+        )
         try:
-            check_plain_yaml(metadata.read_text(encoding="utf-8"), str(metadata))
+            check_plain_yaml(text, str(metadata))
         except CalibrationFileError as error:
             raise BagError(error.seen, expected="metadata as a recorder writes them") from error
         return _checked_name(path, files)

@@ -19,8 +19,7 @@ from semcal_ros.bridge.calibration_text import (
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
-from semcal_ros.files.calibration_file import Calibration
-from semcal_ros.files.confined import read_plain_text
+from semcal_ros.files.calibration_file import Calibration, read_calibration_text
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import value_input
@@ -148,7 +147,7 @@ class CalibrationInput:
         self._install(self._read(path))
 
     def _read(self, path: str) -> _Loaded:
-        text = read_plain_text(self._node.settings.allowed_path(path), MAX_TEXT_BYTES)
+        text = read_calibration_text(self._node.settings.allowed_path(path), MAX_TEXT_BYTES)
         return _loaded(text, path, path, time.time_ns())
 
     def _check_file(self, path: str) -> None:

@@ -1,0 +1,51 @@
+"""Text files of a bounded size: configurations, calibrations, profiles."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from semcal_ros.core.errors import SemcalError
+
+__all__ = ["read_text_file"]
+
+
+def read_text_file(
+    path: Path, max_bytes: int, *, error: type[SemcalError], expected: str, do: str = ""
+) -> str:
+    """Text of a regular file in UTF-8, with line ends as ``\\n``.
+
+    A pipe or a device, which may have no end, is refused without waiting for it.
+
+    Parameters
+    ----------
+    path
+        The file.
+    max_bytes
+        What is longer is refused before all of it is read.
+    error, expected, do
+        The class of errors, and what they say was expected and is to be done.
+
+    Raises
+    ------
+    SemcalError
+        Of the class ``error``: the file is missing, unreadable, not a regular file, too large, or
+        not UTF-8 text.
+    """
+    try:
+        # A pipe without a writer would not even open otherwise.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise error(f"{path}: not a file", expected="a regular file", do=do)
+            data = file.read(max_bytes + 1)
+        if len(data) > max_bytes:
+            raise error(
+                f"{path}: more than {max_bytes} bytes", expected=f"at most {max_bytes} bytes", do=do
+            )
+        return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as reason:
+        raise error(f"{path}: not UTF-8 text", expected=expected, do=do) from reason
+    except (OSError, ValueError) as reason:  # a name with a null byte is a ValueError
+        seen = (isinstance(reason, OSError) and reason.strerror) or reason
+        raise error(f"{path}: {seen}", expected=expected, do=do) from reason

@@ -1,0 +1,28 @@
+"""YAML that could end the process or fill its memory is refused; what calibrations have passes."""
+
+from __future__ import annotations
+
+import pytest
+
+from semcal_ros.core.errors import CalibrationFileError
+from semcal_ros.files.plain_yaml import check_plain_yaml
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        # These many brackets overrun the stack of libyaml's composer, which ends the process.
+        (200_000 * "[", "nested more than 32 deep at line 1"),
+        ("a: &own\n  - *own\n", "an anchor or alias at line 1"),
+        ("a: &x [1]\nb: [*x, *x]\n", "an anchor or alias at line 1"),
+        ("a: b: c", "not valid YAML at line 1"),
+        ("a: \x01", "not valid YAML"),
+    ],
+)
+def test_yaml_that_no_calibration_has_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(CalibrationFileError, match=reason):
+        check_plain_yaml(text, "text")
+
+
+def test_plain_yaml_passes() -> None:
+    check_plain_yaml("a: [1, {b: [2.5]}]\nc: '*not an alias'\n", "text")
