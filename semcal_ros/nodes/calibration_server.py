@@ -25,8 +25,12 @@ from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.calibration_input import calibration_digest
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode
-from semcal_ros.nodes.workers.calibration_process import CalibrationProcess
-from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, Stage, without_images
+from semcal_ros.nodes.workers.calibration_worker import (
+    CalibrationJob,
+    CalibrationProcess,
+    Stage,
+    without_images,
+)
 from semcal_ros.workflows.find_grid import FoundView
 
 __all__ = ["CalibrationServer", "main"]

@@ -54,7 +54,7 @@ def workers_of(pid: int) -> list[int]:
     """Process ids of the calibrations of a node that are more than a copy of the node."""
     threads = Path(f"/proc/{pid}/task").iterdir()
     children = [int(child) for t in threads for child in _read(t / "children").split()]
-    return [child for child in children if "serve()" in _read(Path(f"/proc/{child}/cmdline"))]
+    return [child for child in children if "spawn_main" in _read(Path(f"/proc/{child}/cmdline"))]
 
 
 @dataclass

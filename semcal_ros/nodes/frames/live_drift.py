@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import time
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
+from semcal_ros.nodes.workers.child_process import ChildProcessEnded
 from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measured, measured
 
 __all__ = ["DRIFT_SETTINGS", "FrameDrift", "LiveDrift"]
@@ -62,8 +62,6 @@ _MODE = Setting(
 )
 DRIFT_SETTINGS = (*_RESTARTING, _DETAIL, _MODE)
 
-# The process beside the stream has died, and the tracker with it.
-_LOST = (OSError, EOFError, pickle.PickleError)
 # A forecast of over so many turns is none.
 _FAR = 20.0
 # Between measurements beside the stream, in times of one.
@@ -188,9 +186,9 @@ class LiveDrift:
             # The rest of the time is for other nodes.
             self._rest_until_s = time.monotonic() + _REST * self._pace.cost_s
         except NODE_ERRORS as error:
-            self._complain(error)
-        except _LOST as error:
-            self._complain(error)
+            self._complain(str(error))
+        except ChildProcessEnded as error:
+            self._complain(f"the process that measures it {error}")
             self.reset()
 
     def _fetch(self) -> None:
@@ -200,15 +198,15 @@ class LiveDrift:
         try:
             self._tracker = self._beside.fetch().result()
             self._is_away = False
-        except _LOST as error:
-            self._complain(error)
+        except ChildProcessEnded as error:
+            self._complain(f"the process that measures it {error}")
             self.reset()
 
-    def _complain(self, error: Exception) -> None:
+    def _complain(self, reason: str) -> None:
         # Its frame has gone out: it does not count as rejected.
         self._failed += 1
         self._node.statistics.note("drift_frames_failed", self._failed)
-        self._node.warn_seldom(f"drift: {error or type(error).__name__}")
+        self._node.warn_seldom(f"drift: {reason}")
 
     def _keep(self, known: Measured) -> None:
         self._known = known

@@ -1,23 +1,39 @@
-"""What the process of a calibration does; it imports no ROS."""
+"""A calibration in a process of its own, so that the stream goes on and a stop need not wait for it.
+
+What runs in the process imports no ROS.
+"""
 
 from __future__ import annotations
 
-import json
-import os
-import pickle
-import sys
+import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from semcal_ros.core.errors import CalibrationError, SemcalError
+from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
 from semcal_ros.workflows.find_grid import FoundView
 
-__all__ = ["CalibrationJob", "JobResult", "Stage", "serve", "without_images"]
+__all__ = [
+    "CalibrationJob",
+    "CalibrationProcess",
+    "JobResult",
+    "Stage",
+    "serve",
+    "without_images",
+]
+
+# How often a running calibration asks whether it is still wanted: as fast as a person sees a stop.
+_POLL_S = 0.1
+# A stage is published when it changes, but not more often than can be read, and as a sign of life in between.
+_OFTEN_S, _SELDOM_S = 0.2, 1.0
+# A third of the weight of a live node (sched(7)), where both want the same processor: those keep up, and it still
+# gets on.
+_NICE = 5
 
 # What numerics raise on degenerate views.
 _NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
@@ -90,28 +106,107 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
     return JobResult(done.calibration.dumps(), summary + notes)
 
 
-def _end_with_the_node() -> None:
-    # The node holds the other end open for as long as it lives, however it ends.
-    # Not through sys.stdin, whose lock would be missing at the end of the interpreter.
-    os.read(sys.stdin.fileno(), 1)
-    os._exit(1)
-
-
-def serve() -> None:
-    """Read one pickled job from stdin; write stages and at last the result to stdout, one JSON object per line."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    # Whatever else prints shall not get among the answers.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    job: CalibrationJob = pickle.load(sys.stdin.buffer)
-    threading.Thread(target=_end_with_the_node, daemon=True).start()
-
-    def tell(answer: Stage | JobResult) -> None:
-        print(json.dumps(asdict(answer)), file=answers, flush=True)
-
-    tell(_calibrate(job, lambda name, fraction: tell(Stage(name, fraction))))
+def serve(channel: Channel) -> None:
+    """Take one job; answer with its stages and at last with its result."""
+    job: CalibrationJob = channel.receive()
+    channel.send(_calibrate(job, lambda name, fraction: channel.send(Stage(name, fraction))))
 
 
 def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:
     """The views with their pixels left out, which a calibration does not need."""
     nothing = np.zeros((1, 1), dtype=np.uint8)
     return tuple(FoundView(v.name, v.magnification, nothing, v.detection) for v in views)
+
+
+class CalibrationProcess:
+    """One calibration; :meth:`run` waits for it and :meth:`cancel` ends it from another thread."""
+
+    def __init__(self, job: CalibrationJob) -> None:
+        self.job = job
+        self._lock = threading.Lock()
+        self._process: ChildProcess | None = None
+        self._cancelled = False
+        self._started_s = time.monotonic()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since it was made."""
+        return time.monotonic() - self._started_s
+
+    def cancel(self) -> None:
+        """End it at once; a run that has not begun will not begin."""
+        with self._lock:
+            self._cancelled = True
+            if self._process is not None:
+                self._process.kill()
+
+    def run(
+        self, still_wanted: Callable[[], bool], on_progress: Callable[[Stage], None]
+    ) -> JobResult:
+        """Calibrate.
+
+        Parameters
+        ----------
+        still_wanted
+            Asked some times a second; with False the calibration is given up.
+        on_progress
+            Called with the stage when that changes, though at most five times a second, and once a second anyway.
+        """
+        with self._lock:
+            if self._cancelled:
+                return JobResult("", "cancelled", failed=True)
+            process = self._process = ChildProcess(serve, _NICE)
+        try:
+            process.send(self.job)
+            return self._result(process, still_wanted, _Progress(on_progress))
+        except ChildProcessEnded as error:
+            text = "cancelled" if self._cancelled else _describe(error)
+            return JobResult("", text, failed=True)
+        finally:
+            with self._lock:
+                self._process = None
+            process.close()
+
+    @staticmethod
+    def _result(
+        process: ChildProcess, still_wanted: Callable[[], bool], progress: _Progress
+    ) -> JobResult:
+        while still_wanted():
+            progress.publish()
+            while process.poll(_POLL_S):
+                answer: Stage | JobResult = process.receive()
+                if isinstance(answer, JobResult):
+                    return answer
+                progress.take(answer)
+                progress.publish()
+        return JobResult("", "stopped", failed=True)
+
+
+class _Progress:
+    """Hands on stages at a bounded rate; the fraction never goes back, even where work begins again."""
+
+    def __init__(self, on_progress: Callable[[Stage], None]) -> None:
+        self._on_progress = on_progress
+        self._published: Stage | None = None
+        self._published_s = -_SELDOM_S
+        self._stage = Stage("start", 0.0)
+
+    def take(self, stage: Stage) -> None:
+        self._stage = replace(stage, fraction=max(stage.fraction, self._stage.fraction))
+
+    def publish(self) -> None:
+        now_s = time.monotonic()
+        wait_s = _SELDOM_S if self._stage == self._published else _OFTEN_S
+        if now_s - self._published_s >= wait_s:
+            self._published, self._published_s = self._stage, now_s
+            self._on_progress(self._stage)
+
+
+def _describe(error: ChildProcessEnded) -> str:
+    """Why there is no result, and what to do."""
+    do = "call again"
+    if error.status == -signal.SIGKILL:
+        do = "call again; if nobody ended it, memory ran out: use fewer views, or residual off"
+    elif error.status is None or error.status >= 0:
+        do = "look into the log of the node, and call again"
+    return str(CalibrationError(f"the calibration process {error} without a result", do=do))

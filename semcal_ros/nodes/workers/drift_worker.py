@@ -5,16 +5,10 @@ A thread would do its work under the interpreter's lock, which the frames need.
 
 from __future__ import annotations
 
-import contextlib
-import os
-import pickle
-import signal
-import subprocess
-import sys
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,14 +18,12 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.tracker import DriftPredictor, DriftTracker, DriftUpdate
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 
 __all__ = ["DriftProcess", "Measured", "measured", "serve"]
 
-# By name and not as a script, so that both sides pickle the same classes; this imports no ROS.
-_COMMAND = "from semcal_ros.nodes.workers.drift_worker import serve; serve()"
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
+# A tenth of the weight of a live node (sched(7): each step is a factor of 1.25): the stream goes first.
 _NICE = 10
-_END_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -69,14 +61,14 @@ def measured(
 class DriftProcess:
     """Holds a tracker elsewhere; requests are worked on one after the other, in the order in which they came.
 
-    The process is started with the first request, which takes a second or two, and anew after one that failed for want
-    of it. It ends with this one, however that ends. Futures raise what the tracker raised, or :class:`OSError`,
-    :class:`EOFError` or :class:`pickle.PickleError` if the process has died; the tracker is lost then.
+    The process is started with the first request, which takes a second or two, and again with the first request after
+    it has died. Futures raise what the tracker raised, or :class:`ChildProcessEnded` if the process has died; the
+    tracker is lost then.
     """
 
     def __init__(self) -> None:
         self._queue = ThreadPoolExecutor(1, thread_name_prefix="drift")
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
         self._warming: Future[DriftTracker] | None = None
         self._ended = False
 
@@ -106,23 +98,23 @@ class DriftProcess:
         """End the process."""
         self._ended = True
         self._queue.shutdown(wait=False, cancel_futures=True)
-        process = self._process
-        if process is not None:
-            process.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_END_S)
+        if self._process is not None:
+            # What waits for an answer ends with this.
+            self._process.kill()
+        self._queue.shutdown(wait=True)
+        if self._process is not None:
+            self._process.close()
 
     def _ask(self, tracker: DriftTracker | None, frame: _Frame | None) -> Any:
-        process = self._running()
-        stdin, stdout = process.stdin, process.stdout
-        assert stdin is not None and stdout is not None
+        if self._process is None and not self._ended:
+            self._process = ChildProcess(serve, _NICE)
+        if self._process is None or self._ended:
+            raise ChildProcessEnded(None)
         try:
-            pickle.dump((tracker, frame), stdin, protocol=pickle.HIGHEST_PROTOCOL)
-            stdin.flush()
-            answer = pickle.load(stdout)
-        except (OSError, EOFError, pickle.PickleError):
-            process.kill()
-            process.wait()
+            self._process.send((tracker, frame))
+            answer = self._process.receive()
+        except ChildProcessEnded:
+            self._process.close()
             self._process = None
             self._warming = None
             raise
@@ -130,40 +122,14 @@ class DriftProcess:
             raise answer
         return answer
 
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._ended:
-            raise EOFError("the node has ended")
-        if self._process is None:
-            # Without the node its input ends, and so does it.
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _COMMAND],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=os.environ | _ONE_THREAD,
-            )
-        return self._process
 
-
-def serve() -> None:
-    """Answer requests on stdin until it ends."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # What libraries print must not get in between.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    # Ctrl-C is for the node.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # The stream goes first, and has the other processors.
-    os.nice(_NICE)
+def serve(channel: Channel) -> None:
+    """Answer requests until there is nobody left to ask."""
+    # The stream has the other processors.
     cv2.setNumThreads(1)
-    _answer_all(sys.stdin.buffer, answers)
-
-
-def _answer_all(requests: IO[bytes], answers: IO[bytes]) -> None:
     held = DriftTracker()
     while True:
-        try:
-            tracker, frame = pickle.load(requests)
-        except EOFError:
-            return
+        tracker, frame = channel.receive()
         held = held if tracker is None else tracker
         answer: Any = held
         if frame is not None:
@@ -171,8 +137,4 @@ def _answer_all(requests: IO[bytes], answers: IO[bytes]) -> None:
                 answer = measured(held, frame.image, frame.camera, frame.time_s, frame.timing)
             except (SemcalError, cv2.error) as error:
                 answer = SemcalError(str(error))
-        try:
-            pickle.dump(answer, answers, protocol=pickle.HIGHEST_PROTOCOL)
-            answers.flush()
-        except BrokenPipeError:
-            return
+        channel.send(answer)
