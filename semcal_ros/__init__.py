@@ -6,9 +6,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from semcal_ros.calibration import Calibration
     from semcal_ros.core.camera.scan_camera import ScanCamera
     from semcal_ros.core.errors import SemcalError
-    from semcal_ros.files.calibration_file import Calibration
     from semcal_ros.workflows.calibrate import calibrate
 
 __all__ = ["Calibration", "ScanCamera", "SemcalError", "__version__", "calibrate"]
@@ -16,7 +16,7 @@ __all__ = ["Calibration", "ScanCamera", "SemcalError", "__version__", "calibrate
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Calibration": "semcal_ros.files.calibration_file",
+    "Calibration": "semcal_ros.calibration",
     "ScanCamera": "semcal_ros.core.camera.scan_camera",
     "SemcalError": "semcal_ros.core.errors",
     "calibrate": "semcal_ros.workflows.calibrate",

@@ -9,11 +9,11 @@ import click
 import numpy as np
 
 from semcal_ros.bridge.parameters import value_of
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import echo_json
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.files.calibration_file import Calibration
 
 __all__ = ["command"]
 

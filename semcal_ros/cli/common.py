@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.calibration_file import Calibration
 
 if TYPE_CHECKING:
     from semcal_ros.config.config import MicroscopeConfig

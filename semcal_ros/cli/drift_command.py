@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -26,7 +27,6 @@ from semcal_ros.cli.drift_common import (
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
 from semcal_ros.workflows.follow_drift import (

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -18,7 +19,6 @@ from semcal_ros.cli.common import (
     progress,
 )
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 

@@ -20,6 +20,7 @@ from semcal_ros.applications.cantilever import (
     repeatability,
 )
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -33,7 +34,6 @@ from semcal_ros.cli.drift_common import frame_time_option
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.tables import write_csv
 from semcal_ros.files.video import VIDEO_CODECS, film_of

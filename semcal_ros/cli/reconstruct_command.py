@@ -18,6 +18,7 @@ from semcal_ros.applications.reconstruction import (
     reconstruct,
 )
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -29,7 +30,6 @@ from semcal_ros.cli.common import (
 from semcal_ros.cli.drift_common import frame_time_option
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.meshes import MESH_SUFFIXES, UNITS_PER_M, save_cloud, save_mesh
 from semcal_ros.files.recordings import Recording, open_recording
 from semcal_ros.workflows.follow_drift import camera_of, start_time_s, with_frame_time

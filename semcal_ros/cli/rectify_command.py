@@ -14,6 +14,7 @@ from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
 from semcal_ros.cli.drift_common import echo_states, frame_time_option
 from semcal_ros.config.config import MicroscopeConfig
@@ -21,7 +22,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.files.bags.reader import BagWriter, blank_message
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, open_recording
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,

@@ -13,6 +13,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.common import (
     config_option,
     configured,
@@ -27,7 +28,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
 from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
 from semcal_ros.workflows.follow_drift import Follower, with_frame_time

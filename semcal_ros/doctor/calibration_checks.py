@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from semcal_ros.bridge.parameters import value_of
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import CalibrationSeen, Session
-from semcal_ros.files.calibration_file import Calibration
 
 __all__ = ["calibration_seen", "check_calibration", "live_size"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.calibration_checks import (
@@ -34,7 +35,6 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     magnification_seen,
 )
-from semcal_ros.files.calibration_file import Calibration
 
 __all__ = ["diagnose", "evaluate"]
 

@@ -1,4 +1,4 @@
-"""The calibration file, and :class:`Calibration`, which is what programs use."""
+"""The calibration file: its text, and the checks of what is read."""
 
 from __future__ import annotations
 
@@ -25,7 +25,14 @@ from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.plain_yaml import load_plain_yaml
 from semcal_ros.text_files import read_text_file
 
-__all__ = ["FILE_VERSION", "Calibration", "read_calibration_text"]
+__all__ = [
+    "FILE_VERSION",
+    "format_calibration",
+    "parse_calibration",
+    "read_calibration",
+    "read_calibration_text",
+    "write_calibration",
+]
 
 
 FILE_VERSION = 1
@@ -43,106 +50,88 @@ _NEGATIVE_CORRELATION = 1e-7
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
-class Calibration(CalibrationModel):
-    """A magnification-continuous calibration that can be saved and loaded.
+def read_calibration(path: str | os.PathLike[str]) -> CalibrationModel:
+    """Read a calibration file.
 
-    Examples
-    --------
-    ::
-
-        cal = Calibration.load("jsm820.yaml")
-        cam = cal.at(5250.0)
-        pixels = cam.project(points_m)
+    Raises
+    ------
+    CalibrationFileError
+        If the file is missing, unreadable, corrupt, of another kind, or of a newer version.
     """
+    name = os.fspath(path)
+    return parse_calibration(read_calibration_text(Path(name)), source=name)
 
-    @classmethod
-    def from_model(cls, model: CalibrationModel) -> Calibration:
-        """The calibration of a model that was computed by the core."""
-        return cls(**{name: getattr(model, name) for name in cls.__dataclass_fields__})
 
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read a calibration file.
+def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationModel:
+    """Parse the text of a calibration file; ``source`` names it in errors.
 
-        Raises
-        ------
-        CalibrationFileError
-            If the file is missing, unreadable, corrupt, foreign or of a newer version.
-        """
-        name = os.fspath(path)
-        return cls.loads(read_calibration_text(Path(name)), source=name)
-
-    @classmethod
-    def loads(cls, text: str, *, source: str = "calibration") -> Calibration:
-        """Parse the text of a calibration file; ``source`` names it in errors.
-
-        Raises
-        ------
-        CalibrationFileError
-            As :meth:`load`.
-        """
-        if len(text) > _MAX_TEXT:
-            raise CalibrationFileError(
-                f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
-            )
-        data = load_plain_yaml(text, source)
-        try:
-            _check_kind(data, source)
-            _check_schema(data, source)
-            calibration = cls(**_fields_from(data))
-            _check_cameras(calibration)
-        except (ValueError, ArithmeticError) as error:
-            # YAML has integers of any length, and floats whose products are none.
-            known = isinstance(error, InvalidValueError)
-            reason = str(error)[:_MAX_REASON] if known else "numbers that cannot be used"
-            raise CalibrationFileError(
-                f"{source}: {reason}", do="restore the file or calibrate again"
-            ) from error
-        return calibration
-
-    def dumps(self) -> str:
-        """The text of the calibration file, with every number in full precision."""
-        field = self.residual
-        size = len(self.covariance) - (0 if field is None else field.size)
-        own = self.covariance[:size, :size]
-        data: dict[str, Any] = {
-            "format": _FORMAT,
-            "version": FILE_VERSION,
-            "method": self.method,
-            "image_width_px": int(self.image_width),
-            "image_height_px": int(self.image_height),
-            "display_width_m": float(self.display_width_m),
-            "magnifications": [float(g) for g in self.magnifications],
-            "functions": {name: _function_to(self.functions[name]) for name in FUNCTION_NAMES},
-            "statistics": _plain(self.statistics),
-            "covariance": {
-                "size": size,
-                "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
-            },
-        }
-        if field is not None:
-            data["residual_field"] = _field_to(field, self.covariance[size:])
-        body: str = yaml.dump(
-            data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None
+    Raises
+    ------
+    CalibrationFileError
+        As :func:`read_calibration`.
+    """
+    if len(text) > _MAX_TEXT:
+        raise CalibrationFileError(
+            f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
         )
-        return _HEADER + body
+    data = load_plain_yaml(text, source)
+    try:
+        _check_kind(data, source)
+        _check_schema(data, source)
+        model = CalibrationModel(**_fields_from(data))
+        _check_cameras(model)
+    except (ValueError, ArithmeticError) as error:
+        # YAML has integers of any length, and floats whose products overflow.
+        known = isinstance(error, InvalidValueError)
+        reason = str(error)[:_MAX_REASON] if known else "numbers that cannot be used"
+        raise CalibrationFileError(
+            f"{source}: {reason}", do="restore the file or calibrate again"
+        ) from error
+    return model
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the calibration file completely or not at all.
 
-        Raises
-        ------
-        CalibrationFileError
-            If it cannot be written; an existing file is then untouched.
-        """
-        try:
-            atomic_write_text(Path(path), self.dumps())
-        except OSError as error:
-            raise CalibrationFileError(
-                f"{os.fspath(path)}: {error.strerror or error}",
-                expected="a folder that can be written",
-                do="choose another output",
-            ) from error
+def format_calibration(model: CalibrationModel) -> str:
+    """The text of the calibration file, with every number in full precision."""
+    field = model.residual
+    size = len(model.covariance) - (0 if field is None else field.size)
+    own = model.covariance[:size, :size]
+    data: dict[str, Any] = {
+        "format": _FORMAT,
+        "version": FILE_VERSION,
+        "method": model.method,
+        "image_width_px": int(model.image_width),
+        "image_height_px": int(model.image_height),
+        "display_width_m": float(model.display_width_m),
+        "magnifications": [float(g) for g in model.magnifications],
+        "functions": {name: _function_to(model.functions[name]) for name in FUNCTION_NAMES},
+        "statistics": _plain(model.statistics),
+        "covariance": {
+            "size": size,
+            "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
+        },
+    }
+    if field is not None:
+        data["residual_field"] = _field_to(field, model.covariance[size:])
+    body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
+    return _HEADER + body
+
+
+def write_calibration(model: CalibrationModel, path: str | os.PathLike[str]) -> None:
+    """Write the calibration file completely or not at all.
+
+    Raises
+    ------
+    CalibrationFileError
+        If it cannot be written; an existing file is then untouched.
+    """
+    try:
+        atomic_write_text(Path(path), format_calibration(model))
+    except OSError as error:
+        raise CalibrationFileError(
+            f"{os.fspath(path)}: {error.strerror or error}",
+            expected="a folder that can be written",
+            do="choose another output",
+        ) from error
 
 
 def read_calibration_text(path: Path, max_bytes: int = _MAX_TEXT) -> str:
@@ -191,7 +180,7 @@ def _check_schema(data: Mapping[str, Any], source: str) -> None:
     try:
         error = next(_validator().iter_errors(data), None)
     except TypeError as wrong:  # the validator compares names with patterns
-        raise CalibrationFileError(f"{source}: a key that is no text", expected="names") from wrong
+        raise CalibrationFileError(f"{source}: a key that is not text", expected="names") from wrong
     if error is not None:
         where = ".".join(str(p) for p in error.absolute_path) or "top level"
         raise CalibrationFileError(
@@ -298,7 +287,7 @@ def _with_field_covariance(functions: Array, packed: str, own: int) -> Array:
         values = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<f8")
     except (ValueError, binascii.Error) as error:
         raise InvalidValueError(
-            "a covariance of the residual field that is no base64", expected="8 bytes per number"
+            "a covariance of the residual field that is not base64", expected="8 bytes per number"
         ) from error
     if len(values) != expected:
         raise InvalidValueError(
@@ -331,9 +320,7 @@ def _covariance_from(data: Mapping[str, Any]) -> Array:
 
 def _check_covariance(matrix: Array) -> None:
     if not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
-        raise InvalidValueError(
-            "a covariance that is none", expected="finite numbers, variances >= 0"
-        )
+        raise InvalidValueError("an invalid covariance", expected="finite numbers, variances >= 0")
     # The coefficients have units that differ by orders of magnitude.
     unit = np.sqrt(np.diag(matrix))
     unit[unit == 0.0] = 1.0

@@ -15,10 +15,10 @@ from std_msgs.msg import String
 from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.common.services import trigger_service

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import CalibrationError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.find_grid import (
     CollectedViews,

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -15,7 +16,6 @@ from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_upda
 from semcal_ros.core.drift.frame_time import LEFT_IN, REMOVED, estimate_frame_time
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame
 
 __all__ = [

@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.workflows.follow_drift import Follower, camera_of, start_time_s, timing_seen
 

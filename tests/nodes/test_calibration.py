@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcal_ros.files.calibration_file import Calibration
+from semcal_ros.calibration import Calibration
 from tests.helpers.calibration_session import (
     MAGNIFICATIONS,
     PLAN,

@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64, Float64MultiArray, String
 
-from semcal_ros.files.calibration_file import Calibration
+from semcal_ros.calibration import Calibration
 from tests.helpers.node_scenes import (
     magnification_message,
     stamp_of,

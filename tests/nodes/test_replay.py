@@ -20,8 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.files.calibration_file import Calibration
 from tests.helpers.node_scenes import make_calibration, stamp_of, write_recording
 from tests.helpers.ros_process import LATCHED, PATIENT, RELIABLE, NodeProcess, Peer, running
 

@@ -17,9 +17,9 @@ from rcl_interfaces.msg import ParameterType, ParameterValue
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.nodes.frames.calibration_input import calibration_digest
 from tests.helpers.node_scenes import (
     RANGE,

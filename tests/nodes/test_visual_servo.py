@@ -19,9 +19,9 @@ from std_msgs.msg import Float64, Float64MultiArray
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift
 from semcal_ros.bridge.projection import fill_projection
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.synthetic import NOISE_FREE, Pose, preset, render_frame
 from semcal_ros.synthetic.target import TargetSpecimen
 from tests.helpers.node_scenes import image_message

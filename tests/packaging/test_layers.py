@@ -26,15 +26,17 @@ MAY_IMPORT = {
     "bridge": {"core", "config"},
     "files": {"core", "text_files", "applications", "config", "bridge"},
     "report": {"core", "applications", "files"},
-    "workflows": {"core", "applications", "config", "bridge", "files"},
+    # What programs hold: it has a file, and it can be drawn.
+    "calibration": {"core", "files", "report"},
+    "workflows": {"core", "applications", "config", "bridge", "files", "calibration"},
     "nodes": {
         *("core", "applications", "synthetic", "config", "middleware"),
-        *("bridge", "files", "workflows"),
+        *("bridge", "files", "calibration", "workflows"),
     },
-    "doctor": {"core", "config", "middleware", "bridge", "files"},
+    "doctor": {"core", "config", "middleware", "bridge", "files", "calibration"},
     "cli": {
         *("core", "applications", "synthetic", "config", "middleware", "bridge"),
-        *("files", "report", "workflows", "nodes", "doctor"),
+        *("files", "report", "calibration", "workflows", "nodes", "doctor"),
     },
 }
 # The same inside core.

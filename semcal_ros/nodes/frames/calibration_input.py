@@ -16,10 +16,11 @@ from semcal_ros.bridge.calibration_text import (
     calibration_text_from_message,
     fill_calibration_text,
 )
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
-from semcal_ros.files.calibration_file import Calibration, read_calibration_text
+from semcal_ros.files.calibration_file import read_calibration_text
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import value_input

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
@@ -19,7 +21,7 @@ from semcal_ros.report.calibration.curves import (
 from semcal_ros.report.html.encode import Picture, picture_of_figure
 from semcal_ros.report.html.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
 
-__all__ = ["ParameterGroup", "focal_length_px", "parameter_groups"]
+__all__ = ["ParameterGroup", "calibration_figure", "focal_length_px", "parameter_groups"]
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def focal_length_px(camera: ScanCamera) -> tuple[float, float]:
     gradient = np.zeros(len(PARAMETER_NAMES))
     gradient[PARAMETER_NAMES.index("m")] = 1.0 / camera.rho
     gradient[PARAMETER_NAMES.index("rho")] = -f / camera.rho
-    return f, float(np.sqrt(max(gradient @ camera.covariance @ gradient, 0.0)))
+    return f, float(np.sqrt(max(float(gradient @ camera.covariance @ gradient), 0.0)))
 
 
 def _values_and_sigmas(
@@ -147,16 +149,7 @@ def _picture(
     model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
 ) -> Picture:
     figure = new_figure(4.0, 2.4)
-    axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel=panel.unit)
-    curve(axes, g, values, sigmas, OURS)
-    magnification_axis(axes, g[0], g[-1])
-    if panel is _FOCAL:
-        log_axis_y(axes, 0.7 * float(values.min()), 1.4 * float(values.max()))
-    else:
-        wide_enough(axes, values, sigmas)
-        axes.ticklabel_format(axis="y", useOffset=False)
-    marks_of_magnifications(axes, model)
+    _draw_panel(figure.add_subplot(), model, panel, g, values, sigmas)
     first, last = (_with_sigma(values[k], sigmas[k]) for k in (0, -1))
     # What does not change may be known better at one end than at the other.
     if len(g) > 1 and first == last and np.ptp(values) <= 1e-9 * np.abs(values).max():
@@ -171,6 +164,56 @@ def _picture(
         f"largest 1-sigma {sigmas.max():.2g}.",
         f"{panel.title} ({panel.unit}): {ends}.",
     )
+
+
+def _draw_panel(
+    axes: Axes, model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
+) -> None:
+    """A parameter with its 1-sigma band."""
+    tidy(axes, xlabel="magnification", ylabel=panel.unit)
+    curve(axes, g, values, sigmas, OURS)
+    magnification_axis(axes, g[0], g[-1])
+    if panel is _FOCAL:
+        log_axis_y(axes, 0.7 * float(values.min()), 1.4 * float(values.max()))
+    else:
+        wide_enough(axes, values, sigmas)
+        axes.ticklabel_format(axis="y", useOffset=False)
+    marks_of_magnifications(axes, model)
+
+
+def calibration_figure(model: CalibrationModel) -> Figure:
+    """Pixel size and every parameter against the magnification, with 1-sigma bands, in one figure.
+
+    The focal length is left out: it is the scale over the inverse distance of the scan pivot.
+    """
+    cameras = sampled_cameras(model)
+    g = np.array([c.magnification for c in cameras])
+    panels = [panel for _, _, group in _GROUPS for panel in group if panel is not _FOCAL]
+    # The scale first, then what follows from the paper's figures.
+    panels.sort(key=lambda panel: panel.name != "m")
+    columns = 4
+    figure = new_figure(3.6 * columns, 2.5 * -(-(1 + len(panels)) // columns))
+    places = figure.subplots(-(-(1 + len(panels)) // columns), columns).ravel()
+    _draw_pixel_size(places[0], model, g, np.array([c.pixel_size_m for c in cameras]))
+    for axes, panel in zip(places[1:], panels, strict=False):
+        values, sigmas = _values_and_sigmas(model, cameras, panel.name)
+        values, sigmas = panel.factor * values - panel.offset, panel.factor * sigmas
+        _draw_panel(axes, model, panel, g, values, sigmas)
+        axes.set_title(panel.title, fontsize="small")
+    for axes in places[1 + len(panels) :]:
+        axes.remove()
+    return figure
+
+
+def _draw_pixel_size(axes: Axes, model: CalibrationModel, g: Array, sizes: Array) -> None:
+    """Mean of both axes; its uncertainty, which no logarithmic axis shows, is in the scale's panel."""
+    nm = 1e9 * sizes.mean(axis=1)
+    tidy(axes, xlabel="magnification", ylabel="nm")
+    axes.plot(g, nm, "o" if len(g) == 1 else "-", color=OURS, linewidth=1.4)
+    magnification_axis(axes, g[0], g[-1])
+    log_axis_y(axes, 0.8 * float(nm.min()), 1.25 * float(nm.max()))
+    marks_of_magnifications(axes, model)
+    axes.set_title("Size of a pixel", fontsize="small")
 
 
 def _with_sigma(value: float, sigma: float) -> str:

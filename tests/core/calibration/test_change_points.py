@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.calibration_file import Calibration
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 

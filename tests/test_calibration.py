@@ -1,0 +1,142 @@
+"""The calibration as programs hold it: comparison, text, figure, cameras, pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from semcal_ros import Calibration, SemcalError
+from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+from tests.helpers.node_scenes import make_calibration, texture
+
+MICROSCOPE = preset("jsm820")
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    views = grid_views(MICROSCOPE.camera_at, [500.0, 1000.0, 4000.0], views=3, noise_px=0.05)
+    result = calibrate_views(views, image_size=(512, 512), display_width_m=0.12)
+    return Calibration.from_model(result.model)
+
+
+def test_loads_of_one_file_are_equal(calibration, tmp_path):
+    calibration.save(tmp_path / "cal.yaml")
+    one, other = (Calibration.load(tmp_path / "cal.yaml") for _ in range(2))
+    assert one == other and one is not other
+    assert hash(one) == hash(other)
+    assert one == calibration
+    assert len({one, other, calibration}) == 1
+
+
+def test_a_calibration_with_another_number_is_another_one(calibration):
+    changed = Calibration.from_model(replace(calibration, display_width_m=0.13))
+    assert changed != calibration
+    covariance = calibration.covariance.copy()
+    covariance[0, 0] *= 1.0 + 1e-12
+    assert Calibration.from_model(replace(calibration, covariance=covariance)) != calibration
+    assert calibration != calibration.dumps()
+    assert calibration != 3
+
+
+def test_its_text_is_one_line_of_what_matters(calibration):
+    text = repr(calibration)
+    assert text.startswith("Calibration(joint, 500x to 4000x, 512 x 512 px, 9 views, RMS 0.0")
+    assert "held-out RMS 0." in text and text.endswith(" px)")
+    assert "\n" not in text and len(text) < 120
+
+
+def test_its_table_holds_the_same(calibration):
+    table = calibration._repr_html_()
+    assert table.count("<tr>") == 6
+    for cell in ("500x to 4000x", "512 x 512 px", "<td>9</td>", "held-out RMS"):
+        assert cell in table
+    edited = Calibration.from_model(replace(calibration, method="<b>", statistics={"views": "no"}))
+    assert "<b>" not in edited._repr_html_()
+    assert repr(edited) == "Calibration(<b>, 500x to 4000x, 512 x 512 px)"
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, iter])
+def test_several_magnifications_give_a_camera_each(calibration, kind):
+    wanted = [4000.0, 500.0, 777.0]
+    cameras = calibration.at(kind(wanted))
+    assert isinstance(cameras, tuple)
+    assert [c.magnification for c in cameras] == wanted
+    for camera, g in zip(cameras, wanted, strict=True):
+        np.testing.assert_array_equal(camera.parameters, calibration.at(g).parameters)
+        np.testing.assert_array_equal(camera.covariance, calibration.at(g).covariance)
+
+
+def test_numbers_of_numpy_are_numbers(calibration):
+    for g in (np.float32(500.0), np.array(500.0), 500):
+        assert calibration.at(g).magnification == 500.0
+    assert calibration.at([]) == ()
+    with pytest.raises(InvalidValueError, match="finite"):
+        calibration.at([500.0, float("nan")])
+
+
+def test_a_rectified_image_is_without_distortion(calibration):
+    camera = calibration.at(1000.0)
+    # A point of light where the raw image shows the ideal pixel (400, 90).
+    x, y = camera.distort(np.array([[400.0, 90.0]]))[0]
+    assert np.hypot(x - 400.0, y - 90.0) > 0.3
+    rows, columns = np.mgrid[:512, :512]
+    spot = 200.0 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 3.0**2))
+    flat = calibration.rectify(spot.astype(np.float32), 1000.0)
+    assert flat.shape == (512, 512) and flat.dtype == np.float32
+    moments = cv2.moments(flat)
+    found = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+    # Linear interpolation of a spot of sigma 3 px moves its centroid by less than 0.01 px.
+    assert found == pytest.approx((400.0, 90.0), abs=0.01)
+
+
+def test_images_of_another_size_show_the_same_field(calibration):
+    half = calibration.rectify(texture(size=256), 1000.0)
+    assert half.shape == (256, 256) and half.dtype == np.uint8
+    colour = calibration.rectify(np.dstack([texture(size=256)] * 3), 1000.0)
+    np.testing.assert_array_equal(colour[..., 1], half)
+    for image, g in ((np.zeros((4, 4), bool), 1000.0), (texture(), -1.0)):
+        with pytest.raises(SemcalError):
+            calibration.rectify(image, g)
+    with pytest.raises(InvalidValueError, match="interpolation"):
+        calibration.rectify(texture(), 1000.0, interpolation="sinc")
+
+
+def _lines(figure: Figure, title: str) -> np.ndarray:
+    (axes,) = (axes for axes in figure.axes if axes.get_title() == title)
+    return np.asarray(axes.lines[0].get_xydata())
+
+
+def test_the_figure_shows_scale_and_parameters(calibration):
+    figure = calibration.plot()
+    assert isinstance(figure, Figure)
+    assert len(figure.axes) == 11
+    size = _lines(figure, "Size of a pixel")
+    assert size[[0, -1], 0] == pytest.approx([500.0, 4000.0])
+    expected = 1e9 * np.mean(calibration.at(500.0).pixel_size_m)
+    assert size[0, 1] == pytest.approx(expected)
+    radial = _lines(figure, "Radial distortion")
+    assert radial[-1, 1] == pytest.approx(1e3 * calibration.at(4000.0).xi_r)
+    # Each parameter has a band of its 1-sigma; only the size of a pixel, on a log axis, has none.
+    bands = [axes.collections[0] for axes in figure.axes if axes.get_title() != "Size of a pixel"]
+    assert len(bands) == 10
+    low = bands[0].get_paths()[0].vertices[:, 1].min()
+    line = figure.axes[1].lines[0].get_ydata()
+    sigma = np.sqrt(calibration.at(500.0).covariance[0, 0])
+    nominal = calibration.nominal_px_per_m(500.0)
+    assert low <= line[0] - 100.0 * sigma / nominal + 1e-9
+
+
+def test_a_single_magnification_can_be_drawn(tmp_path):
+    model = make_calibration()
+    single = Calibration.from_model(replace(model, magnifications=model.magnifications[:1]))
+    single.plot().savefig(tmp_path / "one.png")
+    image = cv2.imread(str(tmp_path / "one.png"))
+    assert image is not None and image.std() > 5
+    assert repr(single) == "Calibration(joint, 500x, 96 x 96 px)"
