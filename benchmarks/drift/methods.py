@@ -22,6 +22,7 @@ from semcal_ros.core.registration.register import (
     Registration,
     prepare_reference,
     register,
+    register_pair,
 )
 
 try:
@@ -73,7 +74,7 @@ def _answer(result: Registration) -> Answer:
 
 
 def ours(pair: Pair, prepared: None) -> Answer:
-    return _answer(register(pair.reference, pair.image))
+    return _answer(register_pair(pair.reference, pair.image))
 
 
 def reference_of(pair: Pair) -> Reference:
@@ -145,7 +146,7 @@ def imreg(pair: Pair, prepared: None) -> Answer:
 
 
 def stackreg(pair: Pair, prepared: None) -> Answer:
-    matrix = StackReg(StackReg.TRANSLATION).register(pair.reference, pair.image)
+    matrix = StackReg(StackReg.TRANSLATION).register_pair(pair.reference, pair.image)
     return matrix[:2, 2], None
 
 

@@ -43,12 +43,13 @@ MAY_IMPORT = {
 CORE_MAY_IMPORT = {
     "errors": set(),
     "arrays": {"errors"},
+    "caches": set(),
     "camera": {"errors", "arrays"},
     "corners": {"errors", "arrays"},
-    "registration": {"errors", "arrays"},
-    "rectification": {"errors", "arrays", "camera"},
+    "registration": {"errors", "arrays", "caches"},
+    "rectification": {"errors", "arrays", "caches", "camera"},
     "calibration": {"errors", "arrays", "camera", "corners"},
-    "drift": {"errors", "arrays", "camera", "registration", "rectification"},
+    "drift": {"errors", "arrays", "caches", "camera", "registration", "rectification"},
 }
 # Layer -> distributions it may import beside the standard library.
 THIRD_PARTY = {

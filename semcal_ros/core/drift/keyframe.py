@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.registration.fractional_delay import FINE, sampled
+from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
-from semcal_ros.core.registration.register import Registration, gray_of, prepare_reference
+from semcal_ros.core.registration.register import Registration, prepare_reference, to_gray
 
 __all__ = [
     "Keyframe",
@@ -69,7 +69,7 @@ class Keyframe:
         self, picture: NDArray[np.generic], region: Region, registration: Registration
     ) -> Keyframe:
         """The keyframe with another frame in its mean, where the two overlap."""
-        gray = np.asarray(gray_of(picture), dtype=np.float32)
+        gray = np.asarray(to_gray(picture), dtype=np.float32)
         shift = registration.shift_px
         whole = np.floor(shift).astype(int)
         spans = []
@@ -88,11 +88,13 @@ class Keyframe:
         plain = np.array([1.0])
         corner = left + int(whole[0]), top + int(whole[1])
         size = right - left, bottom - top
-        moved = sampled(gray, corner, size, shift - whole, plain, FINE, -registration.offset)
+        moved = sample_shifted(
+            gray, corner, size, shift - whole, plain, FINE, -registration.alignment.offset
+        )
         mean = self.mean.copy()
         part = mean[top:bottom, left:right]
         share = np.float32(1.0 / (self.averaged + 1))
-        part += (moved * np.float32(1.0 / registration.gain) - part) * share
+        part += (moved * np.float32(1.0 / registration.alignment.gain) - part) * share
         return replace(self, mean=mean, averaged=self.averaged + 1)
 
 
@@ -101,7 +103,7 @@ def keyframe_of(
 ) -> Keyframe:
     """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
     return Keyframe(
-        shot, removed.copy(), np.array(gray_of(picture), dtype=np.float32), region, time_s
+        shot, removed.copy(), np.array(to_gray(picture), dtype=np.float32), region, time_s
     )
 
 

@@ -162,11 +162,11 @@ def _once(
 def is_mergeable(found: Match, store: KeyframeStore) -> bool:
     """Whether a frame makes the mean of its keyframe better."""
     registration, candidate = found.registration, found.candidate
-    shear = np.nan_to_num(registration.joint_px[2:], nan=0.0)
+    shear = np.nan_to_num(registration.alignment.joint_px[2:], nan=0.0)
     return (
         not candidate.rescaled
-        and store.wants(candidate.key, registration.overlap)
-        and registration.likeness > _LIKE_ENOUGH
-        and _GAINS[0] < registration.gain < _GAINS[1]
+        and store.wants(candidate.key, registration.alignment.overlap)
+        and registration.correlation > _LIKE_ENOUGH
+        and _GAINS[0] < registration.alignment.gain < _GAINS[1]
         and float(np.max(np.abs(shear))) < _LARGEST_SHEAR_PX
     )

@@ -81,7 +81,7 @@ def measure_of(
     covariance = share * registration.covariance + np.eye(2) * _SHIFT_FLOOR_PX**2
     bow = acceleration_term_s2(now)
     scan_s = 0.0 if now.timing is None else now.timing.acquisition_time_s
-    if now.timing is None or not np.all(np.isfinite(registration.joint_px)):
+    if now.timing is None or not np.all(np.isfinite(registration.alignment.joint_px)):
         shift = unit @ registration.shift_px + bow * removed[2:]
         return Measure(key, shift, unit @ covariance @ unit.T, bow=bow, scan_s=scan_s)
     frame_s = now.timing.frame_time_s
@@ -90,8 +90,8 @@ def measure_of(
     distance = float(np.hypot(*registration.shift_px))
     shear_floor = _SHEAR_FLOOR_PX**2 + (part * distance) ** 2
     floor = np.diag([_SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
-    joint = share * registration.joint_covariance + floor
-    shift = both @ registration.joint_px + np.append(bow * removed[2:], removed[:2])
+    joint = share * registration.alignment.joint_covariance + floor
+    shift = both @ registration.alignment.joint_px + np.append(bow * removed[2:], removed[:2])
     ratio = 1.0 if before.timing is None else before.timing.frame_time_s / frame_s
     return Measure(key, shift, both @ joint @ both.T, ratio, bow, scan_s)
 

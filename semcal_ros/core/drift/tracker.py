@@ -182,12 +182,12 @@ class DriftTracker:
         picture, region = self._stills.of(shot, removed)
         keyframe = keyframe_of(shot, removed, picture, region, drift.state.time_s)
         reference = keyframe.reference(self.settings.registration)
-        if not reference.complaint:
+        if not reference.defect:
             key, gone = self._store.add(keyframe, reference)
             drift.settle_later(key, removed, acceleration_term_s2(shot))
             for old in gone:
                 drift.do(Marginalise(old))
-        return reference.complaint
+        return reference.defect
 
     def _advance(self, drift: DriftFilter, shot: ScanFrame, centre_s: float) -> None:
         dt = centre_s - drift.state.time_s
@@ -299,12 +299,12 @@ class DriftTracker:
         self._misses = 0
         self._surprises.forget(drift.state)
         registration, candidate = found.registration, found.candidate
-        overlap = registration.overlap
+        overlap = registration.alignment.overlap
         if candidate.ratio > _SMALL_ZOOM:
             return self._report(shot, "keyframe", registration, overlap)
         self._store.use(candidate.key)
         status, enough, joined = "tracked", self.settings.rekey_overlap, False
-        unlike = registration.likeness < _LIKE_ENOUGH
+        unlike = registration.correlation < _LIKE_ENOUGH
         if unlike or overlap < enough:
             following = self._store.candidates(drift.state, shot, enough, _SMALL_ZOOM)
             if unlike or following[0].overlap < enough:
@@ -346,7 +346,9 @@ class DriftTracker:
             drift.do(doubt)
         if lost or (rescaled and not unusable):
             return self._restarted(drift, shot, reason)
-        return self._report(shot, f"coasting: {reason}", registration, registration.overlap)
+        return self._report(
+            shot, f"coasting: {reason}", registration, registration.alignment.overlap
+        )
 
     def _restarted(self, drift: DriftFilter, shot: ScanFrame, reason: str) -> DriftUpdate:
         """Go on from the predicted drift with this frame as keyframe."""
@@ -376,8 +378,12 @@ class DriftTracker:
         reason = status.removeprefix("coasting: ") if status.startswith("coasting") else ""
         open_ = scale_covariance(shot.camera, state.position, state.velocity)
         open_[:2, :2] += self._doubt
-        joint = np.full(4, np.nan) if registration is None else registration.joint_px
-        spread = np.full((4, 4), np.inf) if registration is None else registration.joint_covariance
+        joint = np.full(4, np.nan) if registration is None else registration.alignment.joint_px
+        spread = (
+            np.full((4, 4), np.inf)
+            if registration is None
+            else registration.alignment.joint_covariance
+        )
         return DriftUpdate(
             time_s=state.time_s,
             drift_m=state.position.copy(),
@@ -387,7 +393,7 @@ class DriftTracker:
             status=status,
             accepted=not reason,
             reason=reason,
-            residual=float("nan") if registration is None else registration.residual_rms,
+            residual=float("nan") if registration is None else registration.alignment.residual_rms,
             px_from_unit=shot.px_from_unit,
             overlap=overlap,
             calibrated=shot.camera is not None,

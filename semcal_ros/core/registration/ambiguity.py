@@ -1,24 +1,42 @@
-"""Shifts that explain a picture equally well, as on a lattice: which one to believe."""
+"""Peak disambiguation: which of several shifts that explain a picture about equally well to use.
+
+On a lattice every period gives a peak. Competing peaks are refined and compared tile by tile at
+full resolution; what the tiles cannot tell apart, a prediction may decide.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.inverse_compositional import Alignment, align, residual_energies
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.inverse_compositional import (
+    Alignment,
+    align,
+    tile_residual_energies,
+)
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["NOTHING", "choose_peak"]
+__all__ = ["NOTHING_TO_COMPARE", "choose_peak"]
 
 
-NOTHING = "nothing to compare: featureless in one direction, or too little overlap"
-# Part of the residual by which two shifts must differ to be told apart.
-_DIFFERENT = 0.05
+#: Reason for which none of the peaks could be refined.
+NOTHING_TO_COMPARE = "nothing to compare: featureless in one direction, or too little overlap"
+# Part of the residual by which two shifts must differ to be told apart: below it, the error of the
+# interpolation, which depends on the fraction of the shift, decides instead of the specimen.
+_MIN_RESIDUAL_DIFFERENCE = 0.05
 # The same for a picture to contradict a prediction: sharp lattices look a little different wherever
 # their pixels fall.
-_CONTRADICTING = 0.3
+_MIN_CONTRADICTION = 0.3
+# Peaks that were refined to within this distance of each other are the same shift.
+_SAME_SHIFT_PX = 0.5
+# A prediction covers a peak within three standard deviations.
+_PREDICTED_CHI2 = 9.0
+# Standard errors of a mean over fewer tiles are themselves wrong by more than a fifth.
+_MIN_COMMON_TILES = 16
 
 
 def choose_peak(
@@ -26,88 +44,101 @@ def choose_peak(
     pyramid: Pyramid,
     peaks: list[CoarsePeak],
     guess: Array,
-    spread: Array | None,
-) -> tuple[CoarsePeak, Alignment | None] | str:
-    """The peak to believe with its alignment, or the reason why none can be believed.
-
-    The alignment is None where there was no need to compare.
+    guess_covariance: Array | None,
+) -> tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]:
+    """The peak to use.
 
     Parameters
     ----------
     reference, pyramid
         The two pictures.
     peaks
-        Of their correlation, the best first.
-    guess, spread
+        Peaks of their correlation, the highest first; at least one.
+    guess, guess_covariance
         (2,) predicted shift and its covariance (2, 2), or None.
+
+    Returns
+    -------
+    The peak with its alignment, which is None where there was no need to refine it; or a rejection
+    where the picture does not tell which one.
 
     Notes
     -----
-    Rivals are compared at full resolution: reduced pictures differ by how their pixels happen to
+    Peaks are compared at full resolution: reduced pictures differ by how their pixels happen to
     fall.
     """
     limits, level = reference.settings, reference.levels[-1]
-    rivals = [p for p in peaks if p.correlation >= limits.rival_height * peaks[0].correlation]
-    near: list[CoarsePeak] = []
-    if len(rivals) > 1 and spread is not None:
-        near = [p for p in rivals if _within(p, guess, spread)]
-        if near and rivals[0] not in near:
+    least = limits.min_competing_height * peaks[0].correlation
+    competitors = [p for p in peaks if p.correlation >= least]
+    if len(competitors) > 1 and guess_covariance is not None:
+        predicted = [p for p in competitors if _is_predicted(p, guess, guess_covariance)]
+        if predicted and competitors[0] not in predicted:
             # The prediction decides between equals; it does not override the picture.
-            return _uncontradicted(reference, pyramid, near[0], rivals[0])
-        rivals = near or rivals
-    if len(rivals) == 1:
-        return rivals[0], None
+            return _prefer_prediction(reference, pyramid, predicted[0], competitors[0])
+        competitors = predicted or competitors
+    if len(competitors) == 1:
+        return competitors[0], None
     best: tuple[CoarsePeak, Alignment, Array | None] | None = None
-    for peak in rivals:
-        found = align(reference.levels, pyramid, np.array(peak.shift_px))
-        if found is None or not found.converged:
+    for peak in competitors:
+        alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
+        if alignment is None or not alignment.converged:
             continue
-        theirs = found, residual_energies(level, pyramid, found.shift_px)
+        energies = tile_residual_energies(level, pyramid, alignment.shift_px)
         if best is None:
-            best = (peak, *theirs)
+            best = peak, alignment, energies
             continue
-        shift, other = best[1].shift_px, found.shift_px
-        if float(np.max(np.abs(other - shift))) < 0.5:
+        shift, other = best[1].shift_px, alignment.shift_px
+        if float(np.max(np.abs(other - shift))) < _SAME_SHIFT_PX:
             continue
-        verdict = _paired(best[2], theirs[1])
-        if abs(verdict) < limits.rival_deviations:
-            return (
+        deviations = _compare_residuals(best[2], energies)
+        if abs(deviations) < limits.min_deviations:
+            return Rejection(
+                MatchFailure.AMBIGUOUS,
                 f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
-                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well"
+                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well",
             )
-        if verdict < 0.0:
-            best = (peak, *theirs)
-    return NOTHING if best is None else best[:2]
+        if deviations < 0.0:
+            best = peak, alignment, energies
+    if best is None:
+        return Rejection(MatchFailure.UNDETERMINED, NOTHING_TO_COMPARE)
+    return best[:2]
 
 
-def _uncontradicted(
-    reference: Reference, pyramid: Pyramid, near: CoarsePeak, far: CoarsePeak
-) -> tuple[CoarsePeak, Alignment | None] | str:
-    """The peak near the prediction, unless the best one explains the picture clearly better."""
-    aligned = [align(reference.levels, pyramid, np.array(p.shift_px)) for p in (near, far)]
+def _prefer_prediction(
+    reference: Reference, pyramid: Pyramid, predicted: CoarsePeak, highest: CoarsePeak
+) -> tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]:
+    """The predicted peak, unless the highest one explains the picture clearly better."""
+    alignments = [
+        align(reference.levels, pyramid, np.array(p.shift_px)) for p in (predicted, highest)
+    ]
     energies = [
         None
-        if found is None or not found.converged
-        else residual_energies(reference.levels[-1], pyramid, found.shift_px)
-        for found in aligned
+        if alignment is None or not alignment.converged
+        else tile_residual_energies(reference.levels[-1], pyramid, alignment.shift_px)
+        for alignment in alignments
     ]
-    verdict = _paired(energies[0], energies[1], _CONTRADICTING)
-    if verdict < -reference.settings.rival_deviations:
-        x, y = far.shift_px
-        return f"ambiguous: the picture says ({x:.1f}, {y:.1f}) px, far from the prediction"
-    return near, aligned[0]
+    deviations = _compare_residuals(energies[0], energies[1], _MIN_CONTRADICTION)
+    if deviations < -reference.settings.min_deviations:
+        x, y = highest.shift_px
+        return Rejection(
+            MatchFailure.AMBIGUOUS,
+            f"ambiguous: the picture says ({x:.1f}, {y:.1f}) px, far from the prediction",
+        )
+    return predicted, alignments[0]
 
 
-def _within(peak: CoarsePeak, guess: Array, spread: Array) -> bool:
+def _is_predicted(peak: CoarsePeak, guess: Array, guess_covariance: Array) -> bool:
     """Whether a peak lies within three deviations of the prediction."""
-    away = np.asarray(peak.shift_px) - guess
-    widened = spread + np.eye(2) * (0.5 * peak.step_px) ** 2
-    return float(away @ np.linalg.solve(widened, away)) <= 9.0
+    innovation = np.asarray(peak.shift_px) - guess
+    covariance = guess_covariance + np.eye(2) * (0.5 * peak.step_px) ** 2
+    return float(innovation @ np.linalg.solve(covariance, innovation)) <= _PREDICTED_CHI2
 
 
-def _paired(first: Array | None, second: Array | None, matters: float = _DIFFERENT) -> float:
+def _compare_residuals(
+    first: Array | None, second: Array | None, least: float = _MIN_RESIDUAL_DIFFERENCE
+) -> float:
     """By how many standard errors the second shift explains the common tiles worse than the first;
-    0 where the difference does not matter.
+    0 where the difference is less than the part ``least`` of the residual.
     """
     if second is None:
         return np.inf
@@ -115,13 +146,12 @@ def _paired(first: Array | None, second: Array | None, matters: float = _DIFFERE
         return -np.inf
     difference = (second - first).ravel()
     common = np.isfinite(difference)
-    if np.count_nonzero(common) < 16:
+    if np.count_nonzero(common) < _MIN_COMMON_TILES:
         return 0.0
     difference = difference[common]
     mean = float(difference.mean())
     smaller = min(float(first.ravel()[common].mean()), float(second.ravel()[common].mean()))
-    if abs(mean) < matters * smaller:
-        # The interpolation is not perfect, and differs between shifts.
+    if abs(mean) < least * smaller:
         return 0.0
     error = difference.std(ddof=1) / np.sqrt(difference.size)
     return mean / max(float(error), 1e-30)

@@ -15,14 +15,19 @@ from typing import cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array, Image
+from semcal_ros.core.arrays import AnyImage, Array, Image
 
-__all__ = ["FINE", "SHARP", "Band", "gradients", "sampled"]
+__all__ = ["FINE", "SHARP", "Band", "gradients", "sample_shifted"]
 
 
+# Frequencies at which a filter of up to 16 taps is fitted: four times as many.
 _SAMPLES = 64
+# Of the diagonal of the normal matrix, added to it: what lies outside of the band is left free, and
+# this keeps the weights small there.
+_RIDGE = 1e-9
+# Squared frequency, (rad/px)^2, below which the power of a picture is taken as constant.
+_FLAT_BELOW = 0.05
 
 
 @dataclass(frozen=True)
@@ -52,40 +57,41 @@ class Band:
 
     @property
     def frequencies(self) -> Array:
-        """(64,) frequencies at which the filters are made to be right."""
+        """(64,) frequencies at which the filters are fitted."""
         return np.asarray((np.arange(_SAMPLES) + 0.5) / _SAMPLES * self.edge)
 
     @property
     def weights(self) -> Array:
-        """(64,) how much they matter: pictures have most of their power at low frequencies."""
-        return np.asarray(1.0 / (0.05 + self.frequencies**2))
+        """(64,) their weights: pictures have most of their power at low frequencies."""
+        return np.asarray(1.0 / (_FLAT_BELOW + self.frequencies**2))
 
 
-#: For pictures that are smoothed, and for sharp ones with little noise.
+#: For pictures that are smooth, and for sharp ones with little noise.
 FINE, SHARP = Band(0.72 * np.pi, 12), Band(0.8 * np.pi, 16)
 
 
 @lru_cache(maxsize=2)
-def _fit(band: Band) -> Array:
+def _invert_normal_matrix(band: Band) -> Array:
     """(taps, taps) inverse of the normal equations of the weights."""
     offsets = np.arange(band.taps) + band.first
     difference = offsets[:, None] - offsets[None, :]
     cosines = np.cos(band.frequencies[:, None, None] * difference)
     normal = np.tensordot(band.weights, cosines, axes=1)
-    # Outside of the band the weights are free; this keeps them small there.
-    normal += 1e-9 * normal[0, 0] * np.eye(band.taps)
+    normal += _RIDGE * normal[0, 0] * np.eye(band.taps)
     return np.asarray(np.linalg.inv(normal))
 
 
-def _shift_taps(fraction: float, band: Band) -> Array:
+def _make_shift_taps(fraction: float, band: Band) -> Array:
     """Weights w with ``f(x + fraction) = sum_k w[k] f(x + first + k)``, for a fraction in [0, 1]."""
-    away = np.arange(band.taps) + band.first - fraction
-    taps = _fit(band) @ (np.cos(away[:, None] * band.frequencies) @ band.weights)
+    distance = np.arange(band.taps) + band.first - fraction
+    taps = _invert_normal_matrix(band) @ (
+        np.cos(distance[:, None] * band.frequencies) @ band.weights
+    )
     return np.asarray(taps / taps.sum())
 
 
 @lru_cache(maxsize=2)
-def _derivative_taps(band: Band) -> Array:
+def _make_derivative_taps(band: Band) -> Array:
     """Antisymmetric weights of the first derivative at the centre tap."""
     reach = np.arange(1, band.reach + 1)
     sines = 2.0 * np.sin(band.frequencies[:, None] * reach)
@@ -97,15 +103,15 @@ def _derivative_taps(band: Band) -> Array:
 
 def gradients(image: Image, band: Band) -> tuple[Image, Image]:
     """Derivatives (d/dx, d/dy) of ``image`` in units per px, each as large as ``image``."""
-    taps = _derivative_taps(band)
+    taps = _make_derivative_taps(band)
     one = np.array([1.0])
     dx = cv2.sepFilter2D(image, cv2.CV_32F, taps, one, borderType=cv2.BORDER_REFLECT_101)
     dy = cv2.sepFilter2D(image, cv2.CV_32F, one, taps, borderType=cv2.BORDER_REFLECT_101)
     return np.asarray(dx, dtype=np.float32), np.asarray(dy, dtype=np.float32)
 
 
-def sampled(
-    image: NDArray[np.generic],
+def sample_shifted(
+    image: AnyImage,
     corner: tuple[int, int],
     size: tuple[int, int],
     fraction: Array,
@@ -113,7 +119,7 @@ def sampled(
     band: Band,
     delta: float,
 ) -> Image:
-    """``image`` filtered and sampled at ``corner + (col, row) + fraction``, plus ``delta``.
+    """``image`` filtered and sample_shifted at ``corner + (col, row) + fraction``, plus ``delta``.
 
     Parameters
     ----------
@@ -132,12 +138,12 @@ def sampled(
 
     Notes
     -----
-    What the filters reach outside of the image is mirrored.
+    Beyond its edges the image is mirrored.
     """
     left, top = corner
     width, height = size
     below = np.floor(fraction).astype(int)
-    kernels = [np.convolve(smoothing, _shift_taps(float(p), band)) for p in fraction - below]
+    kernels = [np.convolve(smoothing, _make_shift_taps(float(p), band)) for p in fraction - below]
     before = len(smoothing) // 2 - band.first
     after = len(kernels[0]) - 1 - before
     x0, y0 = left + int(below[0]), top + int(below[1])

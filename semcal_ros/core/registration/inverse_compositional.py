@@ -26,13 +26,13 @@ from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
-    fitted,
-    geometry_of,
-    residuals,
+    prepare_geometry,
+    solve_step,
+    squared_residuals,
     well_posed,
 )
 from semcal_ros.core.registration.tiles import (
-    PIXELS_FOR_SLOPES,
+    HESSIAN_PIXELS,
     Pyramid,
     PyramidLevel,
     TileSums,
@@ -41,34 +41,47 @@ from semcal_ros.core.registration.tiles import (
     tile_window,
 )
 
-__all__ = ["Alignment", "align", "residual_energies"]
+__all__ = ["Alignment", "align", "tile_residual_energies", "unmeasured_alignment"]
 
 
+# A start that needs more steps than these is outside of the range of convergence.
 _MAX_PASSES = 12
-_COARSE_PASSES = 4
-_LONGEST_STEP_PX = 1.5
-# A coarse level is left when its step is this short (px of the level).
+_MAX_COARSE_PASSES = 4
+# The gradient extrapolates over a pixel or two of a sharp picture; longer steps may overshoot.
+_MAX_STEP_PX = 1.5
+# A coarse level is left when its step is this short (px of the level), less than half a pixel of
+# the next one.
 _COARSE_STEP_PX = 0.2
-# What a step leaves is at most this part of it, and its square over the pictures' finest structure.
+# What remains after a step is at most this part of it, and its square over the pictures' finest
+# structure.
 _CONTRACTION = 0.06
 _CURVATURE = 0.5
-_SIGMAS_LEFT = 0.12
-_LEAST_LEFT_PX = 5e-4
+# What may remain: 0.12 sigma adds 0.7 % to the error of the shift; below 0.0005 px interpolation
+# errors rule.
+_TOLERATED_SIGMAS = 0.12
+_MIN_TOLERANCE_PX = 5e-4
+# Scores of tiles that are nearer than this to each other share smoothed noise: a Gaussian of sigma,
+# applied to both pictures, correlates over some 4 sigma to either side; blocks are three times as
+# large, so that little of their sums is shared.
 _BLOCK_SIGMAS = 14.0
-_LEAST_BLOCKS = 36
-# Rows of tiles from which a change of the shift over the rows can be told.
-_LEAST_ROWS = 6
-# Noise of lines is looked for in that many rows of tiles, and found where it makes the variance so
-# many times larger.
-_LEAST_ROWS_OF_NOISE = 10
+# The scatter of 36 blocks tells a sigma to 1 / sqrt(2 * 36) = 12 %.
+_MIN_BLOCKS = 36
+# Rows of tiles from which a change of the shift over the rows can be told apart from noise.
+_MIN_SHEAR_ROWS = 6
+# A shear whose scaled information matrix has a larger condition number is not determined.
+_MAX_CONDITION = 1e6
+# Noise of lines is looked for from this number of rows of tiles on, and found where it makes the
+# variance this much larger; the ratio of two variances from 10 rows scatters by a factor of 1.6.
+_MIN_NOISE_ROWS = 10
 _ROWS_RATIO = 2.0
-# How many standard deviations of chance the common information must be above.
+# By how many standard deviations the common information must exceed what chance gives: once in a
+# million pictures of noise.
 _CHANCE = 5.0
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Outcome of :func:`align`; shifts are those of the cropped pictures that went in.
+    """Outcome of :func:`align`, whose shifts are those of the cropped pictures that went in.
 
     Attributes
     ----------
@@ -80,7 +93,7 @@ class Alignment:
         (4,) shift at the image's middle row, and by how much more the last row of the image is
         shifted than the first, estimated together, and their (4, 4) covariance; NaN and infinite
         where too few rows are compared.
-    look_difference_px, look_variance
+    half_difference_px, half_variance
         (2, 2) differences (rows: left/right, top/bottom) of the shifts that the two halves of the
         overlap ask for, and their variances.
     gain, offset
@@ -100,8 +113,8 @@ class Alignment:
     covariance: Array
     joint_px: Array
     joint_covariance: Array
-    look_difference_px: Array
-    look_variance: Array
+    half_difference_px: Array
+    half_variance: Array
     gain: float
     offset: float
     residual_rms: float
@@ -113,9 +126,31 @@ class Alignment:
     iterations: int
 
 
+def unmeasured_alignment() -> Alignment:
+    """The alignment of pictures between which nothing could be measured."""
+    nan = float("nan")
+    return Alignment(
+        shift_px=np.full(2, np.nan),
+        covariance=np.full((2, 2), np.inf),
+        joint_px=np.full(4, np.nan),
+        joint_covariance=np.full((4, 4), np.inf),
+        half_difference_px=np.full((2, 2), np.nan),
+        half_variance=np.full((2, 2), np.inf),
+        gain=nan,
+        offset=nan,
+        residual_rms=nan,
+        reference_variance=nan,
+        image_variance=nan,
+        common_covariance=nan,
+        overlap=0.0,
+        converged=False,
+        iterations=0,
+    )
+
+
 @dataclass(frozen=True)
-class _Look:
-    """Everything about one look at the pixels of one level; shifts in px of the level."""
+class _Comparison:
+    """The pixels of one level compared at one shift; shifts in px of the level."""
 
     level: PyramidLevel
     window: TileWindow
@@ -128,13 +163,13 @@ class _Look:
 
     @property
     def length(self) -> float:
-        """Length of the step that the look asks for."""
+        """Length of the Gauss-Newton step."""
         return float(np.hypot(self.fit.step[0], self.fit.step[1]))
 
     @property
     def improved(self) -> Array:
         """The shift after the step, which is limited."""
-        limit = min(1.0, _LONGEST_STEP_PX / max(self.length, 1e-12))
+        limit = min(1.0, _MAX_STEP_PX / max(self.length, 1e-12))
         return np.asarray(self.shift + limit * self.fit.step)
 
 
@@ -144,9 +179,9 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
     Parameters
     ----------
     levels
-        Reference at falling reduction factors; the last one decides.
+        The reference at falling reduction factors; the last one decides.
     image
-        Image.
+        The image.
     start_px
         (2,) shift in full-resolution px, right to about a pixel of the first level.
 
@@ -159,57 +194,62 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
     mean = float(image.at(levels[0].factor).mean(dtype=np.float64))
     passes = 0
     for level in levels[:-1]:
-        slopes = None
-        for _ in range(_COARSE_PASSES):
-            look = _look(level, image, shift / level.factor, mean, slopes)
-            if look is None:
+        hessian = None
+        for _ in range(_MAX_COARSE_PASSES):
+            comparison = _compare(level, image, shift / level.factor, mean, hessian)
+            if comparison is None:
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
             passes += 1
-            shift, slopes = look.improved * level.factor, look.sums.slopes
-            if look.length < _COARSE_STEP_PX:
+            shift, hessian = comparison.improved * level.factor, comparison.sums.hessian
+            if comparison.length < _COARSE_STEP_PX:
                 break
-    slopes = None
+    hessian = None
     for _ in range(_MAX_PASSES):
-        look = _look(levels[-1], image, shift / levels[-1].factor, mean, slopes)
-        if look is None:
+        comparison = _compare(levels[-1], image, shift / levels[-1].factor, mean, hessian)
+        if comparison is None:
             return None
         passes += 1
-        shift = look.improved * levels[-1].factor
+        shift = comparison.improved * levels[-1].factor
         # Far from the right shift the gradients have less in common.
-        slopes = look.sums.slopes if look.length < _LONGEST_STEP_PX else None
-        covariance = _covariance(look)
+        hessian = comparison.sums.hessian if comparison.length < _MAX_STEP_PX else None
+        covariance = _covariance(comparison)
         sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
-        left = _CONTRACTION * look.length + _CURVATURE * look.length**2
-        converged = left < max(_SIGMAS_LEFT * sigma, _LEAST_LEFT_PX)
+        remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
+        converged = remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
         if converged:
             break
-    assert look is not None
-    if not _informed(look):
+    assert comparison is not None
+    if not _has_common_gradient(comparison):
         return None
-    return _finished(look, covariance, converged, passes)
+    return _summarise(comparison, covariance, converged, passes)
 
 
-def _look(
-    level: PyramidLevel, image: Pyramid, shift: Array, mean: float, slopes: Array | None
-) -> _Look | None:
-    """Sums and fit at a shift in px of the level; ``slopes`` are those of an earlier look."""
+def _compare(
+    level: PyramidLevel, image: Pyramid, shift: Array, mean: float, hessian: Array | None
+) -> _Comparison | None:
+    """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
+    comparison, None to compute it."""
     picture = image.at(level.factor)
     size = picture.shape[1], picture.shape[0]
     window = tile_window(level, size, shift)
     if window is None:
         return None
-    geometry = geometry_of(level, window)
-    sums = tile_sums(level, window, picture, shift, mean, slopes)
-    fit = fitted(geometry, sums)
-    return None if fit is None else _Look(level, window, geometry, sums, fit, shift, size, mean)
+    geometry = prepare_geometry(level, window)
+    sums = tile_sums(level, window, picture, shift, mean, hessian)
+    fit = solve_step(geometry, sums)
+    return (
+        None if fit is None else _Comparison(level, window, geometry, sums, fit, shift, size, mean)
+    )
 
 
-def _informed(look: _Look) -> bool:
+def _has_common_gradient(comparison: _Comparison) -> bool:
     """Whether the pictures have more gradient in common than chance gives, in every direction."""
-    level, geometry, fit = look.level, look.geometry, look.fit
-    energy = geometry.gram.sum(axis=0)[:2, :2] * np.outer(geometry.kept, geometry.kept)
-    pixels = min(float(geometry.gram[:, 3, 3].sum()), float(PIXELS_FOR_SLOPES))
+    level, geometry, fit = comparison.level, comparison.geometry, comparison.fit
+    energy = geometry.normal_matrices.sum(axis=0)[:2, :2] * np.outer(
+        geometry.gradient_share, geometry.gradient_share
+    )
+    pixels = min(float(geometry.normal_matrices[:, 3, 3].sum()), float(HESSIAN_PIXELS))
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
     values, vectors = np.linalg.eigh(fit.information)
@@ -217,14 +257,14 @@ def _informed(look: _Look) -> bool:
     return bool(values[0] > _CHANCE * chance * float(weakest @ energy @ weakest))
 
 
-def _blocks(look: _Look, scores: Array) -> Array:
-    """(blocks, k) sums of scores over so many tiles that neighbours are independent."""
-    level = look.level
-    rows = look.window.rows.stop - look.window.rows.start
-    cols = look.window.cols.stop - look.window.cols.start
+def _sum_blocks(comparison: _Comparison, scores: Array) -> Array:
+    """(blocks, k) sums of scores over as many tiles as make neighbours independent."""
+    level = comparison.level
+    rows = comparison.window.rows.stop - comparison.window.rows.start
+    cols = comparison.window.cols.stop - comparison.window.cols.start
     wanted = _BLOCK_SIGMAS * level.sigma_px
     merge = [max(1, int(np.ceil(wanted / side))) for side in level.side]
-    while (rows // merge[1]) * (cols // merge[0]) < _LEAST_BLOCKS and max(merge) > 1:
+    while (rows // merge[1]) * (cols // merge[0]) < _MIN_BLOCKS and max(merge) > 1:
         merge = [max(1, m - 1) for m in merge]
     if max(merge) == 1:
         return scores
@@ -234,98 +274,101 @@ def _blocks(look: _Look, scores: Array) -> Array:
     return np.asarray(sums.reshape(-1, scores.shape[1]))
 
 
-def _covariance(look: _Look) -> Array:
-    """(2, 2) from the scatter of the blocks' scores: noise of any colour and strength is in
-    them.
+def _covariance(comparison: _Comparison) -> Array:
+    """(2, 2) covariance from the scatter of the blocks' scores, whatever the colour and the strength
+    of the noise.
     """
-    return _robust(look, look.fit.scores, _inverse(look.fit.information))
+    inverse = np.asarray(np.linalg.inv(comparison.fit.information), dtype=np.float64)
+    return _robust_covariance(comparison, comparison.fit.scores, inverse)
 
 
-def _robust(look: _Look, scores: Array, inverse: Array) -> Array:
+def _robust_covariance(comparison: _Comparison, scores: Array, inverse: Array) -> Array:
     """Covariance from the scatter of blocks, and of whole rows of tiles where that is clearly
     larger: lines of a scan may be shifted or shaded as a whole.
     """
-    covariance = _sandwich(_blocks(look, scores), inverse)
-    cols = look.window.cols.stop - look.window.cols.start
+    covariance = _sandwich_covariance(_sum_blocks(comparison, scores), inverse)
+    cols = comparison.window.cols.stop - comparison.window.cols.start
     rows = scores.reshape(-1, cols, scores.shape[1]).sum(axis=1)
-    if len(rows) < _LEAST_ROWS_OF_NOISE:
+    if len(rows) < _MIN_NOISE_ROWS:
         return covariance
-    ratio = np.diag(_sandwich(rows, inverse)) / np.maximum(np.diag(covariance), 1e-300)
+    ratio = np.diag(_sandwich_covariance(rows, inverse)) / np.maximum(np.diag(covariance), 1e-300)
     # With few rows the ratio scatters; white noise seldom makes it so large.
     scale = np.sqrt(np.where(ratio > _ROWS_RATIO, ratio, 1.0))
     return np.asarray(covariance * np.outer(scale, scale))
 
 
-def _inverse(matrix: Array) -> Array:
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def _sandwich(blocks: Array, inverse: Array) -> Array:
+def _sandwich_covariance(blocks: Array, inverse: Array) -> Array:
+    """Covariance from the scatter of independent scores (White 1980, doi:10.2307/1912934)."""
     count, estimated = blocks.shape
     centred = blocks - blocks.mean(axis=0)
     spread = centred.T @ centred * count / max(count - estimated, 1)
     return np.asarray(inverse @ spread @ inverse.T)
 
 
-def _finished(look: _Look, covariance: Array, converged: bool, passes: int) -> Alignment:
-    gram, cross, level = look.geometry.gram, look.sums.cross.reshape(-1, 4), look.level
-    whole, seen = gram.sum(axis=0), cross.sum(axis=0)
+def _summarise(
+    comparison: _Comparison, covariance: Array, converged: bool, passes: int
+) -> Alignment:
+    level, fit = comparison.level, comparison.fit
+    whole = comparison.geometry.normal_matrices.sum(axis=0)
+    cross = comparison.sums.cross.reshape(-1, 4).sum(axis=0)
     pixels = float(whole[3, 3])
-    error = float(residuals(look.geometry, look.sums, look.fit).sum())
-    gain = float(look.fit.gain[0])
-    weights = _weights(look)
-    difference, variance = _halves(look, covariance, weights)
-    joint, joint_covariance = _with_shear(look, weights)
+    error = float(squared_residuals(comparison.geometry, comparison.sums, fit).sum())
+    gain = float(fit.gain[0])
+    weights = _tile_information(comparison)
+    difference, variance = _compare_halves(comparison, covariance, weights)
+    joint, joint_covariance = _fit_shear(comparison, weights)
     factor = level.factor
     return Alignment(
-        shift_px=look.improved * factor,
+        shift_px=comparison.improved * factor,
         covariance=covariance * factor**2,
         joint_px=joint * factor,
         joint_covariance=joint_covariance * factor**2,
-        look_difference_px=difference * factor,
-        look_variance=variance * factor**2,
+        half_difference_px=difference * factor,
+        half_variance=variance * factor**2,
         gain=gain,
-        offset=float(look.fit.offset[0]) + look.mean - gain * level.mean,
+        offset=float(fit.offset[0]) + comparison.mean - gain * level.mean,
         residual_rms=float(np.sqrt(max(error, 0.0) / pixels)),
         reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels,
-        image_variance=float(look.sums.energy.sum() - seen[3] ** 2 / pixels) / pixels,
-        common_covariance=float(seen[2] - whole[2, 3] * seen[3] / pixels) / pixels,
-        overlap=_overlap(level.size, look.image_size, look.improved),
+        image_variance=float(comparison.sums.energy.sum() - cross[3] ** 2 / pixels) / pixels,
+        common_covariance=float(cross[2] - whole[2, 3] * cross[3] / pixels) / pixels,
+        overlap=_overlap_fraction(level.size, comparison.image_size, comparison.improved),
         converged=converged,
         iterations=passes,
     )
 
 
-def _overlap(reference: tuple[int, int], image: tuple[int, int], shift: Array) -> float:
+def _overlap_fraction(reference: tuple[int, int], image: tuple[int, int], shift: Array) -> float:
     both = 1.0
     for a, b, s in zip(reference, image, shift, strict=True):
         both *= max(0.0, min(float(a), b - float(s)) - max(0.0, -float(s)))
     return both / min(reference[0] * reference[1], image[0] * image[1])
 
 
-def _weights(look: _Look) -> Array:
+def _tile_information(comparison: _Comparison) -> Array:
     """(tiles, 2, 2) each tile's part of the information, in the proportion of its gradients."""
-    own = look.geometry.gram[:, :2, :2]
-    scale = np.sqrt(np.diag(look.fit.information) / np.diag(own.sum(axis=0)))
+    own = comparison.geometry.normal_matrices[:, :2, :2]
+    scale = np.sqrt(np.diag(comparison.fit.information) / np.diag(own.sum(axis=0)))
     tiles = own * np.outer(scale, scale)
     # The products of x and y: those of the common information, spread evenly.
-    missing = look.fit.information[0, 1] - tiles[:, 0, 1].sum()
+    missing = comparison.fit.information[0, 1] - tiles[:, 0, 1].sum()
     tiles[:, 0, 1] += missing / len(tiles)
     tiles[:, 1, 0] = tiles[:, 0, 1]
     return np.asarray(tiles)
 
 
-def _halves(look: _Look, covariance: Array, weights: Array) -> tuple[Array, Array]:
+def _compare_halves(
+    comparison: _Comparison, covariance: Array, weights: Array
+) -> tuple[Array, Array]:
     """Differences of the shifts of opposite halves, and their variances."""
     difference, variance = np.zeros((2, 2)), np.full((2, 2), np.inf)
-    if look.geometry.alone:
-        # Of a lone particle no half tells anything without the other.
+    if comparison.geometry.has_constant_gain:
+        # The halves of a lone particle tell nothing without each other.
         return difference, variance
-    cols = look.window.cols.stop - look.window.cols.start
-    scores, shape = look.fit.scores, (-1, cols)
-    whole, total = look.fit.information, scores.sum(axis=0)
-    # How much larger than that of white noise the variance of the whole is, holds for its halves.
-    colour = np.diag(covariance) / np.diag(_inverse(whole))
+    cols = comparison.window.cols.stop - comparison.window.cols.start
+    scores, shape = comparison.fit.scores, (-1, cols)
+    whole, total = comparison.fit.information, scores.sum(axis=0)
+    # The variance of the whole exceeds that of white noise by the same factor as that of its halves.
+    colour = np.diag(covariance) / np.diag(np.linalg.inv(whole))
     on_grid, scores_on_grid = weights.reshape(*shape, 2, 2), scores.reshape(*shape, 2)
     rows = len(on_grid)
     halves = (
@@ -337,46 +380,49 @@ def _halves(look: _Look, covariance: Array, weights: Array) -> tuple[Array, Arra
         if not (well_posed(half) and well_posed(whole - half)):
             continue
         score = half_scores.sum(axis=(0, 1))
-        inverses = _inverse(half), _inverse(whole - half)
+        inverses = np.linalg.inv(half), np.linalg.inv(whole - half)
         difference[k] = -inverses[0] @ score + inverses[1] @ (total - score)
         variance[k] = (np.diag(inverses[0]) + np.diag(inverses[1])) * colour
     return difference, variance
 
 
-def _with_shear(look: _Look, weights: Array) -> tuple[Array, Array]:
+def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
-    cols = look.window.cols.stop - look.window.cols.start
-    y = np.repeat(look.window.y, cols)
+    cols = comparison.window.cols.stop - comparison.window.cols.start
+    y = np.repeat(comparison.window.y, cols)
     powers = np.stack([np.ones_like(y), y], axis=1)
     pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
     whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
-    if len(look.window.y) < _LEAST_ROWS or np.linalg.cond(scaled) > 1e6:
+    if len(comparison.window.y) < _MIN_SHEAR_ROWS or np.linalg.cond(scaled) > _MAX_CONDITION:
         return np.full(4, np.nan), np.full((4, 4), np.inf)
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    scores = (powers[:, :, None] * look.fit.scores[:, None, :]).reshape(-1, 4)
+    scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 4)
     step = -inverse @ scores.sum(axis=0)
-    joint = np.append(look.shift + step[:2], step[2:])
-    # What the step explains is no noise.
-    moved = powers @ step.reshape(2, 2)
-    left = look.fit.scores + np.einsum("tij,tj->ti", weights, moved)
-    scores = (powers[:, :, None] * left[:, None, :]).reshape(-1, 4)
-    return joint, _robust(look, scores, inverse)
+    joint = np.append(comparison.shift + step[:2], step[2:])
+    # What the step explains is not noise.
+    explained = np.einsum("tij,tj->ti", weights, powers @ step.reshape(2, 2))
+    residual = comparison.fit.scores + explained
+    scores = (powers[:, :, None] * residual[:, None, :]).reshape(-1, 4)
+    return joint, _robust_covariance(comparison, scores, inverse)
 
 
-def residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array) -> Array | None:
+def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array) -> Array | None:
     """(rows, cols) mean squared residual of each tile of the reference at a shift; NaN where they
     do not overlap with the image.
 
-    For comparing rival shifts of the same two pictures: a paired test over tiles tells whether one
+    For comparing competing shifts of the same two pictures: a paired test over tiles tells whether one
     explains the image better than chance and model error allow.
     """
     mean = float(image.at(level.factor).mean(dtype=np.float64))
-    look = _look(level, image, shift_px / level.factor, mean, None)
-    if look is None:
+    comparison = _compare(level, image, shift_px / level.factor, mean, None)
+    if comparison is None:
         return None
-    energies = np.full(level.gram.shape[:2], np.nan)
-    left = residuals(look.geometry, look.sums, look.fit) / level.gram[0, 0, 3, 3]
-    energies[look.window.rows, look.window.cols] = left.reshape(len(look.window.y), -1)
+    energies = np.full(level.normal_matrices.shape[:2], np.nan)
+    squares = squared_residuals(comparison.geometry, comparison.sums, comparison.fit)
+    means = squares / level.normal_matrices[0, 0, 3, 3]
+    energies[comparison.window.rows, comparison.window.cols] = means.reshape(
+        len(comparison.window.y), -1
+    )
     return energies

@@ -18,17 +18,32 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array, Image, Indices
+from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 
-__all__ = ["PictureStatistics", "gaussian_taps", "noise_variance", "picture_statistics", "smoothed"]
+__all__ = [
+    "PictureStatistics",
+    "estimate_noise_variance",
+    "gaussian_taps",
+    "measure_picture",
+    "smooth",
+]
 
 
+# Parts of the picture, from its middle, whose spectrum is measured. 256 px tell the smoothing; the
+# corners of the spectrum of 64 px have some 300 coefficients, which tell the noise to 8 %.
 _CROP_PX = 256
 _NOISE_CROP_PX = 64
+# Rings of the spectrum, out to its corners.
 _BINS = 48
+# Widths of the Gaussian to choose from: in steps of 12 %, over which the variance is flat.
 _SIGMAS_PX = np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)])
+# The noise is what is found beyond this part of the Nyquist frequency, in the corners.
+_NOISE_BAND = 0.9
+# A ring holds signal where it exceeds the noise by this many standard errors.
+_SIGNAL_SIGMAS = 2.0
+# The Gaussian is cut off where it has 0.2 % of its height.
+_REACH_SIGMAS = 3.5
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,7 @@ def _rings(rows: int, cols: int) -> tuple[Array, Indices, Array, Array]:
     return window, ring, middle, count
 
 
-def _radial_spectrum(image: NDArray[np.generic], crop_px: int) -> tuple[Array, Array, Array]:
+def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
     """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
     rows, cols = min(image.shape[0], crop_px), min(image.shape[1], crop_px)
     top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
@@ -75,30 +90,31 @@ def _radial_spectrum(image: NDArray[np.generic], crop_px: int) -> tuple[Array, A
     return middle[filled], (total[filled] / count[filled]), count[filled]
 
 
-def _floor(w: Array, power: Array, count: Array) -> float:
-    corners = w > 0.9 * np.pi
+def _noise_floor(w: Array, power: Array, count: Array) -> float:
+    """Mean power in the corners of the spectrum."""
+    corners = w > _NOISE_BAND * np.pi
     return float(np.average(power[corners], weights=count[corners]))
 
 
-def noise_variance(image: NDArray[np.generic]) -> float:
+def estimate_noise_variance(image: AnyImage) -> float:
     """Variance of the white part of ``image`` per pixel, from its middle."""
-    return _floor(*_radial_spectrum(image, _NOISE_CROP_PX))
+    return _noise_floor(*_radial_spectrum(image, _NOISE_CROP_PX))
 
 
-def picture_statistics(image: NDArray[np.generic], averaged: float = 1.0) -> PictureStatistics:
+def measure_picture(image: AnyImage, averaged: float = 1.0) -> PictureStatistics:
     """Noise, signal and the best smoothing of ``image`` (at least 16 x 16 px).
 
-    ``averaged`` is the number of pictures that ``image`` is the mean of: another single picture has
-    so many times its noise variance.
+    ``averaged`` is the number of pictures that ``image`` is the mean of: a single picture has this
+    many times its noise variance.
 
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; a picture with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
     w, power, count = _radial_spectrum(image, _CROP_PX)
-    noise = _floor(w, power, count)
-    # A ring's estimate scatters; what is not clearly above the noise is no signal.
+    noise = _noise_floor(w, power, count)
+    # A ring's estimate scatters; what is not clearly above the noise is not signal.
     scatter = noise * np.sqrt(2.0 / count)
-    signal = np.where(power - noise > 2.0 * scatter, power - noise, 0.0)
+    signal = np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
     signal_variance = float(np.sum(signal * count) / np.sum(count))
     if signal_variance <= 0.0 or noise <= 0.0:
         return PictureStatistics(noise, signal_variance, 0.0)
@@ -114,12 +130,12 @@ def gaussian_taps(sigma_px: float) -> Array:
     """Odd number of weights of a Gaussian, summing to one; ``[1]`` for sigma 0."""
     if sigma_px <= 0.0:
         return np.array([1.0])
-    reach = max(1, int(np.ceil(3.5 * sigma_px)))
+    reach = max(1, int(np.ceil(_REACH_SIGMAS * sigma_px)))
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return np.asarray(taps / taps.sum())
 
 
-def smoothed(image: Image, sigma_px: float) -> Image:
+def smooth(image: Image, sigma_px: float) -> Image:
     """``image`` after the Gaussian of :func:`gaussian_taps`."""
     if sigma_px <= 0.0:
         return image

@@ -16,18 +16,31 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array, Image, Indices, Mask, mad_sigma
+from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask, mad_sigma
+from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["CoarsePeak", "CoarseReference", "coarse_peaks"]
+__all__ = ["CoarsePeak", "CoarseReference", "find_coarse_peaks"]
 
 
+# Longest sides to which the pictures are reduced, tried one after the other: each step costs four
+# times as much, and textures with little structure left at one size may have it at the next.
 _LEVELS_PX = (128, 256, 512)
 # A maximum over some 10^4 shifts of unrelated pictures stays below about 5 robust deviations.
 _SIGNIFICANT = 7.0
 # On a lattice the whole surface oscillates, so that its spread says nothing; its height does.
-_HIGH = 0.5
+_MIN_CORRELATION = 0.5
+# Peaks lower than this fraction of the highest are left out; competitors must reach 0.7 of it.
+_MIN_HEIGHT = 0.5
+# The highest peaks, and the same number of those nearest to the prediction.
 _MAX_PEAKS = 8
+# Shading is what is broader than an eighth of the field; a blur by a 16th of it keeps that.
+_SHADING_PARTS = 16.0
+# Fewer samples along an axis do not make a correlation.
+_MIN_SAMPLES = 4.0
+# Reductions times sizes of images for which the reference's part of a surface is kept: the sizes
+# differ with what the drift leaves of a frame.
+_KEPT_PARTS = 6
 
 
 @dataclass(frozen=True)
@@ -54,12 +67,12 @@ class CoarsePeak:
     @property
     def significant(self) -> bool:
         """Whether unrelated pictures are unlikely to give such a peak."""
-        return self.significance >= _SIGNIFICANT or self.correlation >= _HIGH
+        return self.significance >= _SIGNIFICANT or self.correlation >= _MIN_CORRELATION
 
 
 @dataclass(frozen=True)
-class _Half:
-    """All that one picture contributes to the surface of a pair of sizes."""
+class _SurfacePart:
+    """What one picture contributes to the surface of a pair of sizes."""
 
     reduced: Image
     spectrum: NDArray[np.complex64]
@@ -68,18 +81,19 @@ class _Half:
 
 
 @dataclass(frozen=True)
-class _Geometry:
+class _SurfaceGeometry:
     """What a surface looks like for two sizes.
 
-    ``there`` and ``here`` are the first and last-plus-one samples of reference and image that
-    overlap at each shift, ``count`` (rows, cols) the overlapping samples, ``root`` their square root,
-    ``allowed`` whether they are enough, ``size`` that of the Fourier transforms.
+    ``reference_spans`` and ``image_spans`` are the first and last-plus-one samples of reference and
+    image that overlap at each shift (rows, then columns), ``count`` (rows, cols) the number of
+    overlapping samples, ``root`` its square root, ``allowed`` whether it is enough, ``size`` that
+    of the Fourier transforms.
     """
 
     shift_x: Indices
     shift_y: Indices
-    here: tuple[tuple[Indices, ...], tuple[Indices, ...]]
-    there: tuple[tuple[Indices, ...], tuple[Indices, ...]]
+    reference_spans: tuple[tuple[Indices, ...], tuple[Indices, ...]]
+    image_spans: tuple[tuple[Indices, ...], tuple[Indices, ...]]
     count: Image
     root: Image
     allowed: Mask
@@ -88,7 +102,7 @@ class _Geometry:
 
 @dataclass(frozen=True)
 class CoarseReference:
-    """A reference picture for :func:`coarse_peaks`.
+    """A reference picture for :func:`find_coarse_peaks`.
 
     Parameters
     ----------
@@ -101,27 +115,30 @@ class CoarseReference:
 
     pyramid: Pyramid
     min_overlap: float
-    # Everything about the reference for one reduction and one size of image.
-    _known: dict[tuple[int, tuple[int, ...]], _Half] = field(
-        default_factory=dict, repr=False, compare=False
+    _parts: LruCache[tuple[int, tuple[int, ...]], _SurfacePart | None] = field(
+        default_factory=lambda: LruCache(_KEPT_PARTS), repr=False, compare=False
     )
 
-    def half(self, factor: int, image_shape: tuple[int, ...]) -> _Half | None:
-        """The reference's part of the surface, computed once."""
-        key = factor, image_shape
-        if key not in self._known:
-            small = _flat(self.pyramid.at(factor))
-            geometry = _geometry(small.shape, image_shape, self.min_overlap)
-            if geometry is None:
-                return None
-            self._known[key] = _half(small, geometry, *geometry.here)
-        return self._known[key]
+    def part(self, factor: int, image_shape: tuple[int, ...]) -> _SurfacePart | None:
+        """The reference's part of the surface for one reduction and one size of reduced image; None
+        where no shift overlaps enough.
+        """
+        return self._parts.get_or_compute(
+            (factor, image_shape), lambda: self._prepare(factor, image_shape)
+        )
+
+    def _prepare(self, factor: int, image_shape: tuple[int, ...]) -> _SurfacePart | None:
+        small = _remove_shading(self.pyramid.at(factor))
+        geometry = _plan_surface(small.shape, image_shape, self.min_overlap)
+        if geometry is None:
+            return None
+        return _prepare_part(small, geometry, *geometry.reference_spans)
 
 
-def coarse_peaks(
+def find_coarse_peaks(
     reference: CoarseReference, image: Pyramid, guess_px: Array, *, finest: bool = False
 ) -> list[CoarsePeak]:
-    """Local maxima of the correlation, best first, down to half of the height of the best.
+    """Local maxima of the correlation, the highest first, down to half of the height of the highest.
 
     Parameters
     ----------
@@ -141,7 +158,7 @@ def coarse_peaks(
     best: list[CoarsePeak] = []
     for level in _LEVELS_PX[-1:] if finest else _LEVELS_PX:
         factor = 1 << max(0, int(np.ceil(np.log2(longest / level))))
-        peaks = _peaks_at(reference, image, factor, guess_px)
+        peaks = _find_peaks_at(reference, image, factor, guess_px)
         if peaks and (not best or peaks[0].significance > best[0].significance):
             best = peaks
         if (peaks and peaks[0].significant) or factor == 1:
@@ -149,28 +166,28 @@ def coarse_peaks(
     return best if best and best[0].significant else []
 
 
-def _flat(picture: NDArray[np.generic]) -> Image:
+def _remove_shading(picture: AnyImage) -> Image:
     """Shading removed: only structure below an eighth of the field is compared."""
     small = np.asarray(picture, dtype=np.float32)
-    sigma = max(small.shape) / 16.0
-    # The shading is smooth: a quarter of the pixels tell it.
+    sigma = max(small.shape) / _SHADING_PARTS
+    # The shading is smooth: a sixteenth of the pixels tell it.
     tiny = cv2.resize(small, (0, 0), fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(tiny, (0, 0), 0.25 * sigma)
     background = cv2.resize(smooth, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(small - background, dtype=np.float32)
 
 
-def _peaks_at(
+def _find_peaks_at(
     reference: CoarseReference, image: Pyramid, factor: int, guess_px: Array
 ) -> list[CoarsePeak]:
-    small = _flat(image.at(factor))
-    before = reference.half(factor, small.shape)
-    if before is None:
+    small = _remove_shading(image.at(factor))
+    reference_part = reference.part(factor, small.shape)
+    if reference_part is None:
         return []
-    geometry = _geometry(before.reduced.shape, small.shape, reference.min_overlap)
+    geometry = _plan_surface(reference_part.reduced.shape, small.shape, reference.min_overlap)
     assert geometry is not None
-    now = _half(small, geometry, *geometry.there)
-    ncc = _surface(before, now, geometry)
+    image_part = _prepare_part(small, geometry, *geometry.image_spans)
+    ncc = _correlate(reference_part, image_part, geometry)
     # The spread of a chance correlation grows as the overlap shrinks.
     score = ncc * geometry.root
     top = float(score.max())
@@ -179,25 +196,25 @@ def _peaks_at(
     searched = score[::4, ::2][geometry.allowed[::4, ::2]]
     spread = mad_sigma(searched - np.median(searched))
     local = cv2.dilate(score, np.ones((5, 5), np.uint8)) <= score
-    rows, cols = np.nonzero(local & (score >= np.float32(0.5 * top)))
+    rows, cols = np.nonzero(local & (score >= np.float32(_MIN_HEIGHT * top)))
     highest = np.argsort(-score[rows, cols], kind="stable")
     origin = int(geometry.shift_x[0]), int(geometry.shift_y[0])
-    away = np.hypot(
+    distances = np.hypot(
         cols + origin[0] - guess_px[0] / factor, rows + origin[1] - guess_px[1] / factor
     )
-    nearest = np.argsort(away, kind="stable")[:_MAX_PEAKS]
+    nearest = np.argsort(distances, kind="stable")[:_MAX_PEAKS]
     # On a lattice the one near the prediction need not be among the highest.
     keep = [k for rank, k in enumerate(highest) if rank < _MAX_PEAKS or k in nearest]
     peaks = []
     for row, col in zip(rows[keep], cols[keep], strict=True):
-        fine_row, fine_col = _vertex(score, int(row), int(col))
+        fine_row, fine_col = _interpolate_vertex(score, int(row), int(col))
         shift = ((fine_col + origin[0]) * factor, (fine_row + origin[1]) * factor)
         height = float(score[row, col]) / max(spread, 1e-12)
         peaks.append(CoarsePeak(shift, float(ncc[row, col]), height, float(factor)))
     return peaks
 
 
-def _vertex(score: Image, row: int, col: int) -> tuple[float, float]:
+def _interpolate_vertex(score: Image, row: int, col: int) -> tuple[float, float]:
     """Vertex of the parabolas through the maximum and its neighbours along each axis."""
 
     def along(before: float, centre: float, after: float) -> float:
@@ -217,35 +234,38 @@ def _vertex(score: Image, row: int, col: int) -> tuple[float, float]:
     return row + d_row, col + d_col
 
 
-def _axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[Indices, ...]:
+def _overlap_along_axis(n_reference: int, n_image: int, min_overlap: float) -> tuple[Indices, ...]:
     """Shifts along one axis, and the first and last-plus-one reference sample that overlaps."""
     shifts = np.arange(-(n_reference - 1), n_image)
     first = np.maximum(0, -shifts)
     last = np.minimum(n_reference, n_image - shifts)
-    keep = last - first >= max(4.0, min_overlap * min(n_reference, n_image))
+    keep = last - first >= max(_MIN_SAMPLES, min_overlap * min(n_reference, n_image))
     return shifts[keep], first[keep], last[keep]
 
 
 @lru_cache(maxsize=8)
-def _geometry(
+def _plan_surface(
     reference: tuple[int, ...], image: tuple[int, ...], min_overlap: float
-) -> _Geometry | None:
-    shift_y, first_y, last_y = _axis(reference[0], image[0], min_overlap)
-    shift_x, first_x, last_x = _axis(reference[1], image[1], min_overlap)
+) -> _SurfaceGeometry | None:
+    shift_y, first_y, last_y = _overlap_along_axis(reference[0], image[0], min_overlap)
+    shift_x, first_x, last_x = _overlap_along_axis(reference[1], image[1], min_overlap)
     if shift_x.size == 0 or shift_y.size == 0:
         return None
-    # Shifts that are not looked at may wrap around.
+    # Shifts that are not searched may wrap around.
     size = [
         scipy.fft.next_fast_len(max(a + int(s[-1]), b - int(s[0])), real=True)
         for a, b, s in zip(reference, image, (shift_y, shift_x), strict=True)
     ]
     count = np.outer(last_y - first_y, last_x - first_x).astype(np.float64)
     smaller = float(min(reference[0] * reference[1], image[0] * image[1]))
-    return _Geometry(
+    return _SurfaceGeometry(
         shift_x=shift_x,
         shift_y=shift_y,
-        here=((first_y, last_y), (first_x, last_x)),
-        there=((first_y + shift_y, last_y + shift_y), (first_x + shift_x, last_x + shift_x)),
+        reference_spans=((first_y, last_y), (first_x, last_x)),
+        image_spans=(
+            (first_y + shift_y, last_y + shift_y),
+            (first_x + shift_x, last_x + shift_x),
+        ),
         count=count.astype(np.float32),
         root=np.sqrt(count).astype(np.float32),
         allowed=count >= min_overlap * smaller,
@@ -253,19 +273,19 @@ def _geometry(
     )
 
 
-def _half(
+def _prepare_part(
     picture: Image,
-    geometry: _Geometry,
+    geometry: _SurfaceGeometry,
     rows: tuple[Indices, ...],
     cols: tuple[Indices, ...],
-) -> _Half:
+) -> _SurfacePart:
     table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     # Shading was removed, so that single precision is enough for differences of the sums.
-    sums = _box_sums(np.asarray(table, dtype=np.float32), rows, cols)
-    energies = _box_sums(np.asarray(squares, dtype=np.float32), rows, cols)
+    sums = _sum_boxes(np.asarray(table, dtype=np.float32), rows, cols)
+    energies = _sum_boxes(np.asarray(squares, dtype=np.float32), rows, cols)
     variance = energies - sums**2 / geometry.count
     floor = 1e-9 * max(float(variance.max()), 1e-30)
-    return _Half(
+    return _SurfacePart(
         picture,
         scipy.fft.rfft2(picture, geometry.size),
         sums,
@@ -273,7 +293,7 @@ def _half(
     )
 
 
-def _box_sums(
+def _sum_boxes(
     table: Image,
     rows: tuple[Indices, ...],
     cols: tuple[Indices, ...],
@@ -285,7 +305,7 @@ def _box_sums(
     return np.asarray(sums.T)
 
 
-def _surface(reference: _Half, image: _Half, geometry: _Geometry) -> Image:
+def _correlate(reference: _SurfacePart, image: _SurfacePart, geometry: _SurfaceGeometry) -> Image:
     """Correlation coefficients at all shifts; 0 where too little overlaps."""
     size = geometry.size
     wrapped = scipy.fft.irfft2(image.spectrum * np.conj(reference.spectrum), size)

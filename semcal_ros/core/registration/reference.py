@@ -1,4 +1,4 @@
-"""A reference picture, prepared, and the limits of what may be registered against it."""
+"""A reference picture prepared for registration, and the limits of what is accepted against it."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class RegistrationSettings:
-    """Limits of :func:`register`.
+    """Limits of :func:`~semcal_ros.core.registration.register.register`.
 
     Attributes
     ----------
     min_overlap
-        Least fraction of the smaller picture that must overlap.
+        Least fraction of the smaller picture that must overlap. Shifts beyond it are not searched.
     max_sigma_px
         Largest acceptable 1-sigma of the shift in its worst direction.
-    min_likeness
-        Least correlation of the two pictures after the noise has been accounted for.
+    min_correlation
+        Least correlation of the two pictures after their noise has been accounted for.
     max_saturated
         Largest fraction of pixels at either end of the grey scale.
-    rival_height
-        Correlation peaks higher than this fraction of the best are examined as rivals.
-    rival_deviations
-        How many standard errors a rival must be worse by.
+    min_competing_height
+        Correlation peaks higher than this fraction of the highest compete with it.
+    min_deviations
+        By how many standard errors a peak must explain the picture better than its competitors.
     """
 
     min_overlap: float = 0.3
     max_sigma_px: float = 0.5
-    min_likeness: float = 0.6
+    min_correlation: float = 0.6
     max_saturated: float = 0.5
-    rival_height: float = 0.7
-    rival_deviations: float = 5.0
+    min_competing_height: float = 0.7
+    min_deviations: float = 5.0
 
 
 @dataclass(frozen=True)
 class Reference:
     """A reference picture with everything about it that does not depend on the image.
 
-    Made by :func:`prepare_reference`.
+    Made by :func:`~semcal_ros.core.registration.register.prepare_reference`.
 
     Attributes
     ----------
@@ -54,16 +54,18 @@ class Reference:
     coarse
         Its side of the search over all shifts.
     levels
-        Its tiles from the coarsest resolution to the finest.
+        Its tiles from the coarsest resolution to the finest; empty where it has a defect.
     noise_variance
-        Of its white part per pixel.
-    complaint
+        Variance of its white noise per pixel, in squared grey levels.
+    defect
         Why nothing can be registered against it, or an empty string.
+    settings
+        Limits of acceptance.
     """
 
     region: Region
     coarse: CoarseReference
     levels: tuple[PyramidLevel, ...]
     noise_variance: float
-    complaint: str
+    defect: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)

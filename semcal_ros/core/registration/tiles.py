@@ -3,24 +3,34 @@
 Everything that least squares needs of an image are its products with the reference's gradients,
 summed over tiles of some twenty pixels a side: gain and offset may then vary from tile to tile,
 halves of the picture can be compared and the scatter of the tiles tells the noise, all without
-another look at the pixels. What does not depend on the image is computed once per reference.
+touching the pixels again. What does not depend on the image is computed once per reference.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import AnyImage, Array, Image
-from semcal_ros.core.registration.fractional_delay import FINE, SHARP, Band, gradients, sampled
-from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smoothed
+from semcal_ros.core.caches import LruCache
+from semcal_ros.core.registration.fractional_delay import (
+    FINE,
+    SHARP,
+    Band,
+    gradients,
+    sample_shifted,
+)
+from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smooth
+
+if TYPE_CHECKING:
+    from semcal_ros.core.registration.tile_least_squares import TileGeometry
 
 __all__ = [
-    "PIXELS_FOR_SLOPES",
+    "HESSIAN_PIXELS",
     "Pyramid",
     "PyramidLevel",
     "TileSums",
@@ -31,11 +41,14 @@ __all__ = [
 ]
 
 
-_LEAST_TILES = 3
-#: From how many pixels the common information is taken at most.
-PIXELS_FOR_SLOPES = 12_000
-_BANDS = 3
-# Pictures that are smoothed by less have structure beyond the band of the shorter filters.
+# Tiles along a side that leave something to compare after gain and offset follow ramps.
+_MIN_TILES = 3
+#: Number of pixels from which the Gauss-Newton Hessian is taken at most: their gradients tell it to
+#: 1 %, and the gradients of the image cost more than all other sums.
+HESSIAN_PIXELS = 12_000
+# They lie in bands at the top, in the middle and at the bottom of the overlap.
+_HESSIAN_BANDS = 3
+# Pictures that are smooth by less have structure beyond the band of the shorter filters.
 _SHARP_PX = 0.3
 
 
@@ -57,9 +70,9 @@ class PyramidLevel:
         Grey level that was subtracted.
     products
         (rows, cols, 3, n) gradient by x, by y and grey level of each tile's pixels.
-    gram
-        (rows, cols, 4, 4) products of those three and of one with each other, summed over each
-        tile.
+    normal_matrices
+        (rows, cols, 4, 4) products of those three and of the constant 1 with each other, summed
+        over each tile.
     """
 
     factor: int
@@ -69,9 +82,11 @@ class PyramidLevel:
     side: tuple[int, int]
     mean: float
     products: Image
-    gram: Array
-    #: What others derive from the level and keep with it, by window.
-    kept: dict[tuple[int, ...], object] = field(default_factory=dict, repr=False, compare=False)
+    normal_matrices: Array
+    #: Geometry of the latest window, by its key.
+    geometries: LruCache[tuple[int, int, int, int], TileGeometry] = field(
+        default_factory=lambda: LruCache(1), repr=False, compare=False
+    )
 
     @property
     def margin(self) -> int:
@@ -98,7 +113,7 @@ class TileWindow:
 
 @dataclass(frozen=True)
 class TileSums:
-    """Sums over tiles of an image sampled at the reference's pixels.
+    """Sums over tiles of an image sample_shifted at the reference's pixels.
 
     Attributes
     ----------
@@ -106,14 +121,14 @@ class TileSums:
         (rows, cols, 4) products with gradient by x, by y, grey level and one.
     energy
         (rows, cols) squares.
-    slopes
-        (2, 2) common information: the image's own gradients times those of the reference, scaled to
-        all tiles; noise does not contribute to it on average.
+    hessian
+        (2, 2) Gauss-Newton Hessian of the shift: the image's own gradients times those of the
+        reference, scaled to all tiles; noise does not contribute to it on average.
     """
 
     cross: Array
     energy: Array
-    slopes: Array
+    hessian: Array
 
 
 def _band(sigma_px: float) -> Band:
@@ -141,24 +156,33 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
     margin = _margin(sigma_px)
     height, width = picture.shape
     inside = (width - 2 * margin, height - 2 * margin)
-    if min(inside) < _LEAST_TILES * 6:
+    if min(inside) < _MIN_TILES * 6:
         return None
     side_x, side_y = (_tile_side(n) for n in inside)
     cols, rows = inside[0] // side_x, inside[1] // side_y
-    smooth = smoothed(picture, sigma_px)
-    mean = float(smooth.mean(dtype=np.float64))
-    planes = np.stack([*gradients(smooth, _band(sigma_px)), smooth - np.float32(mean)])
+    smoothed = smooth(picture, sigma_px)
+    mean = float(smoothed.mean(dtype=np.float64))
+    planes = np.stack([*gradients(smoothed, _band(sigma_px)), smoothed - np.float32(mean)])
     left = margin + (inside[0] - cols * side_x) // 2
     top = margin + (inside[1] - rows * side_y) // 2
     cut = planes[:, top : top + rows * side_y, left : left + cols * side_x]
     tiles = cut.reshape(3, rows, side_y, cols, side_x).transpose(1, 3, 0, 2, 4)
     products = np.ascontiguousarray(tiles).reshape(rows, cols, 3, side_y * side_x)
-    gram = np.empty((rows, cols, 4, 4))
-    gram[..., :3, :3] = products @ products.transpose(0, 1, 3, 2)
-    gram[..., :3, 3] = gram[..., 3, :3] = products.sum(axis=3, dtype=np.float64)
-    gram[..., 3, 3] = side_x * side_y
+    normal_matrices = np.empty((rows, cols, 4, 4))
+    normal_matrices[..., :3, :3] = products @ products.transpose(0, 1, 3, 2)
+    normal_matrices[..., :3, 3] = normal_matrices[..., 3, :3] = products.sum(
+        axis=3, dtype=np.float64
+    )
+    normal_matrices[..., 3, 3] = side_x * side_y
     return PyramidLevel(
-        factor, sigma_px, (width, height), (left, top), (side_x, side_y), mean, products, gram
+        factor,
+        sigma_px,
+        (width, height),
+        (left, top),
+        (side_x, side_y),
+        mean,
+        products,
+        normal_matrices,
     )
 
 
@@ -166,13 +190,13 @@ class Pyramid:
     """A grey picture of any type at the resolutions that are asked for."""
 
     def __init__(self, picture: AnyImage) -> None:
-        self._known: dict[int, AnyImage] = {1: picture}
+        self._levels: dict[int, AnyImage] = {1: picture}
 
     def at(self, factor: int) -> AnyImage:
         """Averaged over squares of ``factor`` px, a power of two; what does not fill a square is
         left out.
         """
-        if factor not in self._known:
+        if factor not in self._levels:
             finer = self.at(factor // 2)
             if factor == 2:
                 # The average of several pixels is finer than their grey levels.
@@ -180,13 +204,13 @@ class Pyramid:
             height, width = finer.shape[0] // 2, finer.shape[1] // 2
             part = cast("NDArray[np.float32]", finer[: 2 * height, : 2 * width])
             small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
-            self._known[factor] = np.asarray(small)
-        return self._known[factor]
+            self._levels[factor] = np.asarray(small)
+        return self._levels[factor]
 
     @property
     def full(self) -> AnyImage:
         """The picture itself."""
-        return self._known[1]
+        return self._levels[1]
 
 
 def tile_window(
@@ -195,12 +219,16 @@ def tile_window(
     """The tiles that an image of that size shows at a shift; None where there are too few."""
     ranges, middles = [], []
     for axis in (0, 1):
-        origin, side, count = level.origin[axis], level.side[axis], level.gram.shape[1 - axis]
+        origin, side, count = (
+            level.origin[axis],
+            level.side[axis],
+            level.normal_matrices.shape[1 - axis],
+        )
         low = level.margin - np.floor(shift[axis]) - origin
         high = image_size[axis] - level.margin - 1 - np.ceil(shift[axis]) - origin
         first = max(0, int(np.ceil(low / side)))
         last = min(count, int(np.floor(high / side)))
-        if last - first < _LEAST_TILES:
+        if last - first < _MIN_TILES:
             return None
         ranges.append(slice(first, last))
         middle = origin + side * (np.arange(first, last) + 0.5) - 0.5 + shift[axis]
@@ -208,7 +236,7 @@ def tile_window(
     return TileWindow(ranges[1], ranges[0], middles[1])
 
 
-def _rectangle(level: PyramidLevel, window: TileWindow) -> tuple[int, int, int, int]:
+def _window_rectangle(level: PyramidLevel, window: TileWindow) -> tuple[int, int, int, int]:
     """Left, top, width and height of the window in the reference."""
     left = level.origin[0] + window.cols.start * level.side[0]
     top = level.origin[1] + window.rows.start * level.side[1]
@@ -223,58 +251,62 @@ def tile_sums(
     image: AnyImage,
     shift: Array,
     mean: float,
-    slopes: Array | None,
+    hessian: Array | None,
 ) -> TileSums:
-    """Sums over the window's tiles of ``image`` sampled at the reference's pixels plus ``shift``.
+    """Sums over the window's tiles of ``image`` sample_shifted at the reference's pixels plus ``shift``.
 
-    ``image`` is at the resolution of the level; ``mean`` is subtracted from it. ``slopes`` are
-    those of an earlier look at the same pictures, None to compute them.
+    ``image`` is at the resolution of the level; ``mean`` is subtracted from it. ``hessian`` is
+    that of an earlier shift of the same pictures, None to compute it.
     """
-    left, top, width, height = _rectangle(level, window)
+    left, top, width, height = _window_rectangle(level, window)
     side_x, side_y = level.side
     whole = np.rint(shift).astype(int)
     corner = (left + int(whole[0]), top + int(whole[1]))
     smoothing = gaussian_taps(level.sigma_px)
     fraction = np.asarray(shift - whole, dtype=np.float64)
     band = _band(level.sigma_px)
-    seen = sampled(image, corner, (width, height), fraction, smoothing, band, -mean)
+    sampled = sample_shifted(image, corner, (width, height), fraction, smoothing, band, -mean)
     rows, cols = height // side_y, width // side_x
-    tiles = _tiled(seen, level.side)
+    tiles = _split_into_tiles(sampled, level.side)
     products = level.products[window.rows, window.cols]
     cross = np.empty((rows, cols, 4))
     cross[..., :3] = (products @ tiles[..., None])[..., 0]
     cross[..., 3] = tiles @ np.ones(side_x * side_y, dtype=np.float32)
     energy = np.einsum("rcn,rcn->rc", tiles, tiles).astype(np.float64)
-    return TileSums(cross, energy, _common(level, window, seen) if slopes is None else slopes)
+    return TileSums(
+        cross, energy, _common_hessian(level, window, sampled) if hessian is None else hessian
+    )
 
 
-def _tiled(picture: Image, side: tuple[int, int]) -> Image:
+def _split_into_tiles(picture: Image, side: tuple[int, int]) -> Image:
     """(rows, cols, n) the pixels of each tile."""
     rows, cols = picture.shape[0] // side[1], picture.shape[1] // side[0]
     cut = picture.reshape(rows, side[1], cols, side[0]).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(cut).reshape(rows, cols, side[0] * side[1])
 
 
-def _common(level: PyramidLevel, window: TileWindow, seen: Image) -> Array:
+def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image) -> Array:
     """Products of both pictures' gradients, scaled from enough rows of tiles to all of them."""
     side, band = level.side[1], _band(level.sigma_px)
     rows = len(window.y)
-    wanted = max(1, -(-PIXELS_FOR_SLOPES // (seen.shape[1] * side * _BANDS)))
+    wanted = max(1, -(-HESSIAN_PIXELS // (sampled.shape[1] * side * _HESSIAN_BANDS)))
     bands = [(0, rows)]
-    if wanted * _BANDS < rows:
-        starts = (rows * (2 * k + 1) // (2 * _BANDS) - wanted // 2 for k in range(_BANDS))
+    if wanted * _HESSIAN_BANDS < rows:
+        starts = (
+            rows * (2 * k + 1) // (2 * _HESSIAN_BANDS) - wanted // 2 for k in range(_HESSIAN_BANDS)
+        )
         bands = [(first, first + wanted) for first in starts]
-    gram = level.gram[window.rows, window.cols]
+    normal_matrices = level.normal_matrices[window.rows, window.cols]
     total, used = np.zeros((2, 2)), np.zeros((4, 4))
     for first, last in bands:
         # The derivatives reach beyond the band, and are mirrored at the edges of the window.
         above = min(band.reach, first * side)
-        part = seen[first * side - above : last * side + band.reach]
+        part = sampled[first * side - above : last * side + band.reach]
         products = level.products[window.rows, window.cols][first:last, :, :2]
-        used += gram[first:last].sum(axis=(0, 1))
+        used += normal_matrices[first:last].sum(axis=(0, 1))
         for axis, own in enumerate(gradients(part, band)):
-            tiles = _tiled(own[above : above + (last - first) * side], level.side)
+            tiles = _split_into_tiles(own[above : above + (last - first) * side], level.side)
             total[:, axis] += (products @ tiles[..., None])[..., 0].sum(axis=(0, 1))
-    whole = np.diag(gram.sum(axis=(0, 1)))[:2]
+    whole = np.diag(normal_matrices.sum(axis=(0, 1)))[:2]
     share = np.sqrt(whole / np.maximum(np.diag(used)[:2], 1e-30))
     return np.asarray(0.5 * (total + total.T) * np.outer(share, share))

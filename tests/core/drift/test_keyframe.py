@@ -31,7 +31,13 @@ from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
-from semcal_ros.core.registration.register import Registration, RegistrationSettings, register
+from semcal_ros.core.registration.inverse_compositional import unmeasured_alignment
+from semcal_ros.core.registration.register import (
+    Registration,
+    RegistrationSettings,
+    register,
+    register_pair,
+)
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
 SIZE = 160
@@ -42,7 +48,8 @@ EVERYTHING = (0, 0, SIZE, SIZE)
 
 def known(shift: tuple[float, float], gain: float = 1.0, offset: float = 0.0) -> Registration:
     """A registration without error."""
-    return Registration(
+    alignment = replace(
+        unmeasured_alignment(),
         shift_px=np.array(shift),
         covariance=np.zeros((2, 2)),
         joint_px=np.array([*shift, 0.0, 0.0]),
@@ -50,13 +57,11 @@ def known(shift: tuple[float, float], gain: float = 1.0, offset: float = 0.0) ->
         gain=gain,
         offset=offset,
         residual_rms=0.0,
-        likeness=1.0,
         overlap=1.0,
         converged=True,
         iterations=1,
-        accepted=True,
-        reason="",
     )
+    return Registration(alignment, correlation=1.0, rejection=None)
 
 
 def frame(shift: tuple[float, float], sigma: float, seed: int) -> NDArray[np.float32]:
@@ -115,7 +120,7 @@ def test_sixteen_frames_at_sub_pixel_shifts_show_the_scene_with_less_noise() -> 
     # White noise would leave 64 / 16; interpolation between pixels averages, and can only lower it.
     assert 0.5 * 64.0 / 16.0 < float(np.var(error)) < 1.05 * 64.0 / 16.0
     # Registered against the noise-free scene it lies where the first frame lay.
-    found = register(scene, key.mean)
+    found = register_pair(scene, key.mean)
     assert found.accepted, found.reason
     np.testing.assert_allclose(found.shift_px, 0.0, atol=0.01)
 

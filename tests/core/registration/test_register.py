@@ -8,8 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.registration.fractional_delay import FINE, SHARP, Band, gradients, sampled
-from semcal_ros.core.registration.register import Registration, prepare_reference, register
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.fractional_delay import (
+    FINE,
+    SHARP,
+    Band,
+    gradients,
+    sample_shifted,
+)
+from semcal_ros.core.registration.register import (
+    Registration,
+    RegistrationSettings,
+    prepare_reference,
+    register,
+    register_pair,
+)
 from tests.helpers.drift_scenes import Texture, cramer_rao_px, lattice, noisy
 
 SIZE = 192
@@ -32,7 +45,7 @@ def test_sign_and_axes_of_the_shift() -> None:
     before = 100.0 * np.exp(-((x - 60.0) ** 2 + (y - 70.0) ** 2) / 50.0)
     after = 100.0 * np.exp(-((x - 67.0) ** 2 + (y - 67.0) ** 2) / 50.0)
     rng = np.random.default_rng(0)
-    result = register(
+    result = register_pair(
         before + rng.standard_normal(before.shape), after + rng.standard_normal(after.shape)
     )
     assert result.accepted, result.reason
@@ -44,7 +57,7 @@ def test_sign_and_axes_of_the_shift() -> None:
     "shift", [(0.0, 0.0), (0.5, -0.5), (3.3, -7.8), (-60.2, 41.7), (64.0, 0.4)]
 )
 def test_shift_up_to_a_third_of_the_field(shift: tuple[float, float]) -> None:
-    result = register(*_pair(shift, 4.0))
+    result = register_pair(*_pair(shift, 4.0))
     assert result.accepted, result.reason
     # Five of the stated deviations, and these must be small.
     sigma = np.sqrt(np.diag(result.covariance))
@@ -55,7 +68,7 @@ def test_shift_up_to_a_third_of_the_field(shift: tuple[float, float]) -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), st.integers(0, 1000))
 def test_any_shift(dx: float, dy: float, seed: int) -> None:
-    result = register(*_pair((dx, dy), 6.0, seed))
+    result = register_pair(*_pair((dx, dy), 6.0, seed))
     assert result.accepted, result.reason
     np.testing.assert_allclose(result.shift_px, [dx, dy], atol=0.08)
 
@@ -65,7 +78,7 @@ def test_reaches_the_cramer_rao_bound_with_honest_covariance(
     sigma: float, shift: tuple[float, float]
 ) -> None:
     trials = 60
-    results = [register(*_pair(shift, sigma, seed)) for seed in range(trials)]
+    results = [register_pair(*_pair(shift, sigma, seed)) for seed in range(trials)]
     assert all(r.accepted for r in results)
     error = np.array([r.shift_px for r in results]) - shift
     bound = cramer_rao_px(TEXTURE, shift, SIZE, sigma)
@@ -84,18 +97,18 @@ def test_reaches_the_cramer_rao_bound_with_honest_covariance(
 def test_gain_offset_and_residual_are_measured() -> None:
     reference = noisy(TEXTURE.view((0.0, 0.0), SIZE), 3.0, 0)
     image = 0.5 * noisy(TEXTURE.view((2.2, 1.1), SIZE), 3.0, 1) + 20.0
-    result = register(reference, image)
+    result = register_pair(reference, image)
     assert result.accepted
-    assert result.gain == pytest.approx(0.5, abs=0.005)
-    assert result.offset == pytest.approx(20.0, abs=1.0)
+    assert result.alignment.gain == pytest.approx(0.5, abs=0.005)
+    assert result.alignment.offset == pytest.approx(20.0, abs=1.0)
     # White noise of 1.5 in each picture after the gain; smoothing can only lower it.
-    assert 0.2 < result.residual_rms < 1.1 * 1.5 * np.sqrt(2.0)
+    assert 0.2 < result.alignment.residual_rms < 1.1 * 1.5 * np.sqrt(2.0)
 
 
 def test_a_change_of_shading_does_not_pull_the_shift() -> None:
     x = np.linspace(0.5, 1.5, SIZE)
     image = TEXTURE.view((4.3, -2.2), SIZE) * x + 0.5 * x[:, None]
-    result = register(_pair((0.0, 0.0), 3.0)[0], noisy(image, 3.0, 5))
+    result = register_pair(_pair((0.0, 0.0), 3.0)[0], noisy(image, 3.0, 5))
     assert result.accepted, result.reason
     # The gain ramp of +-50 % would pull x by more than 0.03 px if it were not part of the model.
     np.testing.assert_allclose(result.shift_px, [4.3, -2.2], atol=0.02)
@@ -105,18 +118,18 @@ def test_a_change_of_shading_does_not_pull_the_shift() -> None:
 def test_pixel_types(dtype: type) -> None:
     scale = 200.0 if dtype is np.uint16 else 1.0
     pair = [np.clip(p * scale, 0, 60000).astype(dtype) for p in _pair((1.7, 2.4), 4.0)]
-    np.testing.assert_allclose(register(*pair).shift_px, [1.7, 2.4], atol=0.03)
+    np.testing.assert_allclose(register_pair(*pair).shift_px, [1.7, 2.4], atol=0.03)
 
 
 def test_colour_pictures_are_registered_by_their_mean() -> None:
     pair = [np.repeat(p[:, :, None], 3, axis=2) for p in _pair((1.7, 2.4), 4.0)]
-    np.testing.assert_allclose(register(*pair).shift_px, [1.7, 2.4], atol=0.03)
+    np.testing.assert_allclose(register_pair(*pair).shift_px, [1.7, 2.4], atol=0.03)
 
 
 def test_regions_keep_the_coordinates_of_the_whole_picture() -> None:
     reference, image = _pair((6.4, -3.3), 3.0)
     reference[:, :20], image[-15:, :] = 0.0, 255.0
-    result = register(
+    result = register_pair(
         reference, image, reference_region=(20, 0, SIZE, SIZE), image_region=(0, 0, SIZE, SIZE - 15)
     )
     assert result.accepted, result.reason
@@ -125,7 +138,10 @@ def test_regions_keep_the_coordinates_of_the_whole_picture() -> None:
 
 def test_prepared_reference_gives_the_same() -> None:
     reference, image = _pair((1.2, 3.4), 5.0)
-    direct, prepared = register(reference, image), register(prepare_reference(reference), image)
+    direct, prepared = (
+        register_pair(reference, image),
+        register(prepare_reference(reference), image),
+    )
     np.testing.assert_array_equal(direct.shift_px, prepared.shift_px)
 
 
@@ -133,16 +149,18 @@ def test_prepared_reference_gives_the_same() -> None:
 def test_lattice_is_refused_without_and_resolved_with_a_prediction(period: float) -> None:
     shift = (2.3, -1.2)
     pair = [noisy(lattice(SIZE, period, s), 4.0, k) for k, s in enumerate([(0.0, 0.0), shift])]
-    _refused(register(*pair), "ambiguous")
+    _refused(register_pair(*pair), "ambiguous")
     vague = np.eye(2) * (2.0 * period) ** 2
-    _refused(register(*pair, guess_px=shift, guess_covariance=vague), "ambiguous")
-    result = register(*pair, guess_px=(2.0, -1.0), guess_covariance=np.eye(2) * 0.5)
+    _refused(register_pair(*pair, guess_px=shift, guess_covariance=vague), "ambiguous")
+    result = register_pair(*pair, guess_px=(2.0, -1.0), guess_covariance=np.eye(2) * 0.5)
     assert result.accepted, result.reason
     np.testing.assert_allclose(result.shift_px, shift, atol=0.05)
 
 
 def test_prediction_does_not_override_an_unambiguous_picture() -> None:
-    result = register(*_pair((20.3, 5.5), 4.0), guess_px=(0.0, 0.0), guess_covariance=np.eye(2))
+    result = register_pair(
+        *_pair((20.3, 5.5), 4.0), guess_px=(0.0, 0.0), guess_covariance=np.eye(2)
+    )
     np.testing.assert_allclose(result.shift_px, [20.3, 5.5], atol=0.03)
 
 
@@ -152,40 +170,40 @@ def _noise(seed: int) -> np.ndarray:
 
 def test_refuses_blank_saturated_and_featureless() -> None:
     reference, image = _pair((0.0, 0.0), 4.0)
-    _refused(register(reference, np.zeros((SIZE, SIZE), np.uint8)), "image: blank")
-    _refused(register(np.full((SIZE, SIZE), 7, np.uint8), image), "reference: blank")
+    _refused(register_pair(reference, np.zeros((SIZE, SIZE), np.uint8)), "image: blank")
+    _refused(register_pair(np.full((SIZE, SIZE), 7, np.uint8), image), "reference: blank")
     burnt = np.clip((image - 60.0) * 10.0, 0, 255).astype(np.uint8)
-    _refused(register(reference, burnt), "image: saturated")
-    _refused(register(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
-    _refused(register(_noise(0), _noise(1)), "reference: featureless picture (noise only)")
-    _refused(register(reference, _noise(2)), "stands out")
+    _refused(register_pair(reference, burnt), "image: saturated")
+    _refused(register_pair(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
+    _refused(register_pair(_noise(0), _noise(1)), "reference: featureless picture (noise only)")
+    _refused(register_pair(reference, _noise(2)), "stands out")
 
 
 def test_refuses_what_leaves_a_direction_open() -> None:
     ramp = 100.0 * np.tanh((np.arange(SIZE) - 90.0) / 3.0)[None, :] * np.ones((SIZE, 1))
     rng = np.random.default_rng(3)
     edge = [ramp + 5.0 * rng.standard_normal(ramp.shape) for _ in range(2)]
-    _refused(register(*edge), "one direction", "ambiguous")
+    _refused(register_pair(*edge), "one direction", "ambiguous")
 
 
 def test_refuses_unrelated_textures() -> None:
     for seed in range(12):
         blur = 1.0 + 0.5 * seed
         pair = [Texture(k + seed, 256, blur, 3.0 * blur).view((0.0, 0.0), SIZE) for k in (100, 200)]
-        assert not register(*(noisy(p, 4.0, k + seed) for k, p in enumerate(pair))).accepted
+        assert not register_pair(*(noisy(p, 4.0, k + seed) for k, p in enumerate(pair))).accepted
 
 
 def test_refuses_when_halves_move_differently() -> None:
     reference, image = _pair((0.0, 0.0), 4.0)
     image[:, SIZE // 2 :] = noisy(TEXTURE.view((3.0, 0.0), SIZE), 4.0, 9)[:, SIZE // 2 :]
-    _refused(register(reference, image), "disagree")
+    _refused(register_pair(reference, image), "disagree")
 
 
 def test_refuses_a_moving_picture_under_a_fixed_pattern() -> None:
     # Such as contamination on the detector: two shifts are equally true.
     fixed = 40.0 * Texture(9).view((0.0, 0.0), SIZE)
     reference, image = _pair((25.3, 2.2), 4.0)
-    _refused(register(reference + fixed, image + fixed), "ambiguous", "differ", "disagree")
+    _refused(register_pair(reference + fixed, image + fixed), "ambiguous", "differ", "disagree")
 
 
 @pytest.mark.parametrize(
@@ -199,7 +217,7 @@ def test_refuses_a_moving_picture_under_a_fixed_pattern() -> None:
 )
 def test_bad_arguments_are_refused_with_a_reason(arguments: dict) -> None:
     with pytest.raises(InvalidValueError, match="expected"):
-        register(np.zeros((64, 64)), **arguments)
+        register_pair(np.zeros((64, 64)), **arguments)
 
 
 @pytest.mark.parametrize("band", [FINE, SHARP])
@@ -213,7 +231,7 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures(band: Band) -> Non
     assert float(np.sqrt(np.mean((dy - exact_y)[inner] ** 2))) < 8e-4
     for fraction in ((0.3, -0.4), (0.5, 0.5), (-0.9, 0.0)):
         plain = np.array([1.0])
-        patch = sampled(picture, (10, 12), (100, 90), np.array(fraction), plain, band, 0.0)
+        patch = sample_shifted(picture, (10, 12), (100, 90), np.array(fraction), plain, band, 0.0)
         moved = TEXTURE.view((-fraction[0], -fraction[1]), 128)[12:102, 10:110]
         assert float(np.sqrt(np.mean((patch - moved) ** 2))) < 2e-3
 
@@ -230,7 +248,7 @@ def test_jitter_of_the_scan_lines_is_in_the_covariance() -> None:
             np.interp(columns - dx, np.arange(SIZE + 2), line)
             for dx, line in zip(rng.normal(0.0, 0.4, SIZE), exact, strict=True)
         ]
-        result = register(reference, noisy(np.array(lines), 3.0, 2 * trial + 1))
+        result = register_pair(reference, noisy(np.array(lines), 3.0, 2 * trial + 1))
         assert result.accepted, result.reason
         inside.append(np.abs(result.shift_px - (2.3, -1.6)) / np.sqrt(np.diag(result.covariance)))
     # 48 values: 68 and 95 % within three binomial deviations. Noise taken for white would put a
@@ -247,6 +265,33 @@ def test_featureless_in_one_direction_however_noisy_is_refused() -> None:
         stripes = 60.0 * np.sin(np.cos(angle) * col + np.sin(angle) * y)
         pair = [128.0 + stripes + rng.normal(0.0, 12.0, stripes.shape) for _ in range(2)]
         for guess in ({}, {"guess_covariance": np.eye(2)}):
-            result = register(*pair, **guess)
+            result = register_pair(*pair, **guess)
             assert not result.accepted
             assert result.reason
+
+
+def test_too_small_an_overlap_is_not_searched() -> None:
+    # Half of the width and half of the height: a quarter of the area, though each is more than 30 %.
+    pair = _pair((96.4, -95.7), 4.0)
+    _refused(register_pair(*pair), "stands out", "nothing to compare", "differ", "ambiguous")
+    less = register_pair(*pair, settings=RegistrationSettings(min_overlap=0.2))
+    assert less.accepted, less.reason
+    assert less.alignment.overlap == pytest.approx(0.25, abs=0.01)
+
+
+def test_every_rejection_has_its_kind() -> None:
+    reference, image = _pair((0.0, 0.0), 4.0)
+    blank = np.zeros((SIZE, SIZE), np.uint8)
+    torn = image.copy()
+    torn[:, SIZE // 2 :] = noisy(TEXTURE.view((3.0, 0.0), SIZE), 4.0, 9)[:, SIZE // 2 :]
+    grid = [noisy(lattice(SIZE, 12.0, (2.0 * k, 0.0)), 4.0, k) for k in range(2)]
+    for pair, failure in (
+        ((blank, image), MatchFailure.UNUSABLE_REFERENCE),
+        ((reference, blank), MatchFailure.UNUSABLE_IMAGE),
+        ((reference, _noise(2)), MatchFailure.NO_PEAK),
+        (grid, MatchFailure.AMBIGUOUS),
+        ((reference, torn), MatchFailure.HALVES_DISAGREE),
+    ):
+        rejection = register_pair(*pair).rejection
+        assert rejection is not None
+        assert rejection.status is failure

@@ -1,0 +1,42 @@
+"""Kinds of reasons for not using a picture, for registration and drift alike."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+__all__ = ["IMAGE_FAILURES", "MatchFailure"]
+
+
+class MatchFailure(Enum):
+    """Why an image was not matched with a reference."""
+
+    #: The reference is blank, saturated, too small, without structure, or not finite.
+    UNUSABLE_REFERENCE = "unusable reference"
+    #: The image is.
+    UNUSABLE_IMAGE = "unusable image"
+    #: The image is the one before once more, down to its noise.
+    REPEATED_IMAGE = "repeated image"
+    #: No shift correlates clearly better than chance.
+    NO_PEAK = "no peak"
+    #: Several shifts explain the image equally well, or another one than was predicted does.
+    AMBIGUOUS = "ambiguous"
+    #: The gradient of the pictures leaves a direction of the shift open, or too little overlaps.
+    UNDETERMINED = "undetermined"
+    #: The refinement did not converge.
+    NOT_CONVERGED = "not converged"
+    #: The refinement ended far from the coarse peak that it started at.
+    STAGES_DISAGREE = "stages disagree"
+    #: The halves of the overlap are shifted differently.
+    HALVES_DISAGREE = "halves disagree"
+    #: The pictures have too little of their structure in common.
+    DISSIMILAR = "dissimilar"
+    #: The shift is so large that the stage must have moved.
+    STAGE_MOVE = "stage move"
+    #: The shift is far from what the drift so far predicts.
+    OUTLIER = "outlier"
+    #: No keyframe has a scale near that of the image.
+    SCALE_CHANGE = "scale change"
+
+
+#: Failures of the image alone, which say nothing about the reference.
+IMAGE_FAILURES = frozenset({MatchFailure.UNUSABLE_IMAGE, MatchFailure.REPEATED_IMAGE})
