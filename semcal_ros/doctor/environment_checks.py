@@ -273,7 +273,14 @@ def check_profile(seen: Environment) -> list[Finding]:
     named = profile_file(seen.environment)
     where = "" if named is None else f" ({named[0]})"
     if memory.segment_bytes is None:
-        return [note("DDS profile", f"{memory.source}{where}: no shared memory between processes")]
+        return [
+            note(
+                "DDS profile",
+                f"{memory.source}{where}: the size of its shared memory is not stated",
+                expected="more shared memory than one image takes",
+                do="compare with `Large images` in doc/nodes.md",
+            )
+        ]
     size = f"{memory.segment_bytes / _MB:.1f} MiB of shared memory"
     if named is None and memory.source != "no profile is set":
         return [

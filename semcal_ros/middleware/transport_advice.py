@@ -1,7 +1,8 @@
 """Whether this process is set up for images of a given size: the shared memory of Fast DDS, and malloc.
 
-A message that the shared memory of its sender holds goes over at once; a larger one waits for room in it again and
-again, and best-effort ones are lost meanwhile. ``doc/nodes.md``, "Large images", tells what was measured.
+A message that fits into the shared memory of its sender goes over at once. A larger one waits for
+room again and again, and meanwhile best-effort messages are lost. ``doc/nodes.md``, "Large images",
+has the measurements.
 """
 
 from __future__ import annotations
@@ -18,14 +19,15 @@ __all__ = ["MALLOC_VARIABLES", "transport_advice"]
 MALLOC_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 """What glibc reads at the start of a process (mallopt(3))."""
 
-# Where the page faults of new buffers were found to cost as much as all the rest of the way.
+# From here on the page faults of new buffers cost as much as all the rest of the way (the table of
+# doc/nodes.md: at 1 MiB the profile alone takes 2.1 times as long as with malloc set, at 512 KiB 1.4).
 _MALLOC_MATTERS_BYTES = 1024 * 1024
 _REMEDY = "set the environment of `Large images` (doc/nodes.md) for every process with images"
 _OTHER_MALLOC = re.compile("jemalloc|tcmalloc|mimalloc")
 
 
 def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str) -> str:
-    """What a process should be told that sends or receives images of this size; empty where nothing is amiss.
+    """Advice for a process that sends or receives images of this size; empty if all is well.
 
     Parameters
     ----------
@@ -34,7 +36,7 @@ def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str)
     environment
         The environment that the process was started with.
     rmw
-        Name of the middleware, such as ``rmw_fastrtps_cpp``; others than Fast DDS are only judged by malloc.
+        Name of the middleware, such as ``rmw_fastrtps_cpp``; of others than Fast DDS only malloc is judged.
     """
     advice = []
     if rmw.startswith("rmw_fastrtps"):

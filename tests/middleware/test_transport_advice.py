@@ -41,19 +41,18 @@ rclpy.shutdown()
 """
 
 
-def profile(transports: str = "", rtps: str = "", default: str = "true") -> str:
+def profile(transports: str = "", rtps: str = "") -> str:
     return (
         '<?xml version="1.0" encoding="UTF-8"?>'
         '<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">'
         f"<transport_descriptors>{transports}</transport_descriptors>"
-        f'<participant profile_name="p" is_default_profile="{default}"><rtps>{rtps}</rtps>'
+        f'<participant profile_name="p" is_default_profile="true"><rtps>{rtps}</rtps>'
         "</participant></profiles>"
     )
 
 
-def shm(segment: int | None = None, message: int | None = None) -> str:
+def shm(segment: int | None = None) -> str:
     size = "" if segment is None else f"<segment_size>{segment}</segment_size>"
-    size += "" if message is None else f"<maxMessageSize>{message}</maxMessageSize>"
     return (
         "<transport_descriptor><transport_id>s</transport_id><type>SHM</type>"
         f"{size}</transport_descriptor>"
@@ -89,49 +88,37 @@ def real_segments(environment: Mapping[str, str]) -> list[int]:
 
 
 CASES = {
-    "default": ("", {}, DEFAULT_SEGMENT_BYTES),
-    "own": (profile(shm(3 * MIB), used("s", "u")), {}, 3 * MIB),
-    "own without size": (profile(shm(), used("s", "u")), {}, DEFAULT_SEGMENT_BYTES),
-    "socket buffers": (
-        profile(rtps="<listenSocketBufferSize>1000000</listenSocketBufferSize>"),
-        {},
-        2_000_000,
-    ),
-    "network alone": (profile(shm(), used("u")), {}, None),
-    "built in UDP": ("", {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}, None),
-    # Differs between the versions.
-    "built in large data": ("", {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}, ...),
-    "built in with an option": (
-        "",
-        {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB&sockets_size=1MB"},
-        2_000_000,
-    ),
-    "with the built-in ones": (profile(shm(3 * MIB), used("s", builtin="true")), {}, 3 * MIB),
+    "default": ("", DEFAULT_SEGMENT_BYTES),
+    "own": (profile(shm(3 * MIB), used("s", "u")), 3 * MIB),
+    "with the built-in ones": (profile(shm(3 * MIB), used("s", builtin="true")), 3 * MIB),
 }
 
 
-@pytest.mark.parametrize(
-    ("case", "reach"),
-    [*((case, "OFF") for case in CASES)]
-    + [(case, "LOCALHOST") for case in ("default", "own", "socket buffers", "network alone")],
-)
+@pytest.mark.parametrize("reach", ["OFF", "LOCALHOST"])
+@pytest.mark.parametrize("case", ["default", "own"])
 def test_the_segment_is_the_one_that_fast_dds_makes(case: str, reach: str, tmp_path: Path) -> None:
-    """Discovery does not matter for it, except that rmw_fastrtps has transports of its own for LOCALHOST."""
-    text, environment, expected = CASES[case]
-    environment = {**CLEAN, "ROS_AUTOMATIC_DISCOVERY_RANGE": reach, **environment}
+    _check_segment(case, reach, tmp_path)
+
+
+def test_of_two_segments_the_larger_counts(tmp_path: Path) -> None:
+    _check_segment("with the built-in ones", "OFF", tmp_path)
+
+
+def _check_segment(case: str, reach: str, folder: Path) -> None:
+    text, expected = CASES[case]
+    environment = {**CLEAN, "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
     if text:
-        environment.update(with_profile(tmp_path / "profile.xml", text))
-    if reach == "LOCALHOST" and expected != 3 * MIB:
-        expected = DEFAULT_SEGMENT_BYTES
-    stated = shared_memory(environment).segment_bytes
-    assert expected in (..., stated)
-    made = max(real_segments(environment), default=None)
-    if stated is None:
-        assert made is None
-    else:
-        # Beside the messages it holds their descriptors: a twentieth with the default queue.
-        assert made is not None
-        assert stated <= made < 1.1 * stated
+        environment.update(with_profile(folder / "profile.xml", text))
+    assert shared_memory(environment).segment_bytes == expected
+    # Beside the messages the segment holds their descriptors: a twentieth with the default queue.
+    assert expected <= max(real_segments(environment)) < 1.1 * expected
+
+
+@pytest.mark.parametrize("text", [profile(shm(), used("s")), profile(shm(), used("u"))])
+def test_a_profile_that_states_no_size_is_not_judged(text: str, tmp_path: Path) -> None:
+    environment = {**MALLOC, **with_profile(tmp_path / "p.xml", text)}
+    assert shared_memory(environment).segment_bytes is None
+    assert transport_advice(64 * MIB, environment, FAST) == ""
 
 
 def test_the_shipped_profile_carries_the_largest_frames() -> None:
@@ -186,9 +173,6 @@ BAD = {
     "no XML": "<profiles",
     "document type": '<!DOCTYPE p [<!ENTITY a "a">]>' + profile(shm(), used("s")),
     "too large": profile(shm(), used("s")) + " " * MIB,
-    "no default": profile(shm(), used("s"), default="false"),
-    "unknown transport": profile(shm(), used("x")),
-    "message over segment": profile(shm(MIB, 2 * MIB), used("s")),
 }
 
 

@@ -62,7 +62,7 @@ def test_files_are_read_from_the_folder_of_the_one_given_at_start(
         file.write_bytes(CALIBRATION.dumps().encode()[:1000] + b"\xff\x00")
         answer = peer.trigger(f"{SERVER}/reload")
         assert not answer.success
-        assert "not a text file" in answer.message
+        assert "not UTF-8 text" in answer.message
         (p,) = peer.get_parameters(SERVER, "p@1000")
         assert p.double_array_value.tolist() == CALIBRATION.at(1000.0).P.ravel().tolist()
         wanted = calibration_digest(CALIBRATION.dumps())
