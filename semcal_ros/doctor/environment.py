@@ -1,4 +1,4 @@
-"""Look at this machine and process; works without ROS."""
+"""Collect what the checks of this machine and process need; works without ROS."""
 
 from __future__ import annotations
 
@@ -11,28 +11,31 @@ from collections.abc import Iterable
 from importlib import import_module, metadata
 from pathlib import Path
 
+from packaging.utils import canonicalize_name
+
 from semcal_ros.doctor.observations import Environment
 
 __all__ = ["collect_environment"]
 
 _MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
-# The middleware is loaded with rclpy and may end the process at once: in one of its own that does no harm.
+# The middleware is loaded with rclpy and may end the process at once, so a process of its own does it.
 _PROBE = "import rclpy; print(rclpy.__file__); print(rclpy.get_rmw_implementation_identifier())"
-_PROBE_S = 60.0
-_LONGEST = 200
+_PROBE_S = 60.0  # importing rclpy takes about a second; this only ends a process that hangs
+_LONGEST = 200  # characters of a reason, which stands in one line
 _RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
 _SHM = Path("/dev/shm")
 _INSTALLATIONS = Path("/opt/ros")
 
 
 def collect_environment() -> Environment:
-    """What can be said without a ROS graph; imports what the nodes import."""
+    """The state of this machine and process, without a ROS graph; imports what the nodes import."""
     rclpy_file, rmw, reason = _probe_ros()
+    distributions = [found for found in metadata.distributions() if found.metadata["Name"]]
     errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
     return Environment(
         python=sys.version_info[:2],
-        packages=dict(_packages()),
-        required=tuple(_required()),
+        packages={_name(found): found.version for found in distributions},
+        requirements={_name(found): tuple(found.requires or ()) for found in distributions},
         import_errors=errors,
         rclpy_file=rclpy_file,
         prefix=sys.prefix,
@@ -45,7 +48,7 @@ def collect_environment() -> Environment:
 
 
 def _probe_ros() -> tuple[str, str, str]:
-    """File of rclpy and name of the middleware, or why there are none."""
+    """File of rclpy, name of the middleware, and, where rclpy cannot be imported, the reason."""
     command = [sys.executable, "-W", "ignore", "-c", _PROBE]
     try:
         done = subprocess.run(
@@ -81,18 +84,8 @@ def _one_line(error: Exception) -> str:
     return text[:_LONGEST]
 
 
-def _packages() -> Iterable[tuple[str, str]]:
-    for distribution in metadata.distributions():
-        name = distribution.metadata["Name"]
-        if name:
-            yield name.lower(), distribution.version
-
-
-def _required() -> list[str]:
-    try:
-        return metadata.requires("semcal_ros") or []
-    except metadata.PackageNotFoundError:
-        return []
+def _name(distribution: metadata.Distribution) -> str:
+    return canonicalize_name(distribution.metadata["Name"])
 
 
 def _number_in(path: Path) -> int | None:

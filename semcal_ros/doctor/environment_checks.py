@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion
 
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
@@ -30,19 +33,17 @@ __all__ = [
     "check_socket_buffers",
 ]
 
-_PYTHON = ((3, 10), (3, 14))
+_PYTHON = ((3, 10), (3, 14))  # as the Makefile has it
 _GET_ROS = (
     "run `make setup` and use .venv/bin/semcal, or install the wheels that requirements/ names, or source the"
     " setup script of a ROS 2 installation"
 )
-# Wheels of the two distributions that are supported: major version of rclpy, and major.minor of the messages.
-_WHEELS = {"7": "5.3", "9": "5.5"}
-_DOMAINS = 232
+_DOMAINS = 232  # the ports of a higher id would exceed 65535
 # Ids above would use ports that Linux hands out to other programs
 # (https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html).
 _SAFE_DOMAINS = 101
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
-# What the shipped profile asks of a socket.
+# What the shipped profile asks of a socket: one frame of 4096 x 4096 with 16 bits.
 _SOCKET_BYTES = 32 * 1024**2
 _MB = 1024**2
 
@@ -58,23 +59,18 @@ def check_python(seen: Environment) -> list[Finding]:
 
 
 def check_packages(seen: Environment) -> list[Finding]:
-    """Whether what this package asks for is installed and new enough."""
-    found = []
-    for requirement in seen.required:
-        name, _, least = requirement.partition(";")[0].partition(">=")
-        # OpenCV has several names; that it can be imported was needed to get here.
-        if name.startswith("opencv"):
-            continue
-        have = seen.packages.get(name.strip().lower())
-        if least and (have is None or _numbers(have) < _numbers(least)):
-            found.append(
-                problem(
-                    "packages",
-                    f"{name.strip()} {have or 'is not installed'}",
-                    expected=f"{least.strip()} or newer",
-                    do=f'`python -m pip install "{requirement}"`',
-                )
-            )
+    """Whether what this package requires is installed in a fitting version."""
+    found = [
+        problem(
+            "packages",
+            f"{wanted.name} {have or 'is not installed'}",
+            expected=f"{wanted.specifier or 'any version'}",
+            do=f'`python -m pip install "{wanted.name}{wanted.specifier}"`',
+        )
+        for wanted, have in _unmet(seen, "semcal-ros")
+        # OpenCV has several names; without it this command could not have started.
+        if not wanted.name.startswith("opencv")
+    ]
     if found:
         return found
     shown = ("numpy", "scipy", "opencv-python-headless", "opencv-python", "rosbags")
@@ -82,8 +78,18 @@ def check_packages(seen: Environment) -> list[Finding]:
     return [ok("packages", ", ".join(versions) or "as the ROS workspace has them")]
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+def _unmet(seen: Environment, distribution: str) -> Iterator[tuple[Requirement, str | None]]:
+    """Requirements of a distribution that are not met, with the version that is installed."""
+    for line in seen.requirements.get(distribution, ()):
+        try:
+            wanted = Requirement(line)
+            if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
+                continue
+            have = seen.packages.get(canonicalize_name(wanted.name))
+            if have is None or not wanted.specifier.contains(have, prereleases=True):
+                yield wanted, have
+        except (InvalidRequirement, InvalidVersion):
+            continue  # metadata of other people: pip judges them
 
 
 def check_rclpy(seen: Environment) -> list[Finding]:
@@ -119,19 +125,20 @@ def check_rclpy(seen: Environment) -> list[Finding]:
 
 def check_one_ros(seen: Environment) -> list[Finding]:
     """Whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
-    rclpy, messages = seen.packages.get("ros-rclpy"), seen.packages.get("ros-sensor-msgs")
+    rclpy = seen.packages.get("ros-rclpy")
     if rclpy is None:
         return []
-    expected = _WHEELS.get(rclpy.partition(".")[0])
-    if messages is not None and expected and not messages.startswith(f"{expected}."):
-        return [
-            problem(
-                "ROS 2 wheels",
-                f"ros-rclpy {rclpy} with ros-sensor-msgs {messages}",
-                expected=f"messages {expected}, of the same distribution",
-                do="make the environment anew: `make setup`",
-            )
-        ]
+    # The wheels of a distribution require each other in narrow ranges of versions.
+    for name in filter(lambda name: name.startswith("ros-"), sorted(seen.requirements)):
+        for wanted, have in _unmet(seen, name):
+            return [
+                problem(
+                    "ROS 2 wheels",
+                    f"{name} {seen.packages.get(name, '')} with {wanted.name} {have or 'missing'}",
+                    expected=f"{wanted.name}{wanted.specifier}, of the same distribution",
+                    do="make the environment anew: `make setup`",
+                )
+            ]
     others = [
         prefix
         for prefix in seen.environment.get("AMENT_PREFIX_PATH", "").split(":")
@@ -148,7 +155,7 @@ def check_one_ros(seen: Environment) -> list[Finding]:
                 do="use a new shell without the setup script, or an environment without the wheels",
             )
         ]
-    return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}, ros-sensor-msgs {messages or 'missing'}")]
+    return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}")]
 
 
 def _wrong_middleware(seen: Environment) -> bool:
@@ -182,7 +189,7 @@ def check_rmw(seen: Environment) -> list[Finding]:
 
 
 def check_domain(seen: Environment) -> list[Finding]:
-    """Whether the domain id is one."""
+    """Whether the domain id is valid."""
     given = seen.environment.get("ROS_DOMAIN_ID", "")
     if not given:
         return [ok("domain", "ROS_DOMAIN_ID is not set: 0")]

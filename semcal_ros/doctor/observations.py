@@ -41,9 +41,9 @@ class Environment:
     python
         Version, (major, minor).
     packages
-        Installed distributions by lower-case name, with their versions.
-    required
-        What this package asks for, such as ``numpy>=1.26``.
+        Versions of the installed distributions, by canonical name.
+    requirements
+        What each of these distributions requires, such as ``numpy>=1.26``.
     import_errors
         Reason by module, of those that cannot be imported.
     rclpy_file
@@ -64,7 +64,7 @@ class Environment:
 
     python: tuple[int, int]
     packages: Mapping[str, str]
-    required: tuple[str, ...]
+    requirements: Mapping[str, tuple[str, ...]]
     import_errors: Mapping[str, str]
     rclpy_file: str
     prefix: str
