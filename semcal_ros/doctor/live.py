@@ -160,7 +160,8 @@ class _Observer:
                     event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
                 )
 
-    def _taking(self, name: str) -> Callable[[Any, Any], None]:
+    def _taking(self, name: str) -> Any:
+        # rclpy takes callbacks with the message's info too; its types say otherwise.
         arrivals = self._arrivals.setdefault(name, [])
 
         def take(message: Any, info: Any) -> None:
