@@ -40,7 +40,7 @@ def corners(quick: bool) -> None:
     rows: list[list[object]] = []
     for index, frame in enumerate(plan.frames):
         image = plan.render(index)
-        board, truth = lattice(plan, index, -3.0)
+        _board, truth = lattice(plan, index, -3.0)
         visible = int(np.sum(np.all((truth > 5.0) & (truth < size - 6.0), axis=1)))
         results: dict[str, list[object]] = {"ours": [], "cv2": []}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
@@ -140,7 +141,7 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
             )
         ]
     found = []
-    back = sum(b <= a for a, b in zip(stamps, stamps[1:], strict=False))
+    back = sum(b <= a for a, b in itertools.pairwise(stamps))
     if back:
         found.append(
             note(

@@ -487,5 +487,5 @@ def test_images_that_do_not_fit_their_encoding(header: Any, image: Any, encoding
 
 def test_a_jpeg_cannot_be_that_wide(header: Any) -> None:
     image = np.zeros((1, 65501), np.uint8)
-    with pytest.raises(InvalidValueError, match="65501 x 1 pixels as jpeg.*choose png"):
+    with pytest.raises(InvalidValueError, match=r"65501 x 1 pixels as jpeg.*choose png"):
         fill_compressed(blank_message(COMPRESSED), image, "mono8", header, "jpeg")

@@ -57,7 +57,7 @@ def test_only_files_are_replaced(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for name in ("pipe", "folder"):
         before = (tmp_path / name).lstat()
-        with pytest.raises(OSError, match="regular file|directory"):
+        with pytest.raises(OSError, match=r"regular file|directory"):
             atomic_write_bytes(tmp_path / name, b"new")
         assert (tmp_path / name).lstat() == before
     # No file can be made in /proc, whoever asks.

@@ -468,7 +468,7 @@ def _statements(draw: st.DrawFn) -> list[tuple[str, tuple[Any, ...]]]:
 def test_odd_databases(
     folder: Path, statements: list[tuple[str, tuple[Any, ...]]], kind: str
 ) -> None:
-    name, data = _storage(kind)
+    _name, data = _storage(kind)
     path = folder / "one.db3"
     path.write_bytes(data)
     database = sqlite3.connect(path, isolation_level=None)

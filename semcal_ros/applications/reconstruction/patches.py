@@ -213,7 +213,7 @@ class _Matched:
 
 def _matched(patches: Image, seen: Mask, half: int) -> _Matched:
     """Shift of every patch (views, points) against the mean of the others, in patch px."""
-    views, points, size = patches.shape
+    views, points, _size = patches.shape
     side = 2 * half + 1
     window = np.exp(-0.5 * np.sum(_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
     shift = np.zeros((views, points, 2))

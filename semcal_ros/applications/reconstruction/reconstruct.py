@@ -255,7 +255,7 @@ class _Work:
             self.seen = self.seen.chosen(self.adjusted.weights > 0.3)
             self._prune(self.settings.least_track, worst_px=4.0 * self.settings.worst_sigma_px)
         self._merge()
-        normals, curvature = self._surface(wide=True)
+        _normals, curvature = self._surface(wide=True)
         if np.count_nonzero(curvature > 0.0) < 0.5 * len(curvature):
             self.rotations, self.translations, self.points = mirror_of(
                 self.rotations, self.translations, self.points

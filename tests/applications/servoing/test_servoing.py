@@ -159,7 +159,7 @@ class Plant:
     """A stage that obeys after a latency, over a drifting ground; frames are instants."""
 
     servo: Servo
-    pose: PlanePose = PlanePose(20e-6, -15e-6, 0.35)
+    pose: PlanePose = field(default_factory=lambda: PlanePose(20e-6, -15e-6, 0.35))
     drift_m_s: np.ndarray = field(default_factory=lambda: np.zeros(2))
     knows: Callable[[float], PlaneCamera] = camera_at
     obeys: np.ndarray = field(default_factory=lambda: np.eye(3))

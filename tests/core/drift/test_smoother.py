@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -309,7 +311,7 @@ def simulated(
     key = state[0] + sigma * rng.standard_normal(2)
     truth = [state[:2].ravel()]
     roots: dict[float, tuple[Array, Array]] = {}
-    for before, now in zip(times[:-1], times[1:], strict=True):
+    for before, now in itertools.pairwise(times):
         step = round(float(now - before), 9)
         if step not in roots:
             move, spread = restlessness.over(step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +125,7 @@ def noise_by_quadrature(psd: float, memory_s: float, dt_s: float) -> Array:
     edges = np.unique(np.concatenate([[0.0, dt_s], ends]))
     nodes, weights = np.polynomial.legendre.leggauss(20)
     total = np.zeros((3, 3))
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         s = low + 0.5 * (high - low) * (nodes + 1.0)
         gone = -np.expm1(-s / memory_s)
         response = np.stack([s - memory_s * gone, gone, (1.0 - gone) / memory_s])
