@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -118,6 +119,14 @@ def _rooms(folder: Path) -> set[str]:
 def test_the_tables_name_every_room() -> None:
     assert set(MAY_IMPORT) == _rooms(PACKAGE)
     assert set(CORE_MAY_IMPORT) == _rooms(PACKAGE / "core")
+
+
+def test_contributing_shows_the_tables() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    package, _, core = text.partition("\nInside `core`:\n")
+    for part, table in ((package, MAY_IMPORT), (core, CORE_MAY_IMPORT)):
+        rows = re.findall(r"^\| `(\w+)` \| .+ \| (.*)\|$", part, re.MULTILINE)
+        assert {room: set(re.findall(r"`(\w+)`", below)) for room, below in rows} == table
 
 
 @pytest.mark.parametrize("table", [MAY_IMPORT, CORE_MAY_IMPORT], ids=["package", "core"])
