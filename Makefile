@@ -14,10 +14,10 @@ endif
 SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo bench fuzz soak clean
+.PHONY: help setup test test-fast lint format demo bench fuzz soak clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
 	@echo "  ROS_DISTRO=kilted selects ROS 2 Kilted (default: jazzy), PYTHON=... the interpreter."
 
 setup: ## make .venv with everything in it (quick when it is there)
@@ -35,10 +35,21 @@ endif
 
 lint: setup ## style (ruff) and types (mypy)
 	@$(VENV_PYTHON) -m ruff check .
+	@$(VENV_PYTHON) -m ruff format --check --quiet . || \
+	  { echo "lint: \`make format\` would change the files of \`ruff format --check .\`" >&2; exit 1; }
 	@$(VENV_PYTHON) -m mypy
 
+format: setup ## bring the source into the form that lint wants
+	@$(VENV_PYTHON) -m ruff check --fix .
+	@$(VENV_PYTHON) -m ruff format .
+
+PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal
+
 test: lint ## everything that is checked: style, types, tests
-	@$(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal $(PYTEST_ARGS) tests
+	@$(PYTEST) $(PYTEST_ARGS) tests
+
+test-fast: setup ## the quick tests: no running nodes, no whole experiments, no fuzzing
+	@$(PYTEST) -m "not slow" --ignore tests/nodes --ignore tests/fuzz $(PYTEST_ARGS) tests
 
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
 	@$(VENV_PYTHON) -m examples.demo
@@ -50,11 +61,17 @@ bench: setup ## the benchmarks, as a table (installs what they compare with into
 	  echo "bench: requirements/bench.txt could not be installed; going on without" >&2
 	@$(VENV_PYTHON) benchmarks/run.py
 
+# A failure comes with its example; the seed makes the whole run again.
 FUZZ_CASES ?= 2400
+ifndef FUZZ_SEED
+FUZZ_SEED := $(shell date +%s)
+endif
 
-fuzz: setup ## over 100 000 damaged messages, recordings, calibrations, TIFFs and configurations
-	@SEMCAL_FUZZ_CASES=$(FUZZ_CASES) $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal \
-	  --timeout 3600 tests/fuzz
+fuzz: setup ## over 100 000 damaged inputs, and all properties with other examples each time
+	@echo "fuzz: FUZZ_SEED=$(FUZZ_SEED)"
+	@SEMCAL_FUZZ_CASES=$(FUZZ_CASES) $(PYTEST) -m hypothesis --timeout 3600 \
+	  --hypothesis-seed=$(FUZZ_SEED) $(PYTEST_ARGS) tests || \
+	  { echo "fuzz: to repeat this run: make fuzz FUZZ_SEED=$(FUZZ_SEED)" >&2; exit 1; }
 
 soak: setup ## the suite broken every second (SEMCAL_SOAK_S=600, SEMCAL_SOAK_SEED=0)
 	@$(VENV_PYTHON) -m pytest -q -s -W error tests/soak/soak_nodes.py

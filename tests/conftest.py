@@ -13,9 +13,11 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# Machines that run tests are shared: a slow example is no failure. The same examples every time.
+# Machines that run tests are shared, so a slow example is no failure. An ordinary run tries the same
+# examples every time; `make fuzz` tries others, from the seed that it prints.
 hypothesis.settings.register_profile("semcal", deadline=None, derandomize=True, max_examples=50)
-hypothesis.settings.load_profile("semcal")
+hypothesis.settings.register_profile("explore", deadline=None, print_blob=True, max_examples=500)
+hypothesis.settings.load_profile("explore" if "SEMCAL_FUZZ_CASES" in os.environ else "semcal")
 
 # Ids above 101 would use ports from the range that Linux hands out to other programs.
 _DOMAIN_IDS = range(1, 102)
