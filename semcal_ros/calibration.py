@@ -161,9 +161,9 @@ class Calibration(CalibrationModel):
             No figure manager knows it: notebooks show it, and ``savefig`` writes it.
         """
         # Here, so that those who want no figure do not wait for matplotlib.
-        from semcal_ros.report.calibration.parameter_figures import calibration_figure
+        from semcal_ros.report.calibration.parameter_figures import plot_calibration
 
-        return calibration_figure(self)
+        return plot_calibration(self)
 
     def __repr__(self) -> str:
         facts = dict(self._facts())

@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
+from examples.demo.correction_page import DemoRow, write_correction_report
 from examples.demo.live_suite import LiveSuite, Received
 from examples.demo.overview import overview
 from semcal_ros import Calibration
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.report import DemoRow, correction_report
 
 OUTPUT = Path("demo_output")
 CALIBRATED = (100, 250, 600, 1200, 2500, 4000, 6000, 8000, 10000)
@@ -166,7 +166,7 @@ def main() -> int:
     ]
     stamps = sorted(through & set(stamps_at(REPLAYED[-1], received)))
     overview(OUTPUT / "overview.png", received.images, stamps, rms, REPLAYED, cal)
-    correction_report(
+    write_correction_report(
         rows,
         pictures,
         OUTPUT / "correction.html",

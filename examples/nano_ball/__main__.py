@@ -31,8 +31,8 @@ from semcal_ros.cli import main as semcal
 from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.report.ball_figures import small_png
-from semcal_ros.report.html.style import INK, OURS, SECOND, new_figure, tidy
+from semcal_ros.report.html.encode import encode_png
+from semcal_ros.report.html.style import INK, OURS, SECOND, create_figure, style_axes
 from semcal_ros.synthetic.ball import BallPlan, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
 
@@ -115,7 +115,7 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
             tracker.add(frame.image, camera, (frame.stamp_ns - SIMULATED_START_NS) * 1e-9)
     keyframes = tracker.finish()
     chosen = [keyframes[int(k)] for k in np.linspace(0, len(keyframes) - 1, 3)]
-    figure = new_figure(9.6, 2.6)
+    figure = create_figure(9.6, 2.6)
     for column, frame in enumerate(chosen):
         axes = figure.add_subplot(1, 3, column + 1)
         axes.imshow(frame.image, cmap="gray", vmin=0, vmax=200)
@@ -124,7 +124,7 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
         axes.set(xlim=(left, left + 420.0), ylim=(319.5, -0.5), xticks=[], yticks=[])
         title = f"frame {frame.index}, {frame.camera.magnification:g}x"
         axes.set_title(title, fontsize=9, color=INK)
-    return small_png(figure, 100.0)
+    return encode_png(figure, 100.0)
 
 
 def draw_trails(axes, keyframes: list[TrackKeyframe]) -> None:
@@ -141,19 +141,19 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
     """Where the mesh departs from the true sphere."""
     vertices = np.asarray(trimesh.load(mesh, process=False).vertices)
     error = distances_nm(vertices, true_nm)
-    figure = new_figure(8.0, 3.0)
+    figure = create_figure(8.0, 3.0)
     axes = figure.add_subplot(1, 2, 1)
     reach = max(3.0, float(np.percentile(np.abs(error), 98)))
     shown = axes.scatter(*vertices[:, :2].T, c=error, s=9, cmap="RdBu_r", vmin=-reach, vmax=reach)
-    tidy(axes, xlabel="X (nm)", ylabel="Y (nm)")
+    style_axes(axes, xlabel="X (nm)", ylabel="Y (nm)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
     figure.colorbar(shown, ax=axes, label="distance from the true sphere (nm)")
     axes = figure.add_subplot(1, 2, 2)
     axes.hist(error, bins=31, color=OURS)
     axes.axvline(0.0, color=SECOND, linewidth=1.0)
-    tidy(axes, xlabel="distance from the true sphere (nm)", ylabel="vertices")
-    return small_png(figure, 100.0)
+    style_axes(axes, xlabel="distance from the true sphere (nm)", ylabel="vertices")
+    return encode_png(figure, 100.0)
 
 
 # -- all of it ------------------------------------------------------------------------------------

@@ -146,9 +146,9 @@ def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
 
 
 def _write_report(done: RecordingCalibration, path: Path, title: str) -> None:
-    from semcal_ros.report import calibration_report
+    from semcal_ros.report import write_calibration_report
 
-    calibration_report(
+    write_calibration_report(
         done.result,
         path,
         detections=done.collected.found,

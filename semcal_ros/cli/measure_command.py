@@ -349,14 +349,14 @@ def _film(
     some = np.concatenate([s.images[0][::4, ::4].ravel() for s in shots])
     low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
     frames = sum(len(s.images) for s in shots)
-    from semcal_ros.report.cantilever_figures import drawn
+    from semcal_ros.report.cantilever_figures import draw_deflection
 
     with film_of(video, (width, height), frames, fps, (low, high)) as film:
         assert film is not None
         for one, measured in zip(shots, series, strict=True):
             pose = _pose_of(len(one.images), poses)
             for k, frame in enumerate(measured.frames):
-                picture = drawn(one.images[k], frame, (low, high))
+                picture = draw_deflection(one.images[k], frame, (low, high))
                 nm, sigma = 1e9 * frame.deflection_m, 1e9 * frame.sigma_m
                 film.write(
                     picture, f"{one.magnification:g}x  pose {pose[k]}  {nm:.1f} +- {sigma:.1f} nm"

@@ -112,9 +112,9 @@ def command(
     if cloud is not None:
         _save_cloud(cloud, structure, ball, unit)
     if figure is not None:
-        from semcal_ros.report.ball_figures import ball_picture
+        from semcal_ros.report.ball_figures import render_ball
 
-        atomic_write_bytes(figure, ball_picture(structure, ball))
+        atomic_write_bytes(figure, render_ball(structure, ball))
     if outside:
         notes.append(f"{outside} frames are outside of the calibrated range")
     notes += _doubts(structure, microscope.scan is not None)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from semcal_ros.report.calibration.examples import ExampleView, UnusedView
-from semcal_ros.report.calibration.page import calibration_report
-from semcal_ros.report.correction_page import DemoRow, correction_report
+from semcal_ros.report.calibration.page import write_calibration_report
 
-__all__ = ["DemoRow", "ExampleView", "UnusedView", "calibration_report", "correction_report"]
+__all__ = ["write_calibration_report"]

@@ -2,50 +2,43 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.applications.reconstruction import Ball, Structure
 from semcal_ros.core.arrays import Array
-from semcal_ros.report.html.style import INK, MUTED, OURS, SECOND, legend, new_figure, tidy
+from semcal_ros.report.html.encode import encode_png
+from semcal_ros.report.html.style import (
+    INK,
+    MUTED,
+    OURS,
+    SECOND,
+    add_legend,
+    create_figure,
+    style_axes,
+)
 
-__all__ = ["ball_figure", "ball_picture", "small_png"]
+__all__ = ["plot_ball", "render_ball"]
 
 
 _NM = 1e9
-_COLORS = 96
+_DPI = 110.0
 
 
-def ball_picture(structure: Structure, ball: Ball) -> bytes:
-    """The figure as a PNG file."""
-    return small_png(ball_figure(structure, ball))
+def render_ball(structure: Structure, ball: Ball) -> bytes:
+    """Draw :func:`plot_ball` as a PNG file."""
+    return encode_png(plot_ball(structure, ball), _DPI)
 
 
-def small_png(figure: Figure, dpi: float = 110.0) -> bytes:
-    """A figure as PNG with few colours, which line drawings do not need."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=dpi)
-    with Image.open(drawn) as image:
-        few = image.convert("RGB").quantize(
-            _COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
-        )
-    small = io.BytesIO()
-    few.save(small, format="png", optimize=True)
-    return small.getvalue()
-
-
-def ball_figure(structure: Structure, ball: Ball) -> Figure:
+def plot_ball(structure: Structure, ball: Ball) -> Figure:
     """Cloud and mesh as seen obliquely from the gun, and the points' distances from the sphere."""
-    figure = new_figure(9.6, 3.4)
+    figure = create_figure(9.6, 3.4)
     on_ball = ball.sphere.inliers
     centre = ball.sphere.centre_m
-    points = _upright(structure.points_m - centre)
+    points = _turn_upright(structure.points_m - centre)
     near = np.linalg.norm(points, axis=1) < 2.0 * _NM * ball.sphere.radius_m
     cloud = figure.add_subplot(1, 3, 1, projection="3d")
     cloud.scatter(*points[on_ball].T, s=3, c=OURS, label="on the ball")
@@ -53,9 +46,9 @@ def ball_figure(structure: Structure, ball: Ball) -> Figure:
     if other.any():
         cloud.scatter(*points[other].T, s=3, c=SECOND, label="not on it")
     cloud.set_title(f"{np.count_nonzero(on_ball)} points", fontsize=9, color=INK)
-    legend(cloud, loc="lower left")
+    add_legend(cloud, loc="lower left")
     surface = figure.add_subplot(1, 3, 2, projection="3d")
-    vertices = _upright(ball.mesh.vertices_m - centre)
+    vertices = _turn_upright(ball.mesh.vertices_m - centre)
     triangles = Poly3DCollection(
         vertices[ball.mesh.faces],
         facecolors="#9cc4e4",
@@ -77,19 +70,19 @@ def ball_figure(structure: Structure, ball: Ball) -> Figure:
         axes.set_xlabel("X (nm)", fontsize=7)
         axes.set_ylabel("-Y (nm)", fontsize=7)
         axes.set_zlabel("-Z, to the gun (nm)", fontsize=7)
-    _distances(figure.add_subplot(1, 3, 3), ball)
+    _plot_distances(figure.add_subplot(1, 3, 3), ball)
     return figure
 
 
-def _upright(points_m: Array) -> Array:
+def _turn_upright(points_m: Array) -> Array:
     """nm, with y and z turned so that the gun is above."""
     return np.asarray(points_m * np.array([1.0, -1.0, -1.0]) * _NM, dtype=np.float64)
 
 
-def _distances(axes: Axes, ball: Ball) -> None:
+def _plot_distances(axes: Axes, ball: Ball) -> None:
     distance = _NM * ball.sphere.residuals_m[ball.sphere.inliers]
     axes.hist(distance, bins=31, color=OURS)
-    tidy(axes, xlabel="distance from the sphere (nm)", ylabel="points")
+    style_axes(axes, xlabel="distance from the sphere (nm)", ylabel="points")
     low, high = (_NM * value for value in ball.interval_m)
     axes.set_title(
         f"diameter {_NM * ball.diameter_m:.1f} nm (95 %: {low:.1f} to {high:.1f})",

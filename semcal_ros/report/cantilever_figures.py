@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.applications.cantilever import Deflection, Repeatability, Series
 from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
@@ -24,25 +24,30 @@ from semcal_ros.report.html.style import (
     OURS,
     REFERENCE,
     SECOND,
-    legend,
-    new_figure,
-    tidy,
+    add_legend,
+    create_figure,
+    style_axes,
 )
 
-__all__ = ["drawn", "poses_figure", "strip_figure", "write_poses_figure", "write_strip_figure"]
+__all__ = [
+    "draw_deflection",
+    "plot_poses",
+    "plot_strip",
+    "write_poses_figure",
+    "write_strip_figure",
+]
 
 _DPI = 90.0
 _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
 _MARKS = "osD^vX"
 _SHOWN_POSES = 3
-_COLOURS = 128
 # Frames are shown smaller than they are: noise averages out, and the file is smaller.
 _SHOWN_PX = 128
 
 
 def write_poses_figure(agreed: Repeatability, file: Path) -> None:
-    """Write :func:`poses_figure` completely or not at all; OSError if that fails."""
-    _write(poses_figure(agreed), file)
+    """Write :func:`plot_poses` completely or not at all; OSError if that fails."""
+    _write(plot_poses(agreed), file)
 
 
 def write_strip_figure(
@@ -51,32 +56,27 @@ def write_strip_figure(
     firsts: Sequence[int],
     file: Path,
 ) -> None:
-    """Write :func:`strip_figure` completely or not at all; OSError if that fails."""
-    _write(strip_figure(images, series, firsts), file)
+    """Write :func:`plot_strip` completely or not at all; OSError if that fails."""
+    _write(plot_strip(images, series, firsts), file)
 
 
 def _write(figure: Figure, file: Path) -> None:
     kind = file.suffix.lower().removeprefix(".")
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format=kind, dpi=_DPI)
     if kind == "png":
-        # Fewer colours make a file with noisy frames several times smaller.
-        with Image.open(drawn) as image:
-            # The few pixels of a line must keep their colour among many grey ones.
-            widest = Image.Quantize.MAXCOVERAGE
-            few = image.convert("RGB").quantize(_COLOURS, widest, dither=Image.Dither.NONE)
-        drawn = io.BytesIO()
-        few.save(drawn, format="png", optimize=True)
-    atomic_write_bytes(file, drawn.getvalue())
+        atomic_write_bytes(file, encode_png(figure, _DPI, keep_rare_colors=True))
+        return
+    encoded = io.BytesIO()
+    figure.savefig(encoded, format=kind, dpi=_DPI)
+    atomic_write_bytes(file, encoded.getvalue())
 
 
-def poses_figure(agreed: Repeatability) -> Figure:
+def plot_poses(agreed: Repeatability) -> Figure:
     """Deflection of each pose at each magnification with 95 % bars; deviations from their mean."""
-    figure = new_figure(7.2, 5.6)
+    figure = create_figure(7.2, 5.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
     pose = np.arange(1, agreed.deflection_m.shape[1] + 1)
-    tidy(upper, xlabel="", ylabel="deflection of the end (nm)")
-    tidy(lower, xlabel="pose", ylabel="from the mean (nm)")
+    style_axes(upper, xlabel="", ylabel="deflection of the end (nm)")
+    style_axes(lower, xlabel="pose", ylabel="from the mean (nm)")
     mean = np.nanmean(agreed.deflection_m, axis=0)
     count = len(agreed.magnifications)
     for row, g in enumerate(agreed.magnifications):
@@ -102,11 +102,11 @@ def poses_figure(agreed: Repeatability) -> Figure:
         lower.set_title(text, fontsize=9, color=INK, loc="left")
     lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     lower.axhline(0.0, color=MUTED, linewidth=0.7)
-    legend(upper, loc="upper left")
+    add_legend(upper, loc="upper left")
     return figure
 
 
-def strip_figure(
+def plot_strip(
     images: Sequence[Sequence[NDArray[Any]]], series: Sequence[Series], firsts: Sequence[int]
 ) -> Figure:
     """The first, the most bent and the last pose at each magnification, with the centre line.
@@ -123,15 +123,15 @@ def strip_figure(
     bent = [abs(series[0].frames[k].deflection_m) for k in firsts]
     most = int(np.nanargmax(bent)) if np.isfinite(bent).any() else 0
     poses = sorted({0, most, len(firsts) - 1})[:_SHOWN_POSES]
-    figure = new_figure(2.1 * len(poses), 2.2 * len(series))
+    figure = create_figure(2.1 * len(poses), 2.2 * len(series))
     grid = figure.subplots(len(series), len(poses), squeeze=False)
     for row, (pictures, one) in enumerate(zip(images, series, strict=True)):
         for column, pose in enumerate(poses):
-            _frame(grid[row, column], pictures[firsts[pose]], one, firsts[pose], pose)
+            _draw_frame(grid[row, column], pictures[firsts[pose]], one, firsts[pose], pose)
     return figure
 
 
-def _frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) -> None:
+def _draw_frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) -> None:
     found = one.frames[frame]
     step = max(1, round(image.shape[1] / _SHOWN_PX))
     rows, cols = (n // step * step for n in image.shape)
@@ -160,7 +160,9 @@ def _frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) 
 _FRACTION_BITS = 4
 
 
-def drawn(image: NDArray[Any], frame: Deflection, grey: tuple[float, float]) -> NDArray[np.float32]:
+def draw_deflection(
+    image: NDArray[Any], frame: Deflection, grey: tuple[float, float]
+) -> NDArray[np.float32]:
     """The picture with the centre line and the end of the beam, in black and white.
 
     Parameters

@@ -26,12 +26,12 @@ from semcal_ros.report.html.style import (
     OURS,
     REFERENCE,
     SECOND,
-    legend,
-    new_figure,
-    tidy,
+    add_legend,
+    create_figure,
+    style_axes,
 )
 
-__all__ = ["drift_figure", "write_drift_figure"]
+__all__ = ["plot_drift", "write_drift_figure"]
 
 
 _DPI = 160.0
@@ -62,7 +62,7 @@ class _Kind:
 
 
 def write_drift_figure(path: DriftPath, file: Path) -> None:
-    """Write :func:`drift_figure` completely or not at all.
+    """Write :func:`plot_draw_drift` completely or not at all.
 
     Parameters
     ----------
@@ -79,11 +79,11 @@ def write_drift_figure(path: DriftPath, file: Path) -> None:
         The file cannot be written.
     """
     drawn = io.BytesIO()
-    drift_figure(path).savefig(drawn, format=file.suffix.lower().removeprefix("."), dpi=_DPI)
+    plot_drift(path).savefig(drawn, format=file.suffix.lower().removeprefix("."), dpi=_DPI)
     atomic_write_bytes(file, drawn.getvalue())
 
 
-def drift_figure(path: DriftPath, title: str = "") -> Figure:
+def plot_drift(path: DriftPath, title: str = "") -> Figure:
     """Path in the plane; drift, rate and residual against time, with 95 % bands.
 
     Frames whose picture was not used are marked in each plot, by the kind of reason, and counted
@@ -103,20 +103,20 @@ def drift_figure(path: DriftPath, title: str = "") -> Figure:
     """
     if len(path) == 0:
         raise InvalidValueError("a drift path without frames", expected="at least one frame")
-    figure = new_figure(10.0, 6.6)
+    figure = create_figure(10.0, 6.6)
     if title:
         figure.suptitle(title, fontsize=10, color=INK, parse_math=False)
-    kinds = _kinds(path)
-    time, time_unit = _times(path)
+    kinds = _group_rejections(path)
+    time, time_unit = _choose_time_unit(path)
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.2), wspace=0.03)
     left, right = halves
     plane, key = left.subplots(2, 1, height_ratios=(3.9, 1.0))
-    _plane(left, plane, path, kinds, time, time_unit)
-    _key(key, path, kinds)
+    _draw_path(left, plane, path, kinds, time, time_unit)
+    _draw_key(key, path, kinds)
     drift, rate, residual = right.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.1, 0.7))
-    _drift(drift, path, kinds, time)
-    _rate(rate, path, kinds, time)
-    _residual(residual, path, kinds, time)
+    _draw_drift(drift, path, kinds, time)
+    _draw_rate(rate, path, kinds, time)
+    _draw_residual(residual, path, kinds, time)
     residual.set_xlabel(f"time since the first frame ({time_unit})")
     right.align_ylabels([drift, rate, residual])
     return figure
@@ -125,7 +125,7 @@ def drift_figure(path: DriftPath, title: str = "") -> Figure:
 # -- what is shown --------------------------------------------------------------------------------
 
 
-def _kinds(path: DriftPath) -> list[_Kind]:
+def _group_rejections(path: DriftPath) -> list[_Kind]:
     """Frames that were not used, by the reason without its numbers, the most frequent first."""
     texts = [
         "" if good else kind_of(status.removeprefix("coasting: "))
@@ -142,7 +142,7 @@ def _kinds(path: DriftPath) -> list[_Kind]:
     ]
 
 
-def _times(path: DriftPath) -> tuple[Array, str]:
+def _choose_time_unit(path: DriftPath) -> tuple[Array, str]:
     """Times since the first frame and their unit."""
     seconds = path.time_s - path.time_s[0]
     longest = float(np.max(np.abs(seconds)))
@@ -152,7 +152,7 @@ def _times(path: DriftPath) -> tuple[Array, str]:
     return seconds, "s"
 
 
-def _unit(path: DriftPath, values: Array, suffix: str = "") -> _Unit:
+def _choose_unit(path: DriftPath, values: Array, suffix: str = "") -> _Unit:
     """The unit in which the largest value is no long number."""
     if not path.calibrated:
         return _Unit("px" + suffix, 1.0)
@@ -167,16 +167,16 @@ def _unit(path: DriftPath, values: Array, suffix: str = "") -> _Unit:
 # -- path in the plane ----------------------------------------------------------------------------
 
 
-def _plane(
+def _draw_path(
     figure: SubFigure, axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array, time_unit: str
 ) -> None:
-    unit = _unit(path, path.drift_m)
+    unit = _choose_unit(path, path.drift_m)
     x, y = unit.factor * path.drift_m.T
-    tidy(axes, xlabel=f"drift along x ({unit.name})", ylabel=f"drift along y ({unit.name})")
+    style_axes(axes, xlabel=f"drift along x ({unit.name})", ylabel=f"drift along y ({unit.name})")
     axes.plot(x, y, color=MUTED, linewidth=0.8, alpha=0.6, zorder=1)
     good = path.accepted
     dots = axes.scatter(
-        x[good], y[good], c=time[good], cmap="viridis", s=_dot_area(len(path)), zorder=3
+        x[good], y[good], c=time[good], cmap="viridis", s=_choose_dot_area(len(path)), zorder=3
     )
     for kind in kinds:
         axes.scatter(
@@ -189,9 +189,9 @@ def _plane(
             linewidths=1.0,
             zorder=4,
         )
-    _square(axes, x, y)
+    _set_equal_axes(axes, x, y)
     for at, text in ((0, "start"), (-1, "end"))[: min(len(path), 2)]:
-        _marked(axes, (float(x[at]), float(y[at])), text, _away(x, y, at))
+        _mark_end(axes, (float(x[at]), float(y[at])), text, _find_free_direction(x, y, at))
     if len(path) > 1:
         bar = figure.colorbar(dots, ax=axes, location="top", shrink=0.7, pad=0.02, aspect=35)
         bar.set_label(f"time since the first frame ({time_unit})", fontsize=9, color=INK)
@@ -199,7 +199,7 @@ def _plane(
         bar.outline.set_visible(False)
 
 
-def _square(axes: Axes, x: Array, y: Array) -> None:
+def _set_equal_axes(axes: Axes, x: Array, y: Array) -> None:
     """Both axes at one scale, y down as in the picture, with room for the texts at the ends."""
     half = 0.67 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
     middle_x, middle_y = 0.5 * float(x.min() + x.max()), 0.5 * float(y.min() + y.max())
@@ -208,12 +208,12 @@ def _square(axes: Axes, x: Array, y: Array) -> None:
     axes.set_aspect("equal")
 
 
-def _dot_area(frames: int) -> float:
+def _choose_dot_area(frames: int) -> float:
     """Smaller dots where there are many."""
     return float(np.clip(900.0 / frames, 3.0, 18.0))
 
 
-def _away(x: Array, y: Array, at: int) -> tuple[float, float]:
+def _find_free_direction(x: Array, y: Array, at: int) -> tuple[float, float]:
     """Direction on the page from the neighbours of an end to it: where the path is not."""
     near = slice(0, max(2, len(x) // 8)) if at == 0 else slice(-max(2, len(x) // 8), None)
     dx, dy = float(x[at] - x[near].mean()), float(y[at] - y[near].mean())
@@ -221,7 +221,9 @@ def _away(x: Array, y: Array, at: int) -> tuple[float, float]:
     return (dx / length, -dy / length) if length > 0.0 else (0.7, 0.7)
 
 
-def _marked(axes: Axes, xy: tuple[float, float], text: str, direction: tuple[float, float]) -> None:
+def _mark_end(
+    axes: Axes, xy: tuple[float, float], text: str, direction: tuple[float, float]
+) -> None:
     axes.plot(*xy, "o", markersize=9, markerfacecolor="none", markeredgecolor=INK, zorder=5)
     axes.annotate(
         text,
@@ -236,14 +238,14 @@ def _marked(axes: Axes, xy: tuple[float, float], text: str, direction: tuple[flo
     )
 
 
-def _key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
+def _draw_key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
     """What the marks mean, with the number of frames of each kind."""
     axes.set_axis_off()
     keyframes = sum(status == "keyframe" for status in path.status)
     used = int(path.accepted.sum())
     tracked = f"{used} of {len(path)} frames tracked, {keyframes} of them as keyframe"
     entries = [("o", "#2a788e", tracked)]
-    entries += [(k.mark, k.color, _short(f"{len(k.frames)} not used: {k.text}")) for k in kinds]
+    entries += [(k.mark, k.color, _shorten(f"{len(k.frames)} not used: {k.text}")) for k in kinds]
     handles = [
         Line2D(
             [],
@@ -274,7 +276,7 @@ def _key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
         text.set_parse_math(False)
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
     """On two lines at most."""
     lines = textwrap.wrap(text, _LINE_LENGTH, max_lines=2, placeholder=" …")
     return "\n".join(lines)
@@ -283,29 +285,31 @@ def _short(text: str) -> str:
 # -- against time ---------------------------------------------------------------------------------
 
 
-def _drift(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
-    unit = _unit(path, path.drift_m)
-    tidy(axes, xlabel="", ylabel=f"drift ({unit.name})")
-    _bands(axes, time, unit.factor * path.drift_m, unit.factor * path.sigma_m, path.accepted)
+def _draw_drift(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
+    unit = _choose_unit(path, path.drift_m)
+    style_axes(axes, xlabel="", ylabel=f"drift ({unit.name})")
+    _draw_bands(axes, time, unit.factor * path.drift_m, unit.factor * path.sigma_m, path.accepted)
     axes.fill_between([], [], [], color=MUTED, alpha=0.3, linewidth=0, label="95 % band")
-    _rug(axes, kinds, time)
+    _mark_rejected(axes, kinds, time)
     # Above the plot, where no curve can be.
-    legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.0)
+    add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.0)
 
 
-def _rate(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
+def _draw_rate(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
     # A frame on its own tells no rate: there the uncertainty is stated as zero.
     known = path.velocity_sigma_m_s > 0.0
     rate = np.where(known, path.velocity_m_s, np.nan)
-    unit = _unit(path, rate, "/s")
-    tidy(axes, xlabel="", ylabel=f"drift rate ({unit.name})")
-    _bands(axes, time, unit.factor * rate, unit.factor * path.velocity_sigma_m_s, path.accepted)
+    unit = _choose_unit(path, rate, "/s")
+    style_axes(axes, xlabel="", ylabel=f"drift rate ({unit.name})")
+    _draw_bands(
+        axes, time, unit.factor * rate, unit.factor * path.velocity_sigma_m_s, path.accepted
+    )
     axes.axhline(0.0, color=MUTED, linewidth=0.7, zorder=1)
-    _rug(axes, kinds, time)
+    _mark_rejected(axes, kinds, time)
 
 
-def _residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
-    tidy(axes, xlabel="", ylabel="residual RMS\n(grey levels)")
+def _draw_residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
+    style_axes(axes, xlabel="", ylabel="residual RMS\n(grey levels)")
     known = np.isfinite(path.residual)
     good = known & path.accepted
     style = "." if len(path) < 200 else ","
@@ -324,10 +328,10 @@ def _residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> N
         axes.set_ylim(0.0, 1.15 * float(np.max(path.residual[known])))
     else:
         axes.set_ylim(0.0, 1.0)
-    _rug(axes, kinds, time)
+    _mark_rejected(axes, kinds, time)
 
 
-def _bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> None:
+def _draw_bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> None:
     """Both axes with their bands, and limits that a few very uncertain frames do not set."""
     for k, (name, color, line) in enumerate((("x", OURS, "-"), ("y", SECOND, "--"))):
         half = np.where(np.isfinite(values[:, k]), _BAND * sigma[:, k], np.nan)
@@ -361,7 +365,7 @@ def _bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> 
     axes.set_ylim(low - room, high + room)
 
 
-def _rug(axes: Axes, kinds: list[_Kind], time: Array) -> None:
+def _mark_rejected(axes: Axes, kinds: list[_Kind], time: Array) -> None:
     """A line through the plot at each frame that was not used, with its mark at the lower edge."""
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     if not kinds:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
-from semcal_ros.report import calibration_report
+from semcal_ros.report import write_calibration_report
 from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
@@ -35,7 +35,7 @@ def result() -> CalibrationResult:
 def page_path(result: CalibrationResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report") / "report.html"
     path.write_text("an older report")
-    written = calibration_report(
+    written = write_calibration_report(
         result,
         path,
         detections=[found_of(v) for v in result.views],

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.drift_figures import drift_figure, write_drift_figure
+from semcal_ros.report.drift_figures import plot_drift, write_drift_figure
 
 REASONS = (
     "image: blank picture (all pixels at 20)",
@@ -73,7 +73,7 @@ def line_of(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
 
 def test_curves_are_the_path_in_readable_units():
     path = sample()
-    figure = drift_figure(path)
+    figure = plot_drift(path)
     for label, values in (("drift (nm)", path.drift_m), ("drift rate (nm/s)", path.velocity_m_s)):
         axes = axes_of(figure, label)
         for k, name in enumerate("xy"):
@@ -87,7 +87,7 @@ def test_curves_are_the_path_in_readable_units():
 
 def test_bands_hold_95_percent():
     path = sample()
-    axes = axes_of(drift_figure(path), "drift (nm)")
+    axes = axes_of(plot_drift(path), "drift (nm)")
     x_band = next(c for c in axes.collections if isinstance(c, PolyCollection))
     corners = x_band.get_paths()[0].vertices
     at_end = corners[np.isclose(corners[:, 0], 39.0), 1]
@@ -101,7 +101,7 @@ def test_a_band_that_explodes_does_not_flatten_the_curve():
     path = sample(reasons=REASONS[:2])
     covariance = path.covariance.copy()
     covariance[4] = np.diag([1.0, 1.0, 1.0, 1.0])  # a metre: nothing is known
-    axes = axes_of(drift_figure(replace(path, covariance=covariance)), "drift (nm)")
+    axes = axes_of(plot_drift(replace(path, covariance=covariance)), "drift (nm)")
     assert np.ptp(axes.get_ylim()) < 3 * 1e9 * np.ptp(path.drift_m)
 
 
@@ -109,26 +109,26 @@ def test_a_band_that_explodes_does_not_flatten_the_curve():
     ("size_m", "unit"), [(3e-10, "nm"), (5e-8, "nm"), (4e-6, "µm"), (2e-3, "mm")]
 )
 def test_prefix_follows_the_size(size_m, unit):
-    figure = drift_figure(sample(size_m=size_m, interval_s=0.1))
+    figure = plot_drift(sample(size_m=size_m, interval_s=0.1))
     assert axes_of(figure, f"drift ({unit})")
     assert any(a.get_xlabel() == f"drift along x ({unit})" for a in figure.axes)
 
 
 @pytest.mark.parametrize(("interval_s", "unit"), [(1.0, "(s)"), (60.0, "(min)"), (900.0, "(h)")])
 def test_long_recordings_are_told_in_minutes_or_hours(interval_s, unit):
-    figure = drift_figure(sample(interval_s=interval_s))
+    figure = plot_drift(sample(interval_s=interval_s))
     assert axes_of(figure, "residual").get_xlabel().endswith(unit)
 
 
 def test_pixels_where_there_is_no_camera():
-    figure = drift_figure(replace(sample(size_m=3.0), calibrated=False))
+    figure = plot_drift(replace(sample(size_m=3.0), calibrated=False))
     assert axes_of(figure, "drift (px)")
     assert axes_of(figure, "drift rate (px/s)")
 
 
 def test_frames_that_were_not_used_are_counted_by_reason_and_marked_in_each_plot():
     path = sample(reasons=REASONS)
-    figure = drift_figure(path)
+    figure = plot_drift(path)
     key = key_of(figure)
     assert key[0] == "33 of 40 frames tracked, 1 of them as keyframe"
     assert key[1] == "2 not used: image: blank picture (all pixels at …)"
@@ -146,7 +146,7 @@ def test_frames_that_were_not_used_are_counted_by_reason_and_marked_in_each_plot
 
 
 def test_nothing_is_marked_where_all_were_used():
-    assert key_of(drift_figure(sample())) == ["40 of 40 frames tracked, 1 of them as keyframe"]
+    assert key_of(plot_drift(sample())) == ["40 of 40 frames tracked, 1 of them as keyframe"]
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_nothing_is_marked_where_all_were_used():
     ids=["plain", "refusals", "two", "one", "long"],
 )
 def test_texts_do_not_overlap_and_stay_on_the_page(path, monkeypatch):
-    figure = drift_figure(path)
+    figure = plot_drift(path)
     drawn: dict[Text, None] = {}
     draw = Text.draw
 
@@ -205,4 +205,4 @@ def test_an_empty_path_is_refused():
     }
     empty = replace(path, **none, residual=path.residual[:0], status=(), accepted=path.accepted[:0])
     with pytest.raises(InvalidValueError, match="without frames"):
-        drift_figure(empty)
+        plot_drift(empty)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcal_ros.report import DemoRow, correction_report
+from examples.demo.correction_page import DemoRow, write_correction_report
 from semcal_ros.report.html.page import render
 
 BROWSER = next(
@@ -94,7 +94,7 @@ def test_page_fits_the_window_without_console_errors(
         assert pictures > 20
     else:
         rows = [DemoRow("with drift and distortion correction", 0.11, (0.9, 1.45))]
-        page = correction_report(
+        page = write_correction_report(
             rows, [("after", np.zeros((600, 640), np.uint8))], tmp_path / "page.html"
         )
         text = page.read_text(encoding="utf-8")

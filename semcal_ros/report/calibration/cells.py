@@ -9,7 +9,13 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 
-__all__ = ["Cells", "all_corners", "cells_of", "empty_share", "filled_shares"]
+__all__ = [
+    "Cells",
+    "assign_cells",
+    "compute_empty_share",
+    "compute_reached_shares",
+    "concatenate_corners",
+]
 
 
 @dataclass(frozen=True)
@@ -27,13 +33,13 @@ class Cells:
         return np.bincount(self.index, minlength=self.columns * self.rows)
 
 
-def empty_share(result: CalibrationResult, across: int = 12) -> float:
+def compute_empty_share(result: CalibrationResult, across: int = 12) -> float:
     """Share of the field, in cells of which ``across`` are side by side, without any corner."""
-    counts = cells_of(result, np.concatenate([v.image_xy for v in result.views]), across).counts
+    counts = assign_cells(result, np.concatenate([v.image_xy for v in result.views]), across).counts
     return float(np.mean(counts == 0))
 
 
-def cells_of(result: CalibrationResult, xy: Array, across: int) -> Cells:
+def assign_cells(result: CalibrationResult, xy: Array, across: int) -> Cells:
     """The field in cells, ``across`` of them side by side, with the cell of each pixel ``xy``."""
     width, height = result.model.image_size
     rows = max(1, round(across * height / width))
@@ -45,18 +51,18 @@ def cells_of(result: CalibrationResult, xy: Array, across: int) -> Cells:
     return Cells(across, rows, ij[:, 1] * across + ij[:, 0], centres)
 
 
-def filled_shares(result: CalibrationResult, across: int = 6) -> dict[float, float]:
+def compute_reached_shares(result: CalibrationResult, across: int = 6) -> dict[float, float]:
     """At each magnification, the share of the field's cells, ``across`` in a row, with a corner."""
     xy: dict[float, list[Array]] = {}
     for view in result.views:
         xy.setdefault(float(view.magnification), []).append(view.image_xy)
     return {
-        g: float(np.mean(cells_of(result, np.concatenate(own), across).counts > 0))
+        g: float(np.mean(assign_cells(result, np.concatenate(own), across).counts > 0))
         for g, own in sorted(xy.items())
     }
 
 
-def all_corners(result: CalibrationResult) -> tuple[Array, Array]:
+def concatenate_corners(result: CalibrationResult) -> tuple[Array, Array]:
     """All corners (n, 2) with their residuals (n, 2), px."""
     return (
         np.concatenate([v.image_xy for v in result.views]),

@@ -11,42 +11,46 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.report.calibration.cells import all_corners, cells_of, filled_shares
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.calibration.cells import (
+    assign_cells,
+    compute_reached_shares,
+    concatenate_corners,
+)
+from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     MUTED,
     OURS,
-    field_axes,
-    log_ticks,
-    magnification_axis,
-    new_figure,
-    nice_factor,
-    tidy,
+    choose_arrow_factor,
+    choose_log_ticks,
+    create_figure,
+    set_magnification_axis,
+    style_axes,
+    style_field_axes,
 )
 
 __all__ = [
-    "coverage_picture",
-    "filled_picture",
-    "pose_picture",
-    "tilt_picture",
-    "tilts_deg",
+    "compute_tilts_deg",
+    "plot_coverage",
+    "plot_reached_shares",
+    "plot_tilt_directions",
+    "plot_tilts",
 ]
 
 
 _CELLS = 24
 
 
-def coverage_picture(result: CalibrationResult) -> Picture:
+def plot_coverage(result: CalibrationResult) -> Picture:
     """How many corners of all views lie in each cell of the field."""
-    xy, _ = all_corners(result)
-    cells = cells_of(result, xy, _CELLS)
+    xy, _ = concatenate_corners(result)
+    cells = assign_cells(result, xy, _CELLS)
     counts = cells.counts
     grid = counts.reshape(cells.rows, cells.columns).astype(np.float64)
     empty = int(np.sum(counts == 0))
     width, height = result.model.image_size
-    figure = new_figure(4.2, 0.6 + 2.8 * min(height / width, 1.6))
+    figure = create_figure(4.2, 0.6 + 2.8 * min(height / width, 1.6))
     axes = figure.add_subplot()
     shown = axes.imshow(
         np.where(grid > 0.0, grid, np.nan),
@@ -55,13 +59,13 @@ def coverage_picture(result: CalibrationResult) -> Picture:
         vmin=0.0,
         interpolation="nearest",
     )
-    field_axes(axes, width, height)
+    style_field_axes(axes, width, height)
     axes.grid(False)
     holes = cells.centres[counts == 0]
     axes.plot(holes[:, 0], holes[:, 1], "x", color=MUTED, markersize=4, markeredgewidth=0.8)
-    _color_bar(axes, shown, "corners per cell")
+    _add_color_bar(axes, shown, "corners per cell")
     share = f"{empty} of {counts.size} cells have no corner"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Map of the image field with the number of corners per cell; {share}.",
         f"Corners of all {len(result.views)} views; {share} (crosses). "
@@ -69,7 +73,7 @@ def coverage_picture(result: CalibrationResult) -> Picture:
     )
 
 
-def tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
+def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
     """Tilt of the grid in each view, and direction of its normal in the image, degrees."""
     normals = result.fit.rotations[:, :, 2]
     upright = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
@@ -77,14 +81,14 @@ def tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
     return tilt, np.degrees(np.arctan2(upright[:, 1], upright[:, 0]))
 
 
-def pose_picture(result: CalibrationResult) -> Picture:
+def plot_tilt_directions(result: CalibrationResult) -> Picture:
     """Tilt of the grid and its direction in every view."""
-    tilt, azimuth = tilts_deg(result)
-    figure = new_figure(4.6, 3.2)
+    tilt, azimuth = compute_tilts_deg(result)
+    figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
     limit = max(5.0, 1.1 * float(tilt.max()))
     circle = np.linspace(0.0, 2.0 * np.pi, 121)
-    step = nice_factor(1.0, limit / 2.0)
+    step = choose_arrow_factor(1.0, limit / 2.0)
     for radius in np.arange(step, limit * 1.001, step):
         axes.plot(radius * np.cos(circle), radius * np.sin(circle), color="#c8ced6", linewidth=0.8)
         axes.annotate(
@@ -103,20 +107,20 @@ def pose_picture(result: CalibrationResult) -> Picture:
         linewidths=0.4,
         zorder=3,
     )
-    tidy(
+    style_axes(
         axes, xlabel="tilt towards the right of the image (°)", ylabel="tilt towards the bottom (°)"
     )
     axes.grid(False)
     axes.set_xlim(-limit, limit)
     axes.set_ylim(limit, -limit)
     axes.set_aspect("equal")
-    bar = _color_bar(axes, dots, "magnification")
+    bar = _add_color_bar(axes, dots, "magnification")
     if high > low:
-        bar.ax.yaxis.set_major_locator(FixedLocator(log_ticks(low, high)))
+        bar.ax.yaxis.set_major_locator(FixedLocator(choose_log_ticks(low, high)))
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda g, _: f"{g:g}×"))
         bar.ax.yaxis.set_minor_locator(NullLocator())
     span = f"from {tilt.min():.1f} to {tilt.max():.1f} degrees"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Tilt and tilt direction of the grid in each view, {span}.",
         f"Tilts of the grid, {span}. Tilts in different directions separate scale, height and "
@@ -124,21 +128,21 @@ def pose_picture(result: CalibrationResult) -> Picture:
     )
 
 
-def filled_picture(result: CalibrationResult) -> Picture:
+def plot_reached_shares(result: CalibrationResult) -> Picture:
     """How much of the field the corners of each magnification reach."""
-    shares = filled_shares(result)
+    shares = compute_reached_shares(result)
     g = np.array(list(shares))
     percent = 100.0 * np.array(list(shares.values()))
-    figure = new_figure(4.6, 3.0)
+    figure = create_figure(4.6, 3.0)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="cells with a corner (%)")
+    style_axes(axes, xlabel="magnification", ylabel="cells with a corner (%)")
     axes.vlines(g, 0.0, percent, color=ACCENT, linewidth=1.4)
     axes.plot(g, percent, "o", color=ACCENT, markersize=4.5)
-    magnification_axis(axes, g[0], g[-1])
+    set_magnification_axis(axes, g[0], g[-1])
     axes.set_ylim(0.0, 108.0)
     least = int(np.argmin(percent))
     text = f"least: {percent[least]:.0f} % at {g[least]:g}×"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Share of the field that the corners reach at each magnification; {text}.",
         f"Share of the field (in 6 cells across) that the corners of each magnification reach; "
@@ -146,14 +150,14 @@ def filled_picture(result: CalibrationResult) -> Picture:
     )
 
 
-def tilt_picture(result: CalibrationResult) -> Picture:
+def plot_tilts(result: CalibrationResult) -> Picture:
     """Tilt of every view against its magnification, with the direction as a line."""
-    tilt, azimuth = tilts_deg(result)
+    tilt, azimuth = compute_tilts_deg(result)
     g = result.fit.magnifications
     low, high = result.model.magnification_range
-    figure = new_figure(4.6, 3.0)
+    figure = create_figure(4.6, 3.0)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="tilt of the grid (°)")
+    style_axes(axes, xlabel="magnification", ylabel="tilt of the grid (°)")
     angle = np.radians(azimuth)
     # Lines of a fixed length on the page: directions can be read without knowing the axes' scales.
     axes.quiver(
@@ -171,19 +175,19 @@ def tilt_picture(result: CalibrationResult) -> Picture:
         headaxislength=3.2,
     )
     axes.plot(g, tilt, "o", color=INK, markersize=2.2)
-    magnification_axis(axes, low, high)
+    set_magnification_axis(axes, low, high)
     axes.set_ylim(-4.0, 1.25 * max(float(tilt.max()), 5.0))
     steep = {x: int(np.sum((g == x) & (tilt > 10.0))) for x in np.unique(g)}
     least = min(steep, key=lambda x: steep[x])
     text = f"views tilted by more than 10°: at least {steep[least]} at every magnification"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Tilt of the grid in each view against magnification; {text}.",
         f"Tilt of each view (dot) and its direction in the image (arrow); {text}.",
     )
 
 
-def _color_bar(axes: Axes, shown: ScalarMappable, label: str) -> Colorbar:
+def _add_color_bar(axes: Axes, shown: ScalarMappable, label: str) -> Colorbar:
     """Colour bar as high as the axes, at their right."""
     figure = axes.figure
     bar = figure.colorbar(shown, cax=axes.inset_axes((1.04, 0.0, 0.05, 1.0)))

@@ -11,37 +11,45 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.html.style import SECOND
 
-__all__ = ["cameras_around", "curve", "marks_of_magnifications", "sampled_cameras", "wide_enough"]
+__all__ = [
+    "draw_curve",
+    "mark_magnifications",
+    "sample_cameras",
+    "sample_cameras_around",
+    "set_limits_with_room",
+]
 
 
 _SAMPLES = 81
 
 
-def sampled_cameras(model: CalibrationModel) -> list[ScanCamera]:
+def sample_cameras(model: CalibrationModel) -> list[ScanCamera]:
     """Cameras over the calibrated range, evenly in log g; one if the range is a single value."""
     low, high = model.magnification_range
     count = _SAMPLES if high > low else 1
     return [model.at(float(g)) for g in np.clip(np.geomspace(low, high, count), low, high)]
 
 
-def cameras_around(model: CalibrationModel, beyond: float, count: int) -> list[ScanCamera]:
+def sample_cameras_around(model: CalibrationModel, beyond: float, count: int) -> list[ScanCamera]:
     """Cameras from the factor ``beyond`` below the calibrated range to as much above it.
 
     Magnifications at which the calibration has no camera are left out.
     """
     low, high = model.magnification_range
-    tried = (_camera(model, float(g)) for g in np.geomspace(low / beyond, high * beyond, count))
+    tried = (
+        _find_camera(model, float(g)) for g in np.geomspace(low / beyond, high * beyond, count)
+    )
     return [camera for camera in tried if camera is not None]
 
 
-def _camera(model: CalibrationModel, g: float) -> ScanCamera | None:
+def _find_camera(model: CalibrationModel, g: float) -> ScanCamera | None:
     try:
         return model.at(g)
     except InvalidValueError:
         return None
 
 
-def marks_of_magnifications(axes: Axes, model: CalibrationModel) -> None:
+def mark_magnifications(axes: Axes, model: CalibrationModel) -> None:
     """Short marks on the x axis where images were taken."""
     g = np.array(model.magnifications)
     axes.plot(
@@ -57,7 +65,7 @@ def marks_of_magnifications(axes: Axes, model: CalibrationModel) -> None:
     )
 
 
-def curve(
+def draw_curve(
     axes: Axes,
     g: Array,
     values: Array,
@@ -77,7 +85,7 @@ def curve(
     axes.plot(g, values, style, color=color, linewidth=1.4, label=label or None)
 
 
-def wide_enough(axes: Axes, values: Array, half_widths: Array) -> None:
+def set_limits_with_room(axes: Axes, values: Array, half_widths: Array) -> None:
     """Limits with room, also for a constant that is exactly known."""
     low, high = float(np.min(values - half_widths)), float(np.max(values + half_widths))
     room = max(0.12 * (high - low), 1e-4 * max(abs(low), abs(high)), 1e-6)

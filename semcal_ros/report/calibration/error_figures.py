@@ -11,7 +11,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
@@ -19,20 +19,20 @@ from semcal_ros.report.html.style import (
     OURS,
     REFERENCE,
     SECOND,
-    legend,
-    log_axis_y,
-    magnification_axis,
-    new_figure,
-    tidy,
+    add_legend,
+    create_figure,
+    set_log_axis_y,
+    set_magnification_axis,
+    style_axes,
 )
 
-__all__ = ["normalised_residuals", "residual_histogram", "rms_picture"]
+__all__ = ["normalise_residuals", "plot_residual_histogram", "plot_rms"]
 
 
 _HISTOGRAM_LIMIT = 5.0
 
 
-def rms_picture(result: CalibrationResult, straight: Mapping[float, float]) -> Picture:
+def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Picture:
     """RMS and held-out RMS at each magnification, with what the paper reports.
 
     ``straight`` is the error without correction of the distortion.
@@ -42,10 +42,10 @@ def rms_picture(result: CalibrationResult, straight: Mapping[float, float]) -> P
     values = np.array(list(rms.values()))
     held = np.array([result.held_out_rms_px.get(float(x), np.nan) for x in g])
     uncorrected = np.array([straight.get(float(x), np.nan) for x in g])
-    noise = _expected(result, g)
-    figure = new_figure(4.6, 3.9)
+    noise = _predict_rms(result, g)
+    figure = create_figure(4.6, 3.9)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="RMS error (px)")
+    style_axes(axes, xlabel="magnification", ylabel="RMS error (px)")
     for value, style in zip(PAPER_RMS_PX, ("--", "-."), strict=True):
         axes.axhline(
             value, color=REFERENCE, linestyle=style, linewidth=1.2, label=f"paper: {value:g} px"
@@ -56,12 +56,12 @@ def rms_picture(result: CalibrationResult, straight: Mapping[float, float]) -> P
     axes.plot(g, values, "o-", color=OURS, markersize=4, linewidth=1.2, label="all views fitted")
     axes.plot(g, noise, "_", color=ACCENT, markersize=9, markeredgewidth=1.6, label="corner noise")
     _plot_held_out(axes, g, held)
-    magnification_axis(axes, g[0], g[-1])
+    set_magnification_axis(axes, g[0], g[-1])
     shown = np.concatenate([values, held, uncorrected, noise, PAPER_RMS_PX])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
-    legend(axes, loc="upper center", ncols=2)
-    return picture_of_figure(
+    set_log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
+    add_legend(axes, loc="upper center", ncols=2)
+    return encode_figure(
         figure,
         f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px, "
         f"beside the paper's {PAPER_RMS_PX[0]:g} and {PAPER_RMS_PX[1]:g} px.",
@@ -72,7 +72,7 @@ def rms_picture(result: CalibrationResult, straight: Mapping[float, float]) -> P
     )
 
 
-def _expected(result: CalibrationResult, g: Array) -> Array:
+def _predict_rms(result: CalibrationResult, g: Array) -> Array:
     """(G,) RMS error that the 1-sigma of the corners alone would give, px."""
     variances: dict[float, list[Array]] = {float(x): [] for x in g}
     for view in result.views:
@@ -98,21 +98,21 @@ def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:
     )
 
 
-def normalised_residuals(result: CalibrationResult) -> Array:
+def normalise_residuals(result: CalibrationResult) -> Array:
     """(n, 2) residuals over the 1-sigma of their corners."""
     sigma = np.concatenate([v.sigma_px for v in result.views])
     return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
 
 
-def residual_histogram(result: CalibrationResult) -> Picture:
+def plot_residual_histogram(result: CalibrationResult) -> Picture:
     """Residuals over their 1-sigma, beside the normal distribution."""
-    values = normalised_residuals(result).ravel()
+    values = normalise_residuals(result).ravel()
     beyond = float(np.mean(np.abs(values) > 3.0))
     spread = float(np.sqrt(np.mean(values**2)))
     limit = _HISTOGRAM_LIMIT
-    figure = new_figure(4.6, 3.2)
+    figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="residual over its predicted 1-sigma", ylabel="share per unit")
+    style_axes(axes, xlabel="residual over its predicted 1-sigma", ylabel="share per unit")
     edges = np.linspace(-limit, limit, 51)
     density = np.histogram(np.clip(values, -limit, limit), edges)[0] / (
         len(values) * np.diff(edges)
@@ -128,9 +128,9 @@ def residual_histogram(result: CalibrationResult) -> Picture:
         label="normal distribution",
     )
     axes.set_xlim(-limit, limit)
-    legend(axes, loc="upper left")
+    add_legend(axes, loc="upper left")
     text = f"spread {spread:.2f}; {100.0 * beyond:.1f} % beyond 3 (normal: 0.3 %)"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Histogram of residuals over their predicted 1-sigma: {text}.",
         f"Residuals over the predicted uncertainty of their corners: {text}. Wider than the dashed "

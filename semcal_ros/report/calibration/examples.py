@@ -12,16 +12,22 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection
-from semcal_ros.report.calibration.numbers import plain
-from semcal_ros.report.html.encode import Picture, as_bytes_image, data_uri, jpeg_of, shrunk
+from semcal_ros.report.html.encode import (
+    Picture,
+    convert_to_8_bits,
+    encode_data_uri,
+    encode_jpeg,
+    shrink,
+)
+from semcal_ros.report.html.text import remove_control_characters
 
 __all__ = [
     "ExampleView",
     "Overlay",
     "UnusedView",
-    "best_per_magnification",
-    "overlay_of",
-    "rejected_pictures",
+    "choose_examples",
+    "overlay_corners",
+    "show_rejected",
 ]
 
 
@@ -99,7 +105,7 @@ class Overlay:
     caption: str
 
 
-def best_per_magnification(views: Sequence[ExampleView]) -> list[ExampleView]:
+def choose_examples(views: Sequence[ExampleView]) -> list[ExampleView]:
     """For each magnification, ascending, the accepted view with most corners."""
     best: dict[float, ExampleView] = {}
     for view in views:
@@ -123,9 +129,9 @@ def _crosses(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
 
 
-def overlay_of(view: ExampleView) -> Overlay:
+def overlay_corners(view: ExampleView) -> Overlay:
     """The view shrunk to a thumbnail, with a cross at each corner and a square where one was refused."""
-    small, factor = shrunk(as_bytes_image(view.image), _OVERLAY_WIDTH)
+    small, factor = shrink(convert_to_8_bits(view.image), _OVERLAY_WIDTH)
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
     xy, refused_xy = (
         (np.asarray(points, dtype=np.float64) + 0.5) * factor
@@ -137,19 +143,19 @@ def overlay_of(view: ExampleView) -> Overlay:
     sigma = view.detection.sigma_px
     precision = f", median 1-sigma {np.median(sigma):.3f} px" if len(sigma) else ""
     return Overlay(
-        src=data_uri("jpeg", jpeg_of(small, _JPEG_QUALITY)),
+        src=encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY)),
         width=small.shape[1],
         height=small.shape[0],
         marks=_crosses(xy, size),
         refused=_squares(refused_xy, size),
         alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
-        caption=plain(
+        caption=remove_control_characters(
             f"{view.magnification:g}×: {count} corners{dropped}{precision} ({view.name})"
         ),
     )
 
 
-def rejected_pictures(views: Sequence[UnusedView], count: int) -> list[Picture]:
+def show_rejected(views: Sequence[UnusedView], count: int) -> list[Picture]:
     """Thumbnails of rejected images that carry their pixels, different reasons first."""
     ranked: list[tuple[int, int]] = []
     seen: Counter[str] = Counter()
@@ -161,9 +167,9 @@ def rejected_pictures(views: Sequence[UnusedView], count: int) -> list[Picture]:
     for _, index in sorted(ranked)[:count]:
         view = views[index]
         image: NDArray[Any] = getattr(view, "image")  # noqa: B009
-        small, _ = shrunk(as_bytes_image(image), _REJECTED_WIDTH)
-        text = plain(f"{view.magnification:g}×: {view.reason} ({view.name})")
-        src = data_uri("jpeg", jpeg_of(small, _JPEG_QUALITY))
+        small, _ = shrink(convert_to_8_bits(image), _REJECTED_WIDTH)
+        text = remove_control_characters(f"{view.magnification:g}×: {view.reason} ({view.name})")
+        src = encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY))
         alt = f"Rejected image, {text}"
         pictures.append(Picture(src, alt, text, small.shape[1], small.shape[0]))
     return pictures

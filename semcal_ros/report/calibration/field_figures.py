@@ -12,24 +12,24 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.calibration.cells import all_corners, cells_of
-from semcal_ros.report.calibration.geometry import displacement_field, without_residual_field
-from semcal_ros.report.calibration.numbers import format_magnification
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.calibration.cells import assign_cells, concatenate_corners
+from semcal_ros.report.calibration.geometry import compute_displacements, remove_residual_field
+from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     OURS,
     SECOND,
-    field_axes,
-    labelled_contours,
-    new_figure,
-    nice_factor,
+    choose_arrow_factor,
+    create_figure,
+    draw_contours,
+    style_field_axes,
 )
+from semcal_ros.report.html.text import format_magnification
 
 __all__ = [
-    "distortion_picture",
-    "mean_residual_picture",
-    "residual_field_pictures",
-    "residual_picture",
+    "plot_distortion",
+    "plot_mean_residuals",
+    "plot_residual_field",
+    "plot_residuals",
 ]
 
 
@@ -39,10 +39,10 @@ _MAX_ARROWS = 700
 _MIN_IN_CELL = 5
 
 
-def mean_residual_picture(result: CalibrationResult) -> Picture:
+def plot_mean_residuals(result: CalibrationResult) -> Picture:
     """Mean residual vector in each cell: what the model cannot describe, without the noise."""
-    xy, residuals = all_corners(result)
-    cells = cells_of(result, xy, _RESIDUAL_CELLS)
+    xy, residuals = concatenate_corners(result)
+    cells = assign_cells(result, xy, _RESIDUAL_CELLS)
     size = cells.columns * cells.rows
     counts = cells.counts
     sums = np.stack([np.bincount(cells.index, residuals[:, k], size) for k in (0, 1)], axis=1)
@@ -50,19 +50,19 @@ def mean_residual_picture(result: CalibrationResult) -> Picture:
     means = sums[enough] / counts[enough, None]
     lengths = np.hypot(means[:, 0], means[:, 1])
     width, height = result.model.image_size
-    figure = new_figure(4.2, 0.6 + 3.6 * min(height / width, 1.6))
+    figure = create_figure(4.2, 0.6 + 3.6 * min(height / width, 1.6))
     axes = figure.add_subplot()
-    field_axes(axes, width, height)
+    style_field_axes(axes, width, height)
     if not len(means):
-        return picture_of_figure(
+        return encode_figure(
             figure,
             "No cell of the field has enough corners for a mean residual.",
             f"No cell of the field has {_MIN_IN_CELL} corners.",
         )
-    factor = nice_factor(float(lengths.max()), width / _RESIDUAL_CELLS)
-    _arrows(axes, cells.centres[enough], means, factor, OURS)
+    factor = choose_arrow_factor(float(lengths.max()), width / _RESIDUAL_CELLS)
+    _draw_arrows(axes, cells.centres[enough], means, factor, OURS)
     text = f"largest {lengths.max():.3f} px, RMS of the means {np.sqrt(np.mean(lengths**2)):.3f} px"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Mean residual vectors in {len(means)} cells of the field, drawn {factor:g} times as "
         f"long; {text}.",
@@ -71,21 +71,21 @@ def mean_residual_picture(result: CalibrationResult) -> Picture:
     )
 
 
-def residual_picture(result: CalibrationResult) -> Picture:
+def plot_residuals(result: CalibrationResult) -> Picture:
     """Residual vectors of single corners, at most some of them, the same ones every time."""
-    xy, residuals = all_corners(result)
+    xy, residuals = concatenate_corners(result)
     chosen = np.arange(len(xy))
     if len(xy) > _MAX_ARROWS:
         chosen = np.random.default_rng(0).choice(len(xy), _MAX_ARROWS, replace=False)
     lengths = np.hypot(residuals[:, 0], residuals[:, 1])
     width, height = result.model.image_size
-    factor = nice_factor(float(np.quantile(lengths, 0.95)), width / 12)
-    figure = new_figure(4.2, 0.6 + 3.6 * min(height / width, 1.6))
+    factor = choose_arrow_factor(float(np.quantile(lengths, 0.95)), width / 12)
+    figure = create_figure(4.2, 0.6 + 3.6 * min(height / width, 1.6))
     axes = figure.add_subplot()
-    field_axes(axes, width, height)
-    _arrows(axes, xy[chosen], residuals[chosen], factor, SECOND)
+    style_field_axes(axes, width, height)
+    _draw_arrows(axes, xy[chosen], residuals[chosen], factor, SECOND)
     part = f"{len(chosen)} of {len(xy)} corners"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Residual vectors of {part} over the field, drawn {factor:g} times as long.",
         f"Residuals (found minus predicted) of {part}, arrows {factor:g} times as long as the "
@@ -94,7 +94,7 @@ def residual_picture(result: CalibrationResult) -> Picture:
     )
 
 
-def _arrows(axes: Axes, xy: Array, vectors: Array, factor: float, color: str) -> None:
+def _draw_arrows(axes: Axes, xy: Array, vectors: Array, factor: float, color: str) -> None:
     # angles="xy" follows the downward y axis; scale 1 in data units makes the stated factor true.
     axes.quiver(
         xy[:, 0],
@@ -112,15 +112,15 @@ def _arrows(axes: Axes, xy: Array, vectors: Array, factor: float, color: str) ->
     )
 
 
-def distortion_picture(camera: ScanCamera) -> Picture:
+def plot_distortion(camera: ScanCamera) -> Picture:
     """Displacement of the pixels by the distortion at one magnification."""
-    xy, moved = displacement_field(camera)
+    xy, moved = compute_displacements(camera)
     g = format_magnification(camera.magnification)
-    figure, factor, largest = _displacements(camera, xy, moved)
+    figure, factor, largest = _draw_displacements(camera, xy, moved)
     figure.axes[0].plot(
         [camera.ex], [camera.ey], "+", color=SECOND, markersize=12, markeredgewidth=2
     )
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Displacement of pixels by the distortion at {g}, at most {largest:.3g} px, arrows "
         f"{factor:g} times as long.",
@@ -129,20 +129,18 @@ def distortion_picture(camera: ScanCamera) -> Picture:
     )
 
 
-def residual_field_pictures(
-    model: CalibrationModel, cameras: Sequence[ScanCamera]
-) -> list[Picture]:
+def plot_residual_field(model: CalibrationModel, cameras: Sequence[ScanCamera]) -> list[Picture]:
     """What the residual field of a calibration adds to the distortion; empty without such a field."""
     if model.residual is None:
         return []
     pictures = []
     for camera in cameras:
-        xy, moved = displacement_field(camera)
-        parametric = displacement_field(without_residual_field(camera))[1]
-        figure, factor, largest = _displacements(camera, xy, moved - parametric)
+        xy, moved = compute_displacements(camera)
+        parametric = compute_displacements(remove_residual_field(camera))[1]
+        figure, factor, largest = _draw_displacements(camera, xy, moved - parametric)
         g = format_magnification(camera.magnification)
         pictures.append(
-            picture_of_figure(
+            encode_figure(
                 figure,
                 f"Displacement of pixels by the residual field at {g}, at most {largest:.3g} px, "
                 f"arrows {factor:g} times as long.",
@@ -153,19 +151,19 @@ def residual_field_pictures(
     return pictures
 
 
-def _displacements(camera: ScanCamera, xy: Array, moved: Array) -> tuple[Figure, float, float]:
+def _draw_displacements(camera: ScanCamera, xy: Array, moved: Array) -> tuple[Figure, float, float]:
     """Figure with arrows and lines of equal length, the arrows' factor, the largest length in px."""
     known = np.all(np.isfinite(moved), axis=1)
     lengths = np.hypot(moved[:, 0], moved[:, 1])
     largest = float(lengths[known].max()) if np.any(known) else 0.0
-    factor = nice_factor(largest, camera.width / 7)
-    figure = new_figure(4.2, 0.6 + 3.6 * min(camera.height / camera.width, 1.6))
+    factor = choose_arrow_factor(largest, camera.width / 7)
+    figure = create_figure(4.2, 0.6 + 3.6 * min(camera.height / camera.width, 1.6))
     axes = figure.add_subplot()
-    field_axes(axes, camera.width, camera.height)
+    style_field_axes(axes, camera.width, camera.height)
     axes.grid(False)
     across = int(np.sum(xy[:, 1] == xy[0, 1]))
-    labelled_contours(
+    draw_contours(
         axes, xy[:across, 0], xy[::across, 1], lengths.reshape(-1, across), largest, lines=4
     )
-    _arrows(axes, xy[known], moved[known], factor, OURS)
+    _draw_arrows(axes, xy[known], moved[known], factor, OURS)
     return figure, factor, largest

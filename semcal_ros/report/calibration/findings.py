@@ -10,14 +10,20 @@ import numpy as np
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.calibration.cells import all_corners, cells_of, empty_share, filled_shares
-from semcal_ros.report.calibration.coverage_figures import tilts_deg
-from semcal_ros.report.calibration.error_figures import normalised_residuals
+from semcal_ros.report.calibration.cells import (
+    assign_cells,
+    compute_empty_share,
+    compute_reached_shares,
+    concatenate_corners,
+)
+from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
+from semcal_ros.report.calibration.error_figures import normalise_residuals
 from semcal_ros.report.calibration.examples import UnusedView
-from semcal_ros.report.calibration.geometry import field_lattice, shape_sigma_px
-from semcal_ros.report.calibration.numbers import format_magnification, plain, view_rows
+from semcal_ros.report.calibration.geometry import make_field_lattice, predict_shape_sigma_px
+from semcal_ros.report.calibration.numbers import tabulate_views
+from semcal_ros.report.html.text import format_magnification, remove_control_characters
 
-__all__ = ["findings", "pattern_px"]
+__all__ = ["collect_warnings", "estimate_pattern_px"]
 
 _EMPTY_SHARE = 0.05
 _SMALL_TILT_DEG = 5.0
@@ -39,32 +45,32 @@ _MIN_IN_CELL = 5
 _NAMED = 5
 
 
-def _sentence(text: str) -> str:
-    clean = plain(text).strip()
+def _format_sentence(text: str) -> str:
+    clean = remove_control_characters(text).strip()
     return clean[:1].upper() + clean[1:].rstrip(".") + "."
 
 
-def _listed(items: Sequence[str]) -> str:
+def _join_names(items: Sequence[str]) -> str:
     more = len(items) - _NAMED
     return ", ".join(items[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def findings(result: CalibrationResult, rejected: Sequence[UnusedView] = ()) -> list[str]:
+def collect_warnings(result: CalibrationResult, rejected: Sequence[UnusedView] = ()) -> list[str]:
     """The warnings of the calibration, then what an expert would see in the report's pictures."""
     found = [
         *result.warnings,
-        *_views(result, rejected),
-        *_field(result),
-        *_held_out(result),
-        *_pattern(result),
-        *_predicted(result),
+        *_check_views(result, rejected),
+        *_check_field(result),
+        *_check_held_out(result),
+        *_check_pattern(result),
+        *_check_predicted_error(result),
     ]
     if not result.fit.converged:
         found.append("the poses of some views did not settle; their residuals may be too large")
-    return [_sentence(text) for text in dict.fromkeys(found)]
+    return [_format_sentence(text) for text in dict.fromkeys(found)]
 
 
-def _views(result: CalibrationResult, rejected: Sequence[UnusedView]) -> list[str]:
+def _check_views(result: CalibrationResult, rejected: Sequence[UnusedView]) -> list[str]:
     found = []
     total = len(rejected) + len(result.views)
     if len(rejected) > _REJECTED_SHARE * total:
@@ -73,32 +79,32 @@ def _views(result: CalibrationResult, rejected: Sequence[UnusedView]) -> list[st
             f"{len(rejected)} of {total} views were rejected, {count} of them for this reason: "
             f"{reason}"
         )
-    bad = [f"{r.name} ({r.magnification})" for r in view_rows(result) if r.ratio > _VIEW_RATIO]
+    bad = [f"{r.name} ({r.magnification})" for r in tabulate_views(result) if r.ratio > _VIEW_RATIO]
     if bad:
         found.append(
-            f"the corners of {_listed(bad)} fit more than {_VIEW_RATIO:g} times worse than their "
+            f"the corners of {_join_names(bad)} fit more than {_VIEW_RATIO:g} times worse than their "
             "own uncertainty: look at these images, and leave them out if something is wrong"
         )
     return found
 
 
-def _field(result: CalibrationResult) -> list[str]:
+def _check_field(result: CalibrationResult) -> list[str]:
     found = []
-    empty = empty_share(result)
+    empty = compute_empty_share(result)
     if empty > _EMPTY_SHARE:
         found.append(
             f"{100.0 * empty:.0f} % of the image field has no corner in any view: "
             "the distortion there is extrapolated; let the grid fill the image"
         )
-    shares = filled_shares(result)
+    shares = compute_reached_shares(result)
     poor = [f"{g:g}×" for g, share in shares.items() if share < _FILLED_SHARE]
     # All of them: that is the sentence before, or a very coarse grid.
     if 0 < len(poor) < len(shares):
         found.append(
-            f"at {_listed(poor)} the corners reach less than half of the image field: the "
+            f"at {_join_names(poor)} the corners reach less than half of the image field: the "
             "distortion there comes from other magnifications; let the grid fill the image"
         )
-    largest = float(np.max(tilts_deg(result)[0]))
+    largest = float(np.max(compute_tilts_deg(result)[0]))
     if largest < _SMALL_TILT_DEG:
         found.append(
             f"no view is tilted by more than {largest:.1f} degrees: scale and height are hardly "
@@ -107,7 +113,7 @@ def _field(result: CalibrationResult) -> list[str]:
     return found
 
 
-def _held_out(result: CalibrationResult) -> list[str]:
+def _check_held_out(result: CalibrationResult) -> list[str]:
     values = result.held_out_rms_px
     without = [f"{g:g}×" for g, value in values.items() if np.isinf(value)]
     if without:
@@ -124,15 +130,15 @@ def _held_out(result: CalibrationResult) -> list[str]:
     return []
 
 
-def pattern_px(result: CalibrationResult) -> tuple[float, float]:
+def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     """Size in px of a pattern in the residuals over the field, and its ratio to chance.
 
     The ratio compares the squares of the cells' weighted mean residuals with what independent
     corners of the same spread would give; 1 is pure chance.
     """
-    xy, residuals = all_corners(result)
+    xy, residuals = concatenate_corners(result)
     weights = np.concatenate([v.sigma_px for v in result.views]) ** -2.0
-    cells = cells_of(result, xy, _PATTERN_CELLS)
+    cells = assign_cells(result, xy, _PATTERN_CELLS)
     size = cells.columns * cells.rows
     enough = cells.counts >= _MIN_IN_CELL
     if not np.any(enough):
@@ -142,7 +148,7 @@ def pattern_px(result: CalibrationResult) -> tuple[float, float]:
         [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
     )
     # The median does not see outliers; 0.6745 is that of a normal distribution.
-    spread = float(np.median(np.abs(normalised_residuals(result)))) / 0.6745
+    spread = float(np.median(np.abs(normalise_residuals(result)))) / 0.6745
     chance = spread**2 / total
     squares = np.sum((sums / total[:, None]) ** 2, axis=1)
     excess = float(np.mean(squares - 2.0 * chance))
@@ -151,8 +157,8 @@ def pattern_px(result: CalibrationResult) -> tuple[float, float]:
     return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / (2.0 * chance)))
 
 
-def _pattern(result: CalibrationResult) -> list[str]:
-    size, ratio = pattern_px(result)
+def _check_pattern(result: CalibrationResult) -> list[str]:
+    size, ratio = estimate_pattern_px(result)
     if ratio > _PATTERN_RATIO and size > _PATTERN_PX:
         return [
             f"the residuals have a pattern over the field of {size:.2f} px RMS, more than chance "
@@ -161,14 +167,14 @@ def _pattern(result: CalibrationResult) -> list[str]:
     return []
 
 
-def _predicted(result: CalibrationResult) -> list[str]:
+def _check_predicted_error(result: CalibrationResult) -> list[str]:
     """The gap between calibrated magnifications in which positions are least certain."""
     model = result.model
     low, high = model.magnification_range
-    lattice = field_lattice(*model.image_size, 5)
+    lattice = make_field_lattice(*model.image_size, 5)
     try:
         worst = {
-            float(g): float(np.nanmax(shape_sigma_px(model.at(float(g)), lattice)))
+            float(g): float(np.nanmax(predict_shape_sigma_px(model.at(float(g)), lattice)))
             for g in np.clip(np.geomspace(low, high, 41 if high > low else 1), low, high)
         }
     except (InvalidValueError, ValueError):

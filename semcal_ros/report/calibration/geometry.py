@@ -12,12 +12,12 @@ from semcal_ros.core.camera.projection import ProjectionJacobians, project_point
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
-    "aligned_sigma_px",
-    "displacement_field",
-    "field_lattice",
-    "rms_without_distortion",
-    "shape_sigma_px",
-    "without_residual_field",
+    "compute_displacements",
+    "compute_rms_without_distortion",
+    "make_field_lattice",
+    "predict_aligned_sigma_px",
+    "predict_shape_sigma_px",
+    "remove_residual_field",
 ]
 
 
@@ -26,29 +26,29 @@ _TURN_RAD = 0.1
 _HEIGHT_M = 1e-4
 
 
-def field_lattice(width: int, height: int, across: int) -> Array:
+def make_field_lattice(width: int, height: int, across: int) -> Array:
     """(n, 2) pixels on a regular lattice from edge to edge of the field, row by row."""
     down = max(2, round(across * height / width))
     x, y = np.meshgrid(np.linspace(0, width - 1, across), np.linspace(0, height - 1, down))
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def displacement_field(camera: ScanCamera, across: int = 13) -> tuple[Array, Array]:
+def compute_displacements(camera: ScanCamera, across: int = 13) -> tuple[Array, Array]:
     """Ideal pixels on a lattice over the field with their displacement; NaN where there is none."""
-    xy = field_lattice(camera.width, camera.height, across)
+    xy = make_field_lattice(camera.width, camera.height, across)
     return xy, camera.distort(xy) - xy
 
 
-def without_residual_field(camera: ScanCamera) -> ScanCamera:
+def remove_residual_field(camera: ScanCamera) -> ScanCamera:
     """The camera with its parametric distortion alone."""
     return replace(camera, residual=None)
 
 
-def _jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
+def _compute_jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
     return project_points_with_jacobians(camera.parameters, points, camera.norm_px)
 
 
-def _larger_sigma(difference: Array, covariance: Array) -> Array:
+def _compute_larger_sigma(difference: Array, covariance: Array) -> Array:
     """(n,) 1-sigma along the worse axis from (n, 2, k) derivatives; NaN where they are not known."""
     spread = np.einsum("nip,pq,njq->nij", difference, covariance, difference, optimize=True)
     known = np.all(np.isfinite(spread), axis=(1, 2))
@@ -57,7 +57,7 @@ def _larger_sigma(difference: Array, covariance: Array) -> Array:
     return out
 
 
-def shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
+def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     """(n,) predicted 1-sigma, px, of positions relative to the image centre, worse axis.
 
     The points lie in the reference plane and are seen at ideal pixels ``xy``. A common shift of the
@@ -70,11 +70,11 @@ def shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     centre = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
     points = camera.sem_from_ideal(np.concatenate([centre, xy]))
     jacobian = camera.project_jacobian(points)
-    return _larger_sigma(jacobian[1:] - jacobian[:1], covariance)
+    return _compute_larger_sigma(jacobian[1:] - jacobian[:1], covariance)
 
 
-def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
-    """(n,) as :func:`shape_sigma_px`, after a shift, a turn and a scale that fit best over ``xy``.
+def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
+    """(n,) as :func:`predict_shape_sigma_px`, after a shift, a turn and a scale that fit best over ``xy``.
 
     This is what stays when the pose of a flat specimen is fitted to the image, so it is the part
     of the predicted error that reprojection errors can show.
@@ -84,7 +84,7 @@ def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
         return np.zeros(len(xy))
     points = camera.sem_from_ideal(xy)
     # The moves of the specimen span the same images with and without the small residual field.
-    moved = _jacobians(camera, points).d_xyz
+    moved = _compute_jacobians(camera, points).d_xyz
     jacobian = camera.project_jacobian(points)
     known = np.all(np.isfinite(jacobian), axis=(1, 2))
     if not np.any(known):
@@ -97,11 +97,11 @@ def aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     rows = jacobian[known].reshape(-1, jacobian.shape[2])
     left = (rows - basis @ (basis.T @ rows)).reshape(-1, 2, jacobian.shape[2])
     out = np.full(len(xy), np.nan)
-    out[known] = _larger_sigma(left, covariance)
+    out[known] = _compute_larger_sigma(left, covariance)
     return out
 
 
-def rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
+def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
     """RMS error in px at each magnification if the distortion were not corrected.
 
     The poses are fitted again, linearly about those of the result.
@@ -110,11 +110,11 @@ def rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
     pull = np.diag([1.0 / _TURN_RAD] * 3 + [0.0, 0.0, 1.0 / _HEIGHT_M])
     poses = zip(result.fit.rotations, result.fit.translations_m, strict=True)
     for view, (rotation, translation) in zip(result.views, poses, strict=True):
-        camera = without_residual_field(result.model.at(view.magnification))
+        camera = remove_residual_field(result.model.at(view.magnification))
         straight = replace(camera, xi_r=0.0, xi_t=0.0)
         turned = view.board_xy_m @ rotation[:, :2].T
         points = turned + translation
-        jacobian = _jacobians(straight, points).d_xyz
+        jacobian = _compute_jacobians(straight, points).d_xyz
         x, y, z = turned.T
         o = np.zeros_like(x)
         turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)

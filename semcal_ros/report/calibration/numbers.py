@@ -1,8 +1,7 @@
-"""Numbers and sentences of a report, in the units that a person reads."""
+"""Tables of a calibration report, in the units that a person reads."""
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,20 +10,17 @@ import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
 __all__ = [
     "PAPER_RMS_PX",
     "MagnificationRow",
     "ViewRow",
-    "facts",
-    "fitted_inner_px",
-    "format_length",
-    "format_magnification",
-    "format_px",
-    "held_out_px",
-    "magnification_rows",
-    "plain",
-    "view_rows",
+    "collect_facts",
+    "compute_fitted_inner_px",
+    "compute_held_out_px",
+    "tabulate_magnifications",
+    "tabulate_views",
 ]
 
 # Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
@@ -35,39 +31,6 @@ _METHODS = {
     "discrete": "discrete: each magnification on its own, linear in between",
     "pda": "pda: the paper's differential equations through the separate results",
 }
-
-
-def plain(text: object) -> str:
-    """Text without what a page or UTF-8 cannot carry: control characters and lone surrogates."""
-    kept = (
-        c if c.isspace() or unicodedata.category(c) not in ("Cc", "Cs") else "�" for c in str(text)
-    )
-    return "".join(kept)
-
-
-def format_length(length_m: float, sigma_m: float | None = None) -> str:
-    """A length in nm or um, with two digits of its 1-sigma if there is one."""
-    unit, factor = ("µm", 1e6) if abs(length_m) >= 1e-6 else ("nm", 1e9)
-    value = factor * length_m
-    if sigma_m is None or not (np.isfinite(sigma_m) and sigma_m > 0.0):
-        return f"{value:#.4g}".rstrip(".") + f" {unit}"
-    sigma = factor * sigma_m
-    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
-
-
-def format_magnification(g: float, digits: int = 4) -> str:
-    """A magnification with so many digits, never with an exponent."""
-    return f"{float(f'{g:.{digits}g}'):.10g}×"
-
-
-def format_px(value: float | None) -> str:
-    """An error in px; a dash where there is none."""
-    if value is None or np.isnan(value):
-        return "–"
-    if np.isinf(value):
-        return "no answer"
-    return f"{value:.3f} px"
 
 
 @dataclass(frozen=True)
@@ -85,7 +48,7 @@ class MagnificationRow:
     field: str
 
 
-def magnification_rows(result: CalibrationResult) -> list[MagnificationRow]:
+def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]:
     """Views, errors and pixel size at each calibrated magnification."""
     model = result.model
     rms = rms_by_magnification(result.fit)
@@ -114,7 +77,7 @@ def magnification_rows(result: CalibrationResult) -> list[MagnificationRow]:
     return rows
 
 
-def held_out_px(result: CalibrationResult) -> float | None:
+def compute_held_out_px(result: CalibrationResult) -> float | None:
     """RMS of the held-out errors of all but the two outermost magnifications, px, or None."""
     inner = [
         result.held_out_rms_px[g]
@@ -124,8 +87,8 @@ def held_out_px(result: CalibrationResult) -> float | None:
     return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
 
 
-def fitted_inner_px(result: CalibrationResult) -> float | None:
-    """As :func:`held_out_px` for the fitted errors of the same magnifications."""
+def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
+    """As :func:`compute_held_out_px` for the fitted errors of the same magnifications."""
     rms = rms_by_magnification(result.fit)
     inner = [rms[g] for g in result.model.magnifications[1:-1] if g in result.held_out_rms_px]
     return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
@@ -148,7 +111,7 @@ class ViewRow:
     ratio: float
 
 
-def view_rows(result: CalibrationResult) -> list[ViewRow]:
+def tabulate_views(result: CalibrationResult) -> list[ViewRow]:
     """All views, those first whose corners fit worst for their uncertainty."""
     rows = []
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
@@ -156,7 +119,7 @@ def view_rows(result: CalibrationResult) -> list[ViewRow]:
         expected = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
         rows.append(
             ViewRow(
-                plain(view.name) or "(no name)",
+                remove_control_characters(view.name) or "(no name)",
                 f"{view.magnification:g}×",
                 len(residuals),
                 format_px(rms),
@@ -166,7 +129,7 @@ def view_rows(result: CalibrationResult) -> list[ViewRow]:
     return sorted(rows, key=lambda r: -r.ratio)
 
 
-def facts(result: CalibrationResult) -> list[tuple[str, str]]:
+def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     """How the calibration was computed, as (name, value) pairs."""
     model = result.model
     statistics = model.statistics
@@ -184,21 +147,21 @@ def facts(result: CalibrationResult) -> list[tuple[str, str]]:
         pairs.append(("Observed scale over nominal", f"{statistics['scale_over_nominal']:.4f}"))
     fit = statistics.get("fit", {})
     if isinstance(fit, Mapping):
-        pairs += _fit_facts(fit)
+        pairs += _collect_fit_facts(fit)
     if statistics.get("gauge"):
-        pairs.append(("Convention", plain(statistics["gauge"])))
+        pairs.append(("Convention", remove_control_characters(statistics["gauge"])))
     priors = statistics.get("priors", {})
     if isinstance(priors, Mapping) and priors:
         pairs.append(
             (
                 "Priors (1/m, m and plain numbers)",
-                ", ".join(f"{k} = {_short(v)}" for k, v in priors.items()),
+                ", ".join(f"{k} = {_format_value(v)}" for k, v in priors.items()),
             )
         )
-    return [(name, plain(value)) for name, value in pairs]
+    return [(name, remove_control_characters(value)) for name, value in pairs]
 
 
-def _fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _collect_fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
     pairs = []
     if "reason" in fit:
         pairs.append(("Adjustment", f"{fit['reason']} ({fit.get('iterations', '?')} iterations)"))
@@ -214,5 +177,5 @@ def _fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
     return pairs
 
 
-def _short(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

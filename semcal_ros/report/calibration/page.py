@@ -15,46 +15,44 @@ from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.coverage_figures import (
-    coverage_picture,
-    filled_picture,
-    pose_picture,
-    tilt_picture,
+    plot_coverage,
+    plot_reached_shares,
+    plot_tilt_directions,
+    plot_tilts,
 )
-from semcal_ros.report.calibration.error_figures import residual_histogram, rms_picture
+from semcal_ros.report.calibration.error_figures import plot_residual_histogram, plot_rms
 from semcal_ros.report.calibration.examples import (
     ExampleView,
     UnusedView,
-    best_per_magnification,
-    overlay_of,
-    rejected_pictures,
+    choose_examples,
+    overlay_corners,
+    show_rejected,
 )
 from semcal_ros.report.calibration.field_figures import (
-    distortion_picture,
-    mean_residual_picture,
-    residual_field_pictures,
-    residual_picture,
+    plot_distortion,
+    plot_mean_residuals,
+    plot_residual_field,
+    plot_residuals,
 )
-from semcal_ros.report.calibration.findings import findings
-from semcal_ros.report.calibration.geometry import rms_without_distortion
+from semcal_ros.report.calibration.findings import collect_warnings
+from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
     PAPER_RMS_PX,
-    facts,
-    fitted_inner_px,
-    format_length,
-    format_px,
-    held_out_px,
-    magnification_rows,
-    plain,
-    view_rows,
+    collect_facts,
+    compute_fitted_inner_px,
+    compute_held_out_px,
+    tabulate_magnifications,
+    tabulate_views,
 )
-from semcal_ros.report.calibration.paper import paper_rows
-from semcal_ros.report.calibration.parameter_figures import parameter_groups
-from semcal_ros.report.calibration.pixel_size_figures import pixel_size_pictures
-from semcal_ros.report.calibration.prediction_figures import prediction_pictures
-from semcal_ros.report.html.encode import captioned_pictures
+from semcal_ros.report.calibration.paper import tabulate_beside_paper
+from semcal_ros.report.calibration.parameter_figures import plot_parameters
+from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes
+from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
+from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
+from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
-__all__ = ["calibration_report"]
+__all__ = ["write_calibration_report"]
 
 _MAX_OVERLAYS = 24
 # Seen at once; the others unfold.
@@ -64,7 +62,7 @@ _MAX_REJECTED = 200
 _WORST_VIEWS = 5
 
 
-def calibration_report(
+def write_calibration_report(
     result: CalibrationResult,
     path: str | os.PathLike[str],
     *,
@@ -102,69 +100,73 @@ def calibration_report(
         If an image has an unsupported shape, or the file cannot be written.
     """
     model = result.model
-    extra = captioned_pictures(images)
-    shown = _spread(best_per_magnification(detections), _MAX_OVERLAYS)
-    first = _spread(shown, _FIRST_OVERLAYS)
-    examples = _low_middle_high(model)
-    rms, straight = rms_by_magnification(result.fit), rms_without_distortion(result)
+    extra = encode_pictures(images)
+    shown = _choose_evenly(choose_examples(detections), _MAX_OVERLAYS)
+    first = _choose_evenly(shown, _FIRST_OVERLAYS)
+    examples = _choose_example_cameras(model)
+    rms, straight = rms_by_magnification(result.fit), compute_rms_without_distortion(result)
     values = {
-        "title": plain(title),
-        "summary": _summary(result, len(rejected)),
-        "warnings": findings(result, rejected),
-        "errors": [rms_picture(result, straight)],
-        "paper": paper_rows(result, rms, straight),
-        "predicted": prediction_pictures(model),
+        "title": remove_control_characters(title),
+        "summary": _summarise(result, len(rejected)),
+        "warnings": collect_warnings(result, rejected),
+        "errors": [plot_rms(result, straight)],
+        "paper": tabulate_beside_paper(result, rms, straight),
+        "predicted": plot_predicted_errors(model),
         "residuals": [
-            mean_residual_picture(result),
-            residual_picture(result),
-            residual_histogram(result),
+            plot_mean_residuals(result),
+            plot_residuals(result),
+            plot_residual_histogram(result),
         ],
-        "distortion": [distortion_picture(camera) for camera in examples],
-        "residual_field": residual_field_pictures(model, examples),
-        "pixel_size": pixel_size_pictures(model),
-        "parameters": parameter_groups(model),
+        "distortion": [plot_distortion(camera) for camera in examples],
+        "residual_field": plot_residual_field(model, examples),
+        "pixel_size": plot_pixel_sizes(model),
+        "parameters": plot_parameters(model),
         "coverage": [
-            coverage_picture(result),
-            filled_picture(result),
-            pose_picture(result),
-            tilt_picture(result),
+            plot_coverage(result),
+            plot_reached_shares(result),
+            plot_tilt_directions(result),
+            plot_tilts(result),
         ],
-        "overlays": [overlay_of(view) for view in first],
-        "more_overlays": [overlay_of(v) for v in shown if all(v is not f for f in first)],
+        "overlays": [overlay_corners(view) for view in first],
+        "more_overlays": [overlay_corners(v) for v in shown if all(v is not f for f in first)],
         "refused_corners": sum(d.detection.rejected for d in detections),
-        "rejected_images": rejected_pictures(rejected, _MAX_THUMBNAILS),
+        "rejected_images": show_rejected(rejected, _MAX_THUMBNAILS),
         "rejected": [
-            (plain(r.name), f"{r.magnification:g}×", plain(r.reason))
+            (
+                remove_control_characters(r.name),
+                f"{r.magnification:g}×",
+                remove_control_characters(r.reason),
+            )
             for r in rejected[:_MAX_REJECTED]
         ],
         "rejected_count": len(rejected),
-        "worst_views": view_rows(result)[:_WORST_VIEWS],
-        "rows": magnification_rows(result),
-        "facts": facts(result),
+        "worst_views": tabulate_views(result)[:_WORST_VIEWS],
+        "rows": tabulate_magnifications(result),
+        "facts": collect_facts(result),
         "images": extra,
     }
     return write_page(path, render("calibration.html.j2", values))
 
 
-def _spread(views: list[ExampleView], count: int) -> list[ExampleView]:
+def _choose_evenly(views: list[ExampleView], count: int) -> list[ExampleView]:
     """At most ``count`` of the views, evenly chosen, with the first and the last."""
     if len(views) <= count:
         return views
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
 
 
-def _low_middle_high(model: CalibrationModel) -> list[ScanCamera]:
+def _choose_example_cameras(model: CalibrationModel) -> list[ScanCamera]:
     low, high = model.magnification_range
     if low == high:
         return [model.at(low)]
     return [model.at(g) for g in (low, float(np.sqrt(low * high)), high)]
 
 
-def _summary(result: CalibrationResult, rejected: int) -> list[tuple[str, str, str]]:
+def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str, str]]:
     """The key figures as (name, value, remark)."""
     model = result.model
     low, high = model.magnification_range
-    held_out = held_out_px(result)
+    held_out = compute_held_out_px(result)
     size = [model.at(g).pixel_size_m[0] for g in (low, high)]
     corners = sum(len(v.image_xy) for v in result.views)
     paper = f"paper: {PAPER_RMS_PX[0]:g} to {PAPER_RMS_PX[1]:g} px"
@@ -179,7 +181,7 @@ def _summary(result: CalibrationResult, rejected: int) -> list[tuple[str, str, s
             "Held-out error",
             format_px(held_out),
             "RMS of images left out, without the outermost magnifications; "
-            f"fitted: {format_px(fitted_inner_px(result))}"
+            f"fitted: {format_px(compute_fitted_inner_px(result))}"
             if held_out is not None
             else "needs 3 magnifications",
         ),

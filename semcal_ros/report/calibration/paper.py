@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.report.calibration.numbers import PAPER_RMS_PX, format_px, held_out_px
+from semcal_ros.report.calibration.numbers import PAPER_RMS_PX, compute_held_out_px
+from semcal_ros.report.html.text import format_px
 
-__all__ = ["PaperRow", "paper_rows", "typical_px"]
+__all__ = ["PaperRow", "compute_median_px", "tabulate_beside_paper"]
 
 # Section 4.1.3, medians: after the correction of drift but not of distortion.
 _PAPER_STRAIGHT_PX = 3.0
@@ -28,13 +29,13 @@ class PaperRow:
     paper: str
 
 
-def typical_px(errors: Mapping[float, float]) -> float | None:
+def compute_median_px(errors: Mapping[float, float]) -> float | None:
     """Median over the magnifications, px, or None."""
     values = [v for v in errors.values() if not np.isnan(v)]
     return float(np.median(values)) if values else None
 
 
-def paper_rows(
+def tabulate_beside_paper(
     result: CalibrationResult, rms: Mapping[float, float], straight: Mapping[float, float]
 ) -> list[PaperRow]:
     """Errors of the calibration with the paper's figures for the same.
@@ -48,12 +49,12 @@ def paper_rows(
     return [
         PaperRow(
             "Distortion left in, median over the magnifications",
-            format_px(typical_px(straight)),
+            format_px(compute_median_px(straight)),
             f"{_PAPER_STRAIGHT_PX:g} px (median, section 4.1.3)",
         ),
         PaperRow(
             "Distortion corrected, median over the magnifications",
-            format_px(typical_px(rms)),
+            format_px(compute_median_px(rms)),
             f"{section:g} px (median, section 4.1.3)",
         ),
         PaperRow(
@@ -63,7 +64,7 @@ def paper_rows(
         ),
         PaperRow(
             "Magnifications left out of the calibration, RMS without the outermost two",
-            format_px(held_out_px(result)),
+            format_px(compute_held_out_px(result)),
             "not reported",
         ),
     ]

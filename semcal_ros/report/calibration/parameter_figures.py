@@ -13,15 +13,22 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
-    curve,
-    marks_of_magnifications,
-    sampled_cameras,
-    wide_enough,
+    draw_curve,
+    mark_magnifications,
+    sample_cameras,
+    set_limits_with_room,
 )
-from semcal_ros.report.html.encode import Picture, picture_of_figure
-from semcal_ros.report.html.style import OURS, log_axis_y, magnification_axis, new_figure, tidy
+from semcal_ros.report.html.encode import Picture, encode_figure
+from semcal_ros.report.html.style import (
+    OURS,
+    create_figure,
+    set_log_axis_y,
+    set_magnification_axis,
+    style_axes,
+)
+from semcal_ros.report.html.text import format_with_sigma
 
-__all__ = ["ParameterGroup", "calibration_figure", "focal_length_px", "parameter_groups"]
+__all__ = ["ParameterGroup", "compute_focal_length_px", "plot_calibration", "plot_parameters"]
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ _GROUPS = (
 )
 
 
-def focal_length_px(camera: ScanCamera) -> tuple[float, float]:
+def compute_focal_length_px(camera: ScanCamera) -> tuple[float, float]:
     """Focal length m / rho and its 1-sigma, px; infinite for a parallel projection."""
     if camera.rho <= 0.0:
         return float("inf"), float("inf")
@@ -110,16 +117,18 @@ def focal_length_px(camera: ScanCamera) -> tuple[float, float]:
     return f, float(np.sqrt(max(float(gradient @ camera.covariance @ gradient), 0.0)))
 
 
-def _values_and_sigmas(
+def _collect_values(
     model: CalibrationModel, cameras: list[ScanCamera], name: str
 ) -> tuple[Array, Array]:
     """(G,) values of a parameter and their 1-sigma, the scale relative to nominal."""
     if name == "f":
-        pairs = np.array([focal_length_px(c) for c in cameras])
+        pairs = np.array([compute_focal_length_px(c) for c in cameras])
         return pairs[:, 0], pairs[:, 1]
     k = PARAMETER_NAMES.index(name)
     values = np.array([c.parameters[k] for c in cameras])
-    variances = np.array([0.0 if c.covariance is None else c.covariance[k, k] for c in cameras])
+    variances = np.array(
+        [0.0 if c.covariance is None else float(c.covariance[k, k]) for c in cameras]
+    )
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     if name == "m":
         nominal = np.array([model.nominal_px_per_m(c.magnification) for c in cameras])
@@ -127,30 +136,30 @@ def _values_and_sigmas(
     return values, sigmas
 
 
-def parameter_groups(model: CalibrationModel) -> list[ParameterGroup]:
+def plot_parameters(model: CalibrationModel) -> list[ParameterGroup]:
     """Each camera parameter against the magnification with its 1-sigma band."""
-    cameras = sampled_cameras(model)
+    cameras = sample_cameras(model)
     g = np.array([c.magnification for c in cameras])
     groups = []
     for title, text, panels in _GROUPS:
         pictures = []
         for panel in panels:
-            values, sigmas = _values_and_sigmas(model, cameras, panel.name)
+            values, sigmas = _collect_values(model, cameras, panel.name)
             if np.all(np.isfinite(values)):
                 values, sigmas = panel.factor * values - panel.offset, panel.factor * sigmas
-                pictures.append(_picture(model, panel, g, values, sigmas))
+                pictures.append(_plot_panel(model, panel, g, values, sigmas))
             else:
                 text = f"{text} {_NO_FOCAL}"
         groups.append(ParameterGroup(title, text, tuple(pictures)))
     return groups
 
 
-def _picture(
+def _plot_panel(
     model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
 ) -> Picture:
-    figure = new_figure(4.0, 2.4)
+    figure = create_figure(4.0, 2.4)
     _draw_panel(figure.add_subplot(), model, panel, g, values, sigmas)
-    first, last = (_with_sigma(values[k], sigmas[k]) for k in (0, -1))
+    first, last = (format_with_sigma(values[k], sigmas[k]) for k in (0, -1))
     # What does not change may be known better at one end than at the other.
     if len(g) > 1 and first == last and np.ptp(values) <= 1e-9 * np.abs(values).max():
         ends = f"{first} at every magnification"
@@ -158,7 +167,7 @@ def _picture(
         ends = f"{first} at {g[0]:g}× to {last} at {g[-1]:g}×"
     else:
         ends = f"{first} at {g[0]:g}×"
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"{panel.title} against magnification: {ends}, in {panel.unit}; "
         f"largest 1-sigma {sigmas.max():.2g}.",
@@ -170,33 +179,33 @@ def _draw_panel(
     axes: Axes, model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
 ) -> None:
     """A parameter with its 1-sigma band."""
-    tidy(axes, xlabel="magnification", ylabel=panel.unit)
-    curve(axes, g, values, sigmas, OURS)
-    magnification_axis(axes, g[0], g[-1])
+    style_axes(axes, xlabel="magnification", ylabel=panel.unit)
+    draw_curve(axes, g, values, sigmas, OURS)
+    set_magnification_axis(axes, g[0], g[-1])
     if panel is _FOCAL:
-        log_axis_y(axes, 0.7 * float(values.min()), 1.4 * float(values.max()))
+        set_log_axis_y(axes, 0.7 * float(values.min()), 1.4 * float(values.max()))
     else:
-        wide_enough(axes, values, sigmas)
+        set_limits_with_room(axes, values, sigmas)
         axes.ticklabel_format(axis="y", useOffset=False)
-    marks_of_magnifications(axes, model)
+    mark_magnifications(axes, model)
 
 
-def calibration_figure(model: CalibrationModel) -> Figure:
+def plot_calibration(model: CalibrationModel) -> Figure:
     """Pixel size and every parameter against the magnification, with 1-sigma bands, in one figure.
 
     The focal length is left out: it is the scale over the inverse distance of the scan pivot.
     """
-    cameras = sampled_cameras(model)
+    cameras = sample_cameras(model)
     g = np.array([c.magnification for c in cameras])
     panels = [panel for _, _, group in _GROUPS for panel in group if panel is not _FOCAL]
     # The scale first, then what follows from the paper's figures.
     panels.sort(key=lambda panel: panel.name != "m")
     columns = 4
-    figure = new_figure(3.6 * columns, 2.5 * -(-(1 + len(panels)) // columns))
+    figure = create_figure(3.6 * columns, 2.5 * -(-(1 + len(panels)) // columns))
     places = figure.subplots(-(-(1 + len(panels)) // columns), columns).ravel()
     _draw_pixel_size(places[0], model, g, np.array([c.pixel_size_m for c in cameras]))
     for axes, panel in zip(places[1:], panels, strict=False):
-        values, sigmas = _values_and_sigmas(model, cameras, panel.name)
+        values, sigmas = _collect_values(model, cameras, panel.name)
         values, sigmas = panel.factor * values - panel.offset, panel.factor * sigmas
         _draw_panel(axes, model, panel, g, values, sigmas)
         axes.set_title(panel.title, fontsize="small")
@@ -208,17 +217,9 @@ def calibration_figure(model: CalibrationModel) -> Figure:
 def _draw_pixel_size(axes: Axes, model: CalibrationModel, g: Array, sizes: Array) -> None:
     """Mean of both axes; its uncertainty, which no logarithmic axis shows, is in the scale's panel."""
     nm = 1e9 * sizes.mean(axis=1)
-    tidy(axes, xlabel="magnification", ylabel="nm")
+    style_axes(axes, xlabel="magnification", ylabel="nm")
     axes.plot(g, nm, "o" if len(g) == 1 else "-", color=OURS, linewidth=1.4)
-    magnification_axis(axes, g[0], g[-1])
-    log_axis_y(axes, 0.8 * float(nm.min()), 1.25 * float(nm.max()))
-    marks_of_magnifications(axes, model)
+    set_magnification_axis(axes, g[0], g[-1])
+    set_log_axis_y(axes, 0.8 * float(nm.min()), 1.25 * float(nm.max()))
+    mark_magnifications(axes, model)
     axes.set_title("Size of a pixel", fontsize="small")
-
-
-def _with_sigma(value: float, sigma: float) -> str:
-    """A value with two digits of its 1-sigma, such as ``230.54 ± 0.31``."""
-    if not (np.isfinite(sigma) and sigma > 0.0):
-        return f"{value:.4g}"
-    digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"

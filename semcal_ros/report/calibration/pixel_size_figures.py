@@ -8,75 +8,73 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
-    curve,
-    marks_of_magnifications,
-    sampled_cameras,
-    wide_enough,
+    draw_curve,
+    mark_magnifications,
+    sample_cameras,
+    set_limits_with_room,
 )
-from semcal_ros.report.calibration.numbers import format_length
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     OURS,
     SECOND,
-    legend,
-    log_axis_y,
-    magnification_axis,
-    new_figure,
-    tidy,
+    add_legend,
+    create_figure,
+    set_log_axis_y,
+    set_magnification_axis,
+    style_axes,
 )
+from semcal_ros.report.html.text import format_length
 
-__all__ = ["pixel_size_pictures"]
+__all__ = ["plot_pixel_sizes"]
 
 
-def pixel_size_pictures(model: CalibrationModel) -> list[Picture]:
+def plot_pixel_sizes(model: CalibrationModel) -> list[Picture]:
     """Size of a pixel against the magnification, and how well it is known."""
-    cameras = sampled_cameras(model)
+    cameras = sample_cameras(model)
     g = np.array([c.magnification for c in cameras])
     sizes = np.array([c.pixel_size_m for c in cameras])
-    sigmas = np.array([_size_sigma(c) for c in cameras])
+    sigmas = np.array([_get_size_sigma(c) for c in cameras])
     nominal = np.array([1.0 / model.nominal_px_per_m(float(x)) for x in g])
     return [
-        _size_picture(model, g, sizes),
-        _size_interval_picture(model, g, sizes / nominal[:, None], sigmas / nominal[:, None]),
+        _plot_size(model, g, sizes),
+        _plot_size_interval(model, g, sizes / nominal[:, None], sigmas / nominal[:, None]),
     ]
 
 
 _DIRECTIONS = (("x (horizontal)", OURS, "-"), ("y (vertical)", SECOND, "--"))
 
 
-def _size_picture(model: CalibrationModel, g: Array, sizes: Array) -> Picture:
-    figure = new_figure(4.6, 3.2)
+def _plot_size(model: CalibrationModel, g: Array, sizes: Array) -> Picture:
+    figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="nm per pixel")
+    style_axes(axes, xlabel="magnification", ylabel="nm per pixel")
     for k, (label, color, style) in enumerate(_DIRECTIONS):
         shape = "o" if len(g) == 1 else style
         axes.plot(g, 1e9 * sizes[:, k], shape, color=color, linewidth=2.6 - 1.2 * k, label=label)
-    magnification_axis(axes, g[0], g[-1])
-    log_axis_y(axes, 0.8e9 * float(sizes.min()), 1.25e9 * float(sizes.max()))
-    marks_of_magnifications(axes, model)
-    legend(axes, loc="upper right")
+    set_magnification_axis(axes, g[0], g[-1])
+    set_log_axis_y(axes, 0.8e9 * float(sizes.min()), 1.25e9 * float(sizes.max()))
+    mark_magnifications(axes, model)
+    add_legend(axes, loc="upper right")
     ends = [f"{format_length(sizes[k, 0])} at {g[k]:g}×" for k in (0, -1)]
     span = f"from {ends[0]} to {ends[1]}" if len(g) > 1 else ends[0]
-    return picture_of_figure(
+    return encode_figure(
         figure, f"Pixel size against magnification, in x {span}.", f"Size of a pixel; in x {span}."
     )
 
 
-def _size_interval_picture(
-    model: CalibrationModel, g: Array, ratio: Array, sigma: Array
-) -> Picture:
-    figure = new_figure(4.6, 3.2)
+def _plot_size_interval(model: CalibrationModel, g: Array, ratio: Array, sigma: Array) -> Picture:
+    figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="pixel size relative to nominal (%)")
+    style_axes(axes, xlabel="magnification", ylabel="pixel size relative to nominal (%)")
     percent, half = 100.0 * (ratio - 1.0), 196.0 * sigma
     for k, (label, color, style) in enumerate(_DIRECTIONS):
-        curve(axes, g, percent[:, k], half[:, k], color, label, style)
-    magnification_axis(axes, g[0], g[-1])
-    wide_enough(axes, percent, half)
-    marks_of_magnifications(axes, model)
-    legend(axes, loc="best")
+        draw_curve(axes, g, percent[:, k], half[:, k], color, label, style)
+    set_magnification_axis(axes, g[0], g[-1])
+    set_limits_with_room(axes, percent, half)
+    mark_magnifications(axes, model)
+    add_legend(axes, loc="best")
     worst = float(np.max(half / ratio))
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Deviation of the pixel size from nominal with its 95 % interval, at most {worst:.2g} % "
         "to either side.",
@@ -85,5 +83,5 @@ def _size_interval_picture(
     )
 
 
-def _size_sigma(camera: ScanCamera) -> tuple[float, float]:
+def _get_size_sigma(camera: ScanCamera) -> tuple[float, float]:
     return (0.0, 0.0) if camera.covariance is None else camera.pixel_size_sigma_m

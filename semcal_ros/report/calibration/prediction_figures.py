@@ -9,29 +9,33 @@ from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
-    cameras_around,
-    marks_of_magnifications,
-    sampled_cameras,
+    mark_magnifications,
+    sample_cameras,
+    sample_cameras_around,
 )
-from semcal_ros.report.calibration.geometry import aligned_sigma_px, field_lattice, shape_sigma_px
-from semcal_ros.report.calibration.numbers import format_magnification
-from semcal_ros.report.html.encode import Picture, picture_of_figure
+from semcal_ros.report.calibration.geometry import (
+    make_field_lattice,
+    predict_aligned_sigma_px,
+    predict_shape_sigma_px,
+)
+from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     LIGHT_MAP,
     OURS,
     SECOND,
-    field_axes,
-    labelled_contours,
-    legend,
-    log_axis_y,
-    magnification_axis,
-    new_figure,
-    tidy,
+    add_legend,
+    create_figure,
+    draw_contours,
+    set_log_axis_y,
+    set_magnification_axis,
+    style_axes,
+    style_field_axes,
 )
+from semcal_ros.report.html.text import format_magnification
 
-__all__ = ["prediction_pictures"]
+__all__ = ["plot_predicted_errors"]
 
 
 # The map goes on to this factor outside of the calibrated range, to show what extrapolation costs.
@@ -42,45 +46,47 @@ _DIRECTIONS = 32
 _ACROSS = 17
 
 
-def prediction_pictures(model: CalibrationModel) -> list[Picture]:
+def plot_predicted_errors(model: CalibrationModel) -> list[Picture]:
     """Map over distance and magnification, maps over the field, and curves.
 
     Empty for a calibration without uncertainty.
     """
-    cameras = sampled_cameras(model)
+    cameras = sample_cameras(model)
     if any(c.covariance is None for c in cameras):
         return []
-    lattice = field_lattice(*model.image_size, 9)
-    shape = np.stack([shape_sigma_px(c, lattice) for c in cameras])
-    worst = cameras[int(np.nanargmax(np.nanmax(shape, axis=1)))] if _any(shape) else cameras[0]
-    pictures = [_fields_picture(model, worst), _curves(model, cameras, lattice, shape)]
-    return [_map_picture(model), *pictures] if len(cameras) > 1 else pictures
+    lattice = make_field_lattice(*model.image_size, 9)
+    shape = np.stack([predict_shape_sigma_px(c, lattice) for c in cameras])
+    worst = (
+        cameras[int(np.nanargmax(np.nanmax(shape, axis=1)))] if _has_finite(shape) else cameras[0]
+    )
+    pictures = [_plot_fields(model, worst), _plot_curves(model, cameras, lattice, shape)]
+    return [_plot_map(model), *pictures] if len(cameras) > 1 else pictures
 
 
-def _any(values: Array) -> bool:
+def _has_finite(values: Array) -> bool:
     return bool(np.any(np.isfinite(values)))
 
 
 # -- map ------------------------------------------------------------------------------------------
 
 
-def _map_picture(model: CalibrationModel) -> Picture:
+def _plot_map(model: CalibrationModel) -> Picture:
     """Largest predicted error at each distance from the image centre, at each magnification."""
-    cameras = cameras_around(model, _BEYOND, _COLUMNS)
+    cameras = sample_cameras_around(model, _BEYOND, _COLUMNS)
     g = np.array([c.magnification for c in cameras])
-    radii, points, ring = _rings(model)
+    radii, points, ring = _sample_rings(model)
     table = np.full((len(radii), len(cameras)), np.nan)
     for column, camera in enumerate(cameras):
-        sigma = np.nan_to_num(shape_sigma_px(camera, points), nan=np.inf)
+        sigma = np.nan_to_num(predict_shape_sigma_px(camera, points), nan=np.inf)
         largest = np.zeros(len(radii))
         np.maximum.at(largest, ring, sigma)
         table[:, column] = np.where(np.isfinite(largest), largest, np.nan)
     low, high = model.magnification_range
     inside = table[:, (g >= low) & (g <= high)]
-    top = float(np.nanmax(inside)) if _any(inside) else 1.0
-    figure = new_figure(4.6, 3.6)
+    top = float(np.nanmax(inside)) if _has_finite(inside) else 1.0
+    figure = create_figure(4.6, 3.6)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="distance from the image centre (px)")
+    style_axes(axes, xlabel="magnification", ylabel="distance from the image centre (px)")
     axes.grid(False)
     axes.pcolormesh(
         g,
@@ -92,16 +98,16 @@ def _map_picture(model: CalibrationModel) -> Picture:
         shading="gouraud",
         rasterized=True,
     )
-    magnification_axis(axes, g[0], g[-1])
+    set_magnification_axis(axes, g[0], g[-1])
     axes.set_ylim(0.0, float(radii[-1]))
-    labelled_contours(axes, g, radii, table, 1.2 * top, lines=8)
+    draw_contours(axes, g, radii, table, 1.2 * top, lines=8)
     for edge in (low, high):
         axes.axvline(edge, color=INK, linewidth=1.2, linestyle="--")
     for start, end in ((g[0], low), (high, g[-1])):
         axes.axvspan(start, end, facecolor="none", edgecolor=INK, hatch="///", alpha=0.18)
-    marks_of_magnifications(axes, model)
-    ends = [_ends(table, g, x) for x in (low / _BEYOND, high * _BEYOND)]
-    return picture_of_figure(
+    mark_magnifications(axes, model)
+    ends = [_get_largest_at(table, g, x) for x in (low / _BEYOND, high * _BEYOND)]
+    return encode_figure(
         figure,
         "Map of the predicted error over magnification and distance from the image centre: at "
         f"most {top:.2g} px in the calibrated range.",
@@ -111,12 +117,12 @@ def _map_picture(model: CalibrationModel) -> Picture:
     )
 
 
-def _ends(table: Array, g: Array, x: float) -> float:
+def _get_largest_at(table: Array, g: Array, x: float) -> float:
     column = table[:, int(np.argmin(np.abs(np.log(g / x))))]
-    return float(np.nanmax(column)) if _any(column) else float("inf")
+    return float(np.nanmax(column)) if _has_finite(column) else float("inf")
 
 
-def _rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
+def _sample_rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
     """Radii (px), points of the field on circles of these radii, and the circle of each point."""
     width, height = model.image_size
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
@@ -135,7 +141,7 @@ def _rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
 # -- fields ---------------------------------------------------------------------------------------
 
 
-def _fields_picture(model: CalibrationModel, worst: ScanCamera) -> Picture:
+def _plot_fields(model: CalibrationModel, worst: ScanCamera) -> Picture:
     """Predicted error over the field at the ends, in the middle, and where it is largest."""
     low, high = model.magnification_range
     chosen = {c.magnification: c for c in (model.at(low), worst, model.at(high))}
@@ -144,17 +150,17 @@ def _fields_picture(model: CalibrationModel, worst: ScanCamera) -> Picture:
         chosen[middle.magnification] = middle
     cameras = [chosen[g] for g in sorted(chosen)]
     width, height = model.image_size
-    lattice = field_lattice(width, height, _ACROSS)
+    lattice = make_field_lattice(width, height, _ACROSS)
     down = len(lattice) // _ACROSS
-    tables = [shape_sigma_px(c, lattice).reshape(down, _ACROSS) for c in cameras]
-    top = max((float(np.nanmax(t)) for t in tables if _any(t)), default=1.0)
+    tables = [predict_shape_sigma_px(c, lattice).reshape(down, _ACROSS) for c in cameras]
+    top = max((float(np.nanmax(t)) for t in tables if _has_finite(t)), default=1.0)
     columns = 1 if len(cameras) == 1 else 2
     rows = -(-len(cameras) // columns)
-    figure = new_figure(4.6, 0.4 + rows * (0.45 + 3.9 / columns * min(height / width, 1.6)))
+    figure = create_figure(4.6, 0.4 + rows * (0.45 + 3.9 / columns * min(height / width, 1.6)))
     x, y = lattice[:_ACROSS, 0], lattice[::_ACROSS, 1]
     for k, (camera, table) in enumerate(zip(cameras, tables, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
-        _field(axes, x, y, table, top)
+        _draw_field(axes, x, y, table, top)
         axes.set_title(format_magnification(camera.magnification), fontsize=9, color=INK)
         if k % columns:
             axes.set_ylabel("")
@@ -163,9 +169,9 @@ def _fields_picture(model: CalibrationModel, worst: ScanCamera) -> Picture:
     peaks = ", ".join(
         f"{np.nanmax(t):.2g} px at {format_magnification(c.magnification)}"
         for c, t in zip(cameras, tables, strict=True)
-        if _any(t)
+        if _has_finite(t)
     )
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Maps of the predicted error over the field at {len(cameras)} magnifications; "
         f"largest: {peaks}.",
@@ -173,28 +179,30 @@ def _fields_picture(model: CalibrationModel, worst: ScanCamera) -> Picture:
     )
 
 
-def _field(axes: Axes, x: Array, y: Array, table: Array, top: float) -> None:
-    field_axes(axes, round(float(x[-1])) + 1, round(float(y[-1])) + 1)
+def _draw_field(axes: Axes, x: Array, y: Array, table: Array, top: float) -> None:
+    style_field_axes(axes, round(float(x[-1])) + 1, round(float(y[-1])) + 1)
     axes.grid(False)
     axes.pcolormesh(
         x, y, table, cmap=LIGHT_MAP, vmin=0.0, vmax=1.3 * top, shading="gouraud", rasterized=True
     )
-    labelled_contours(axes, x, y, table, float(np.nanmax(table)) if _any(table) else top, lines=4)
+    draw_contours(
+        axes, x, y, table, float(np.nanmax(table)) if _has_finite(table) else top, lines=4
+    )
 
 
 # -- curves ---------------------------------------------------------------------------------------
 
 
-def _curves(
+def _plot_curves(
     model: CalibrationModel, cameras: list[ScanCamera], lattice: Array, shape: Array
 ) -> Picture:
     """Predicted error against the magnification, with and without what a fitted pose absorbs."""
     g = np.array([c.magnification for c in cameras])
-    aligned = np.stack([aligned_sigma_px(c, lattice) for c in cameras])
+    aligned = np.stack([predict_aligned_sigma_px(c, lattice) for c in cameras])
     total = max(float(np.nanmax(c.project_sigma(c.sem_from_ideal(lattice)))) for c in cameras)
-    figure = new_figure(4.6, 3.6)
+    figure = create_figure(4.6, 3.6)
     axes = figure.add_subplot()
-    tidy(axes, xlabel="magnification", ylabel="predicted 1-sigma (px)")
+    style_axes(axes, xlabel="magnification", ylabel="predicted 1-sigma (px)")
     mark = "o" if len(g) == 1 else ""
     shown = []
     for values, color, line, label in (
@@ -207,13 +215,13 @@ def _curves(
         shown.append(values)
     positive = np.concatenate(shown)
     positive = positive[np.isfinite(positive) & (positive > 0.0)]
-    magnification_axis(axes, g[0], g[-1])
+    set_magnification_axis(axes, g[0], g[-1])
     if positive.size:
-        log_axis_y(axes, 0.6 * float(positive.min()), 8.0 * float(positive.max()))
-    marks_of_magnifications(axes, model)
-    legend(axes, loc="upper center", ncols=1)
+        set_log_axis_y(axes, 0.6 * float(positive.min()), 8.0 * float(positive.max()))
+    mark_magnifications(axes, model)
+    add_legend(axes, loc="upper center", ncols=1)
     worst, left = float(np.nanmax(shape)), float(np.nanmax(aligned))
-    return picture_of_figure(
+    return encode_figure(
         figure,
         f"Predicted error of positions relative to the image centre, at most {worst:.2g} px over "
         f"field and range; {left:.2g} px after the pose is fitted.",

@@ -16,25 +16,30 @@ from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.core.arrays import check_image
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.calibration.numbers import plain
+from semcal_ros.report.html.text import remove_control_characters
 
 __all__ = [
     "Picture",
-    "as_bytes_image",
-    "captioned_pictures",
-    "data_uri",
-    "jpeg_of",
-    "picture_of_figure",
-    "shrunk",
+    "convert_to_8_bits",
+    "encode_data_uri",
+    "encode_figure",
+    "encode_jpeg",
+    "encode_pictures",
+    "encode_png",
+    "shrink",
 ]
 
 # Two dots of the file per CSS pixel of the page (96 per inch), so that pictures are sharp on fine
 # screens.
 _FIGURE_DPI = 192.0
 _CSS_PX_PER_INCH = 96.0
-_JPEG_QUALITY = 82
 # Line drawings with soft edges need no more colours; the file is three times smaller than in RGB.
 _COLORS = 128
+# Quality of JPEG files. Pictures that a caller hands in are the subject of a page, and get more.
+_JPEG_QUALITY = 82
+_CALLER_QUALITY = 88
+# Width of pictures that a caller hands in, px: that of a column of the page.
+_CALLER_WIDTH = 640
 
 
 @dataclass(frozen=True)
@@ -60,37 +65,50 @@ class Picture:
     height: int
 
 
-def data_uri(kind: str, data: bytes) -> str:
-    """``data:image/<kind>;base64,...``"""
+def encode_data_uri(kind: str, data: bytes) -> str:
+    """Encode as ``data:image/<kind>;base64,...``."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def picture_of_figure(figure: Figure, alt: str, caption: str = "") -> Picture:
-    """The figure as a PNG picture; the figure is emptied afterwards, so that its memory is free."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=_FIGURE_DPI)
+def encode_figure(figure: Figure, alt: str, caption: str = "") -> Picture:
+    """Encode a figure for a page, and empty it, so that its memory is free."""
     width, height = figure.get_size_inches() * _CSS_PX_PER_INCH
+    source = encode_data_uri("png", encode_png(figure, _FIGURE_DPI))
     figure.clear()
-    with Image.open(drawn) as image:
-        few = image.convert("RGB").quantize(
-            _COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
-        )
+    return Picture(source, alt, caption, round(float(width)), round(float(height)))
+
+
+def encode_png(figure: Figure, dpi: float, *, keep_rare_colors: bool = False) -> bytes:
+    """Encode a figure as a PNG file with a palette.
+
+    Parameters
+    ----------
+    figure
+        What is drawn.
+    dpi
+        Dots per inch.
+    keep_rare_colors
+        Let the few pixels of a coloured line keep their colour among the grey ones of a micrograph.
+    """
+    full = io.BytesIO()
+    figure.savefig(full, format="png", dpi=dpi)
+    method = Image.Quantize.MAXCOVERAGE if keep_rare_colors else Image.Quantize.MEDIANCUT
+    with Image.open(full) as image:
+        palette = image.convert("RGB").quantize(_COLORS, method, dither=Image.Dither.NONE)
     small = io.BytesIO()
-    few.save(small, format="png", optimize=True)
-    return Picture(
-        data_uri("png", small.getvalue()), alt, caption, round(float(width)), round(float(height))
-    )
+    palette.save(small, format="png", optimize=True)
+    return small.getvalue()
 
 
-def as_bytes_image(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Any gray or three-channel (RGB) image as uint8.
+def convert_to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Convert any gray or three-channel (RGB) image to uint8.
 
     Eight-bit images keep their values; others are stretched between their 0.5 and 99.5 % quantiles.
 
     Raises
     ------
     InvalidValueError
-        For an array that is no image: wrong number of dimensions or channels, empty, or without
+        If the array is not an image: wrong number of dimensions or channels, empty, or without
         finite pixels.
     """
     array = check_image(image)
@@ -105,8 +123,13 @@ def as_bytes_image(image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.nan_to_num(scaled, nan=0.0), 0.0, 255.0), dtype=np.uint8)
 
 
-def shrunk(image: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], float]:
-    """The image at most ``width`` px wide and three times as high, and its scale factor."""
+def shrink(image: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], float]:
+    """Shrink an image to at most ``width`` px across and three times that down.
+
+    Returns
+    -------
+    The image, and the factor by which it was scaled.
+    """
     factor = min(1.0, width / image.shape[1], 3.0 * width / image.shape[0])
     if factor == 1.0:
         return image, 1.0
@@ -115,8 +138,8 @@ def shrunk(image: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], flo
     return np.asarray(resized, dtype=np.uint8), factor
 
 
-def jpeg_of(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> bytes:
-    """JPEG file of a gray or RGB image: noisy micrographs are several times smaller than as PNG."""
+def encode_jpeg(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> bytes:
+    """Encode a gray or RGB image as JPEG: noisy micrographs are several times smaller than as PNG."""
     ordered = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     ok, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:
@@ -126,16 +149,12 @@ def jpeg_of(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> bytes:
     return bytes(data)
 
 
-_MAX_WIDTH = 640
-_QUALITY = 88
-
-
-def captioned_pictures(images: Sequence[tuple[str, NDArray[Any]]]) -> list[Picture]:
-    """(caption, image) pairs, gray or RGB of any depth, at most 640 px wide."""
+def encode_pictures(images: Sequence[tuple[str, NDArray[Any]]]) -> list[Picture]:
+    """Encode (caption, image) pairs, gray or RGB of any depth, at most 640 px wide."""
     pictures = []
     for caption, image in images:
-        small, _ = shrunk(as_bytes_image(image), _MAX_WIDTH)
-        text = plain(caption)
-        src = data_uri("jpeg", jpeg_of(small, _QUALITY))
+        small, _ = shrink(convert_to_8_bits(image), _CALLER_WIDTH)
+        text = remove_control_characters(caption)
+        src = encode_data_uri("jpeg", encode_jpeg(small, _CALLER_QUALITY))
         pictures.append(Picture(src, f"Image: {text}", text, small.shape[1], small.shape[0]))
     return pictures

@@ -1,4 +1,4 @@
-"""From a template to a file on disk."""
+"""Write a page from a template to a file."""
 
 from __future__ import annotations
 
@@ -15,10 +15,30 @@ from semcal_ros.files.atomic import atomic_write_text
 __all__ = ["render", "write_page"]
 
 
-def render(template: str, values: Mapping[str, Any]) -> str:
-    """The page; every value is escaped, and a value that the template misses is an error."""
+def render(
+    template: str, values: Mapping[str, Any], *, folder: str | os.PathLike[str] | None = None
+) -> str:
+    """Fill in a template.
+
+    Parameters
+    ----------
+    template
+        File name of the template. It may extend or import the templates of this package.
+    values
+        What the template shows. Every value is escaped.
+    folder
+        Folder of the template if it is not one of this package.
+
+    Raises
+    ------
+    jinja2.UndefinedError
+        If the template asks for a value that is not given.
+    """
+    loaders: list[jinja2.BaseLoader] = [jinja2.PackageLoader("semcal_ros.report.html", "templates")]
+    if folder is not None:
+        loaders.insert(0, jinja2.FileSystemLoader(folder))
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("semcal_ros.report", "templates"),
+        loader=jinja2.ChoiceLoader(loaders),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -27,15 +27,15 @@ __all__ = [
     "OURS",
     "REFERENCE",
     "SECOND",
-    "field_axes",
-    "labelled_contours",
-    "legend",
-    "log_axis_y",
-    "log_ticks",
-    "magnification_axis",
-    "new_figure",
-    "nice_factor",
-    "tidy",
+    "add_legend",
+    "choose_arrow_factor",
+    "choose_log_ticks",
+    "create_figure",
+    "draw_contours",
+    "set_log_axis_y",
+    "set_magnification_axis",
+    "style_axes",
+    "style_field_axes",
 ]
 
 
@@ -51,14 +51,14 @@ _GRID = "#dde2e8"
 _TEXT_PT = 9.0
 
 
-def new_figure(width_in: float = 4.2, height_in: float = 3.0) -> Figure:
+def create_figure(width_in: float = 4.2, height_in: float = 3.0) -> Figure:
     """An empty figure on the Agg canvas; no figure manager knows it."""
     figure = Figure(figsize=(width_in, height_in), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def tidy(axes: Axes, *, xlabel: str, ylabel: str) -> None:
+def style_axes(axes: Axes, *, xlabel: str, ylabel: str) -> None:
     """Labels, thin frame, light grid."""
     axes.set_facecolor("white")
     axes.set_xlabel(xlabel, fontsize=_TEXT_PT, color=INK)
@@ -71,14 +71,14 @@ def tidy(axes: Axes, *, xlabel: str, ylabel: str) -> None:
         spine.set_color(MUTED)
 
 
-def legend(axes: Axes, **options: Any) -> None:
+def add_legend(axes: Axes, **options: Any) -> None:
     """Small legend without a frame of its own."""
     axes.legend(
         fontsize=_TEXT_PT - 1.5, framealpha=0.85, edgecolor="none", labelcolor=INK, **options
     )
 
 
-def log_ticks(low: float, high: float) -> list[float]:
+def choose_log_ticks(low: float, high: float) -> list[float]:
     """At least three round numbers from ``low`` to ``high`` where there are as many."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     for steps in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), tuple(1.0 + 0.5 * k for k in range(18))):
@@ -88,30 +88,30 @@ def log_ticks(low: float, high: float) -> list[float]:
     return [float(np.sqrt(low * high))]
 
 
-def magnification_axis(axes: Axes, low: float, high: float) -> None:
+def set_magnification_axis(axes: Axes, low: float, high: float) -> None:
     """Logarithmic x axis over the calibrated range, with plain numbers."""
     margin = 1.12 if high > low else 1.5
     axes.set_xscale("log")
     axes.set_xlim(low / margin, high * margin)
-    axes.xaxis.set_major_locator(FixedLocator(log_ticks(low / margin, high * margin)))
+    axes.xaxis.set_major_locator(FixedLocator(choose_log_ticks(low / margin, high * margin)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda g, _: f"{g:g}×"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def log_axis_y(axes: Axes, low: float, high: float) -> None:
+def set_log_axis_y(axes: Axes, low: float, high: float) -> None:
     """Logarithmic y axis from ``low`` to ``high`` with plain numbers."""
     axes.set_yscale("log")
     axes.set_ylim(low, high)
-    axes.yaxis.set_major_locator(FixedLocator(log_ticks(low, high)))
+    axes.yaxis.set_major_locator(FixedLocator(choose_log_ticks(low, high)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def field_axes(axes: Axes, width: int, height: int) -> None:
+def style_field_axes(axes: Axes, width: int, height: int) -> None:
     """Axes that show the image field, y down, square pixels."""
-    tidy(axes, xlabel="column (px)", ylabel="row (px)")
+    style_axes(axes, xlabel="column (px)", ylabel="row (px)")
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     axes.set_aspect("equal")
@@ -119,7 +119,7 @@ def field_axes(axes: Axes, width: int, height: int) -> None:
         axes.spines[side].set_visible(True)
 
 
-def nice_factor(length_px: float, target_px: float) -> float:
+def choose_arrow_factor(length_px: float, target_px: float) -> float:
     """Factor (1, 2, 5, 10, ...) that makes arrows of ``length_px`` at most ``target_px`` long."""
     if not (np.isfinite(length_px) and length_px > 0.0):
         return 1.0
@@ -128,7 +128,7 @@ def nice_factor(length_px: float, target_px: float) -> float:
     return float(power * max(s for s in (1.0, 2.0, 5.0) if s * power <= ratio * (1.0 + 1e-9)))
 
 
-def labelled_contours(
+def draw_contours(
     axes: Axes, x: Array, y: Array, table: Array, top: float, *, lines: int = 6
 ) -> None:
     """Contours at round values up to ``top`` with their numbers, so that no colour has to be read."""

@@ -14,37 +14,39 @@ from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.calibration.cells import empty_share, filled_shares
-from semcal_ros.report.calibration.coverage_figures import tilts_deg
-from semcal_ros.report.calibration.error_figures import rms_picture
-from semcal_ros.report.calibration.field_figures import residual_field_pictures
-from semcal_ros.report.calibration.findings import findings, pattern_px
+from semcal_ros.report.calibration.cells import compute_empty_share, compute_reached_shares
+from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
+from semcal_ros.report.calibration.error_figures import plot_rms
+from semcal_ros.report.calibration.field_figures import plot_residual_field
+from semcal_ros.report.calibration.findings import collect_warnings, estimate_pattern_px
 from semcal_ros.report.calibration.geometry import (
-    aligned_sigma_px,
-    displacement_field,
-    field_lattice,
-    rms_without_distortion,
-    shape_sigma_px,
-    without_residual_field,
+    compute_displacements,
+    compute_rms_without_distortion,
+    make_field_lattice,
+    predict_aligned_sigma_px,
+    predict_shape_sigma_px,
+    remove_residual_field,
 )
 from semcal_ros.report.calibration.numbers import (
-    fitted_inner_px,
+    compute_fitted_inner_px,
+    compute_held_out_px,
+    tabulate_magnifications,
+    tabulate_views,
+)
+from semcal_ros.report.calibration.paper import compute_median_px, tabulate_beside_paper
+from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
+from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
+from semcal_ros.report.html.text import (
     format_length,
     format_magnification,
     format_px,
-    held_out_px,
-    magnification_rows,
-    plain,
-    view_rows,
+    remove_control_characters,
 )
-from semcal_ros.report.calibration.paper import paper_rows, typical_px
-from semcal_ros.report.calibration.parameter_figures import focal_length_px, parameter_groups
-from semcal_ros.report.calibration.prediction_figures import prediction_pictures
 from tests.helpers.report_samples import SIZE, Unused, camera_at
 
 
 def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResult) -> None:
-    rows = magnification_rows(result)
+    rows = tabulate_magnifications(result)
     assert [r.magnification for r in rows] == ["100×", "400×", "1500×", "5000×"]
     assert [r.extrapolated for r in rows] == [True, False, False, True]
     for row, g in zip(rows, (100.0, 400.0, 1500.0, 5000.0), strict=True):
@@ -60,32 +62,32 @@ def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResul
 
 def test_infinite_held_out_error_is_named(result: CalibrationResult) -> None:
     broken = replace(result, held_out_rms_px={**result.held_out_rms_px, 400.0: float("inf")})
-    assert [row.held_out for row in magnification_rows(broken)][1] == "no answer"
-    assert any("without the images at 400×" in f.lower() for f in findings(broken))
-    assert rms_picture(broken, {}).src.startswith("data:image/png")
+    assert [row.held_out for row in tabulate_magnifications(broken)][1] == "no answer"
+    assert any("without the images at 400×" in f.lower() for f in collect_warnings(broken))
+    assert plot_rms(broken, {}).src.startswith("data:image/png")
 
 
 def test_badly_predicted_magnification_is_named(result: CalibrationResult) -> None:
     # 0.07 px is the noise of these views; the outermost magnifications are allowed to be worse.
     held_out = {**result.held_out_rms_px, 1500.0: 0.5, 5000.0: 0.5}
-    found = findings(replace(result, held_out_rms_px=held_out))
+    found = collect_warnings(replace(result, held_out_rms_px=held_out))
     assert len(found) == 1 and found[0].startswith("The images at 1500× are predicted badly")
 
 
 def test_findings_of_poor_views(result: CalibrationResult) -> None:
-    assert findings(result) == []
+    assert collect_warnings(result) == []
     corner = tuple(
         replace(v, image_xy=0.4 * v.image_xy) for v in result.views
     )  # all corners in the upper left part: 1 - 0.4^2 = 84 % of the field is empty
     sparse = replace(result, views=corner)
-    assert empty_share(sparse) > 0.75
-    assert any("has no corner in any view" in f for f in findings(sparse))
+    assert compute_empty_share(sparse) > 0.75
+    assert any("has no corner in any view" in f for f in collect_warnings(sparse))
     flat = replace(result.fit, rotations=np.stack([np.eye(3)] * len(result.views)))
-    assert any("tilted" in f for f in findings(replace(result, fit=flat)))
+    assert any("tilted" in f for f in collect_warnings(replace(result, fit=flat)))
 
 
 def test_tilts_are_those_of_the_views(result: CalibrationResult) -> None:
-    tilt, _ = tilts_deg(result)
+    tilt, _ = compute_tilts_deg(result)
     # 0.05 px of noise over 250 px and 25 to 32 degrees determine a tilt far better than 1 degree;
     # the flat one less so.
     steep = tilt.reshape(4, 4)[:, 1:]
@@ -94,7 +96,7 @@ def test_tilts_are_those_of_the_views(result: CalibrationResult) -> None:
 
 def test_displacement_field_is_the_distortion() -> None:
     camera = camera_at(100.0)
-    xy, moved = displacement_field(camera, across=5)
+    xy, moved = compute_displacements(camera, across=5)
     assert xy.shape == (25, 2)
     assert np.array_equal(xy[0], [0.0, 0.0]) and np.array_equal(xy[-1], [SIZE - 1.0, SIZE - 1.0])
     assert np.allclose(camera.undistort(xy + moved), xy, atol=1e-9)
@@ -106,13 +108,15 @@ def test_shape_sigma_ignores_the_principal_point_but_not_the_scale() -> None:
     camera = replace(camera_at(400.0), xi_r=0.0, xi_t=0.0, covariance=covariance)
     corner = np.array([[0.0, 0.0]])
     # Without distortion, a shift is the same everywhere.
-    assert shape_sigma_px(camera, corner)[0] == pytest.approx(0.0, abs=1e-9)
+    assert predict_shape_sigma_px(camera, corner)[0] == pytest.approx(0.0, abs=1e-9)
     covariance = np.zeros((10, 10))
     covariance[0, 0] = (1e-3 * camera.m) ** 2
     scaled = replace(camera, covariance=covariance)
     # 0.1 % of the distance from the centre.
     half = 0.5 * (SIZE - 1)
-    assert shape_sigma_px(scaled, corner)[0] == pytest.approx(1e-3 * half * np.sqrt(2.0), rel=1e-6)
+    assert predict_shape_sigma_px(scaled, corner)[0] == pytest.approx(
+        1e-3 * half * np.sqrt(2.0), rel=1e-6
+    )
 
 
 def test_units_a_person_reads() -> None:
@@ -125,32 +129,32 @@ def test_units_a_person_reads() -> None:
     assert format_px(float("inf")) == "no answer"
     assert format_magnification(10000.0) == format_magnification(10000.0, 2) == "10000×"
     assert format_magnification(211.349) == "211.3×"
-    assert plain("a\x00b\ud800\n") == "a\ufffdb\ufffd\n"
+    assert remove_control_characters("a\x00b\ud800\n") == "a\ufffdb\ufffd\n"
 
 
 def test_aligned_sigma_has_lost_shift_turn_and_scale_but_not_the_aspect() -> None:
-    xy = field_lattice(SIZE, SIZE, 9)
+    xy = make_field_lattice(SIZE, SIZE, 9)
     plainly = replace(camera_at(400.0), xi_r=0.0, xi_t=0.0, skew=0.0, aspect=1.0)
     for k, sigma in ((0, 1e-3 * plainly.m), (3, 5.0), (4, 5.0)):
         covariance = np.zeros((10, 10))
         covariance[k, k] = sigma**2
         camera = replace(plainly, covariance=covariance)
-        assert aligned_sigma_px(camera, xy) == pytest.approx(0.0, abs=1e-9)
+        assert predict_aligned_sigma_px(camera, xy) == pytest.approx(0.0, abs=1e-9)
     covariance = np.zeros((10, 10))
     covariance[1, 1] = 1e-6
     camera = replace(plainly, covariance=covariance)
     # At the middle of an edge, 0.1 % of the distance from the centre: nothing similar does that.
     edge = int(np.argmin(np.hypot(xy[:, 0], xy[:, 1] - 0.5 * (SIZE - 1))))
     expected = 1e-3 * 0.5 * (SIZE - 1)
-    assert aligned_sigma_px(camera, xy)[edge] == pytest.approx(expected, rel=1e-6)
-    assert np.all(aligned_sigma_px(replace(camera, covariance=None), xy) == 0.0)
+    assert predict_aligned_sigma_px(camera, xy)[edge] == pytest.approx(expected, rel=1e-6)
+    assert np.all(predict_aligned_sigma_px(replace(camera, covariance=None), xy) == 0.0)
 
 
 def test_aligned_sigma_is_never_above_the_one_about_the_centroid(result: CalibrationResult) -> None:
-    xy = field_lattice(SIZE, SIZE, 7)
+    xy = make_field_lattice(SIZE, SIZE, 7)
     for g in (100.0, 900.0, 5000.0):
         camera = result.model.at(g)
-        aligned, shape = aligned_sigma_px(camera, xy), shape_sigma_px(camera, xy)
+        aligned, shape = predict_aligned_sigma_px(camera, xy), predict_shape_sigma_px(camera, xy)
         assert np.sum(aligned**2) <= 2.0 * np.sum(shape**2)
 
 
@@ -162,7 +166,7 @@ def test_error_without_distortion_is_that_of_poses_fitted_to_a_straight_camera(
 
     # A height that is all but free, as it is in the linear answer.
     exact = rms_by_magnification(fit_poses(result.views, straight, height_sigma_m=1e-3))
-    linear = rms_without_distortion(result)
+    linear = compute_rms_without_distortion(result)
     assert list(linear) == list(exact)
     for g, value in exact.items():
         assert linear[g] == pytest.approx(value, rel=0.15)
@@ -172,39 +176,41 @@ def test_error_without_distortion_is_that_of_poses_fitted_to_a_straight_camera(
 
 def test_rows_beside_the_paper(result: CalibrationResult) -> None:
     rms = rms_by_magnification(result.fit)
-    rows = paper_rows(result, rms, {100.0: 4.0, 400.0: 2.0, 1500.0: 3.0})
+    rows = tabulate_beside_paper(result, rms, {100.0: 4.0, 400.0: 2.0, 1500.0: 3.0})
     assert [r.here for r in rows] == [
         "3.000 px",
         format_px(float(np.median(list(rms.values())))),
         format_px(result.fit.rms_px()),
-        format_px(held_out_px(result)),
+        format_px(compute_held_out_px(result)),
     ]
     assert [r.paper.split()[0] for r in rows] == ["3", "1.45", "0.9", "not"]
-    assert typical_px({}) is None
+    assert compute_median_px({}) is None
 
 
 def test_fitted_error_beside_the_held_out_one_is_of_the_same_images(
     result: CalibrationResult,
 ) -> None:
     rms = rms_by_magnification(result.fit)
-    assert fitted_inner_px(result) == pytest.approx(np.hypot(rms[400.0], rms[1500.0]) / 2**0.5)
+    assert compute_fitted_inner_px(result) == pytest.approx(
+        np.hypot(rms[400.0], rms[1500.0]) / 2**0.5
+    )
 
 
 def test_focal_length_and_its_interval() -> None:
     covariance = np.zeros((10, 10))
     covariance[0, 0], covariance[5, 5] = 9.0, 0.25
     camera = replace(camera_at(400.0), covariance=covariance)
-    f, sigma = focal_length_px(camera)
+    f, sigma = compute_focal_length_px(camera)
     assert f == pytest.approx(camera.m / 50.0)
     assert sigma == pytest.approx(np.hypot(3.0 / 50.0, f * 0.5 / 50.0))
-    assert focal_length_px(replace(camera, rho=0.0)) == (float("inf"), float("inf"))
+    assert compute_focal_length_px(replace(camera, rho=0.0)) == (float("inf"), float("inf"))
     parallel: Any = SimpleNamespace(
         magnification_range=(400.0, 400.0),
         magnifications=(400.0,),
         nominal_px_per_m=lambda g: g * SIZE / 0.12,
         at=lambda _: replace(camera, rho=0.0),
     )
-    groups = parameter_groups(parallel)
+    groups = plot_parameters(parallel)
     assert [len(group.pictures) for group in groups] == [2, 2, 2, 4]
     assert "not shown" in groups[2].text
 
@@ -213,30 +219,30 @@ def test_worst_views_come_first(result: CalibrationResult) -> None:
     residuals = list(result.fit.residuals_px)
     residuals[6] = 8.0 * residuals[6]
     spoilt = replace(result, fit=replace(result.fit, residuals_px=tuple(residuals)))
-    rows = view_rows(spoilt)
+    rows = tabulate_views(spoilt)
     assert rows[0].name == result.views[6].name and rows[0].ratio > 3.0
     assert [r.ratio for r in rows] == sorted((r.ratio for r in rows), reverse=True)
-    assert any(f"corners of {rows[0].name}" in f for f in findings(spoilt))
+    assert any(f"corners of {rows[0].name}" in f for f in collect_warnings(spoilt))
 
 
 def test_a_pattern_in_the_residuals_is_found_and_noise_is_not(result: CalibrationResult) -> None:
-    assert pattern_px(result)[1] < 2.0
+    assert estimate_pattern_px(result)[1] < 2.0
     turned = []
     for view, own in zip(result.views, result.fit.residuals_px, strict=True):
         q = (view.image_xy - 0.5 * SIZE) / (0.5 * SIZE)
         turned.append(own + 0.1 * np.stack([-q[:, 1], q[:, 0]], axis=1))
     spiral = replace(result, fit=replace(result.fit, residuals_px=tuple(turned)))
-    size, ratio = pattern_px(spiral)
+    size, ratio = estimate_pattern_px(spiral)
     # |q|^2 has the mean 2/3 over a square.
     assert size == pytest.approx(0.1 * np.sqrt(2.0 / 3.0), rel=0.15) and ratio > 3.0
-    assert any("pattern over the field" in f for f in findings(spiral))
+    assert any("pattern over the field" in f for f in collect_warnings(spiral))
 
 
 def test_many_rejected_views_are_a_finding_with_the_commonest_reason(
     result: CalibrationResult,
 ) -> None:
     rejected = [Unused(f"{k}", 100.0, "blurred" if k else "blank") for k in range(12)]
-    found = findings(result, rejected)
+    found = collect_warnings(result, rejected)
     assert found == ["12 of 28 views were rejected, 11 of them for this reason: blurred."]
 
 
@@ -246,14 +252,14 @@ def test_magnifications_that_fill_a_part_of_the_field_are_named(result: Calibrat
         for v in result.views
     )
     poor = replace(result, views=views)
-    shares = filled_shares(poor)
+    shares = compute_reached_shares(poor)
     assert shares[1500.0] < 0.3 and shares[100.0] > 0.9
-    assert any("At 1500× the corners reach less than half" in f for f in findings(poor))
+    assert any("At 1500× the corners reach less than half" in f for f in collect_warnings(poor))
 
 
 def test_uncertain_positions_are_a_finding(result: CalibrationResult) -> None:
     model = replace(result.model, covariance=1e6 * result.model.covariance)
-    assert any("are uncertain by" in f for f in findings(replace(result, model=model)))
+    assert any("are uncertain by" in f for f in collect_warnings(replace(result, model=model)))
 
 
 def test_residual_field_is_shown_where_there_is_one() -> None:
@@ -263,24 +269,26 @@ def test_residual_field_is_shown_where_there_is_one() -> None:
     shift = np.broadcast_to(np.array([-0.25, 0.0]) / base.norm_px, blank.coefficients.shape)
     field = replace(blank, coefficients=np.array(shift))
     camera = replace(base, residual=field.at(400.0))
-    assert np.allclose(displacement_field(camera)[1] - displacement_field(base)[1], [0.25, 0.0])
-    assert without_residual_field(camera).distort(np.zeros((1, 2))) == pytest.approx(
+    assert np.allclose(
+        compute_displacements(camera)[1] - compute_displacements(base)[1], [0.25, 0.0]
+    )
+    assert remove_residual_field(camera).distort(np.zeros((1, 2))) == pytest.approx(
         base.distort(np.zeros((1, 2)))
     )
     model: Any = SimpleNamespace(residual=field)
-    (picture,) = residual_field_pictures(model, [camera])
+    (picture,) = plot_residual_field(model, [camera])
     assert "at most 0.25 px" in picture.caption
-    assert residual_field_pictures(SimpleNamespace(residual=None), [camera]) == []  # type: ignore[arg-type]
+    assert plot_residual_field(SimpleNamespace(residual=None), [camera]) == []  # type: ignore[arg-type]
 
 
 def test_predictions_need_a_covariance(result: CalibrationResult) -> None:
-    pictures = prediction_pictures(result.model)
-    lattice = field_lattice(SIZE, SIZE, 17)
+    pictures = plot_predicted_errors(result.model)
+    lattice = make_field_lattice(SIZE, SIZE, 17)
     low, high = result.model.magnification_range
     for g in (low, high):
-        peak = f"{np.max(shape_sigma_px(result.model.at(g), lattice)):.2g} px at {g:g}×"
+        peak = f"{np.max(predict_shape_sigma_px(result.model.at(g), lattice)):.2g} px at {g:g}×"
         assert peak in pictures[1].caption
     bare: Any = SimpleNamespace(
         magnification_range=(low, low), image_size=(SIZE, SIZE), at=lambda _: camera_at(low)
     )
-    assert prediction_pictures(bare) == []
+    assert plot_predicted_errors(bare) == []

@@ -17,22 +17,22 @@ from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report import calibration_report
+from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration.examples import (
-    best_per_magnification,
-    overlay_of,
-    rejected_pictures,
+    choose_examples,
+    overlay_corners,
+    show_rejected,
 )
-from semcal_ros.report.calibration.geometry import rms_without_distortion
+from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
-    fitted_inner_px,
-    format_px,
-    held_out_px,
-    magnification_rows,
-    view_rows,
+    compute_fitted_inner_px,
+    compute_held_out_px,
+    tabulate_magnifications,
+    tabulate_views,
 )
-from semcal_ros.report.calibration.paper import paper_rows
+from semcal_ros.report.calibration.paper import tabulate_beside_paper
 from semcal_ros.report.html.page import write_page
+from semcal_ros.report.html.text import format_px
 from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
@@ -120,21 +120,21 @@ def test_hostile_names_are_shown_as_text(page: str) -> None:
 def test_numbers_in_the_page_are_those_of_the_result(page: str, result: CalibrationResult) -> None:
     text = Page(page).text
     assert f"{len(result.views)} used" in text and "3 rejected" in text
-    held_out = held_out_px(result)
+    held_out = compute_held_out_px(result)
     assert held_out is not None
     assert f"Held-out error{held_out:.3f} px" in text.replace("Held-out error ", "Held-out error")
     assert "0.9 to 1.45 px" in text
-    assert f"fitted: {format_px(fitted_inner_px(result))}" in text
+    assert f"fitted: {format_px(compute_fitted_inner_px(result))}" in text
     assert f"{result.fit.rms_px():.3f} px" in text
-    for row in magnification_rows(result):
+    for row in tabulate_magnifications(result):
         cells = [row.magnification, f"{row.views}", f"{row.corners}", row.rms]
         cells += [row.held_out + (" *" if row.extrapolated else "")]
         cells += [row.pixel_x, row.pixel_y, row.field]
         assert " ".join(cells) in text
-    rms, straight = rms_by_magnification(result.fit), rms_without_distortion(result)
-    for beside in paper_rows(result, rms, straight):
+    rms, straight = rms_by_magnification(result.fit), compute_rms_without_distortion(result)
+    for beside in tabulate_beside_paper(result, rms, straight):
         assert f"{beside.label} {beside.here} {beside.paper}" in text
-    for view in view_rows(result)[:5]:
+    for view in tabulate_views(result)[:5]:
         assert f"{view.name} {view.magnification} {view.corners} {view.rms}" in text
     for g in result.model.magnification_range:
         camera = result.model.at(g)
@@ -155,7 +155,7 @@ def test_bad_image_leaves_the_old_file(result: CalibrationResult, tmp_path: Path
     path = tmp_path / "r.html"
     path.write_text("old")
     with pytest.raises(InvalidValueError, match=r"shape \(3,\)"):
-        calibration_report(result, path, images=[("bad", np.zeros(3))])
+        write_calibration_report(result, path, images=[("bad", np.zeros(3))])
     assert path.read_text() == "old"
 
 
@@ -172,7 +172,7 @@ def test_single_magnification_without_the_optional_parts(tmp_path: Path) -> None
         views, image_size=(SIZE, SIZE), display_width_m=DISPLAY_M, method="discrete"
     )
     one = replace(one, warnings=("fewer than 3 views at magnification 800",))
-    parsed = Page(calibration_report(one, tmp_path / "r.html").read_text(encoding="utf-8"))
+    parsed = Page(write_calibration_report(one, tmp_path / "r.html").read_text(encoding="utf-8"))
     assert "needs 3 magnifications" in parsed.text
     assert "No images were kept" in parsed.text and "No view was rejected" in parsed.text
     assert "What to watch" in parsed.text
@@ -194,7 +194,7 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
         (1280, 1280),
         rejected_xy=np.array([[99.5, 199.5]]),
     )
-    overlay = overlay_of(Found("a", 100.0, image, detection))
+    overlay = overlay_corners(Found("a", 100.0, image, detection))
     assert (overlay.width, overlay.height) == (320, 320)
     starts = re.findall(r"M([-\d.]+) ([\d.]+)h([\d.]+)", overlay.marks)
     centres = np.array([[float(x) + 0.5 * float(h), float(y)] for x, y, h in starts])
@@ -208,7 +208,7 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
 def test_examples_are_the_richest_accepted_views(result: CalibrationResult) -> None:
     found = [found_of(v) for v in result.views]
     lost = replace(found[0], detection=replace(found[0].detection, accepted=False, reason="x"))
-    best = best_per_magnification([lost, *found[1:]])
+    best = choose_examples([lost, *found[1:]])
     assert [b.magnification for b in best] == [100.0, 400.0, 1500.0, 5000.0]
     for view in best:
         own = [v for v in result.views if v.magnification == view.magnification]
@@ -234,7 +234,7 @@ def test_fast_and_small_enough_with_many_views(result: CalibrationResult, tmp_pa
     )
     noise = rng.integers(0, 256, (SIZE, SIZE)).astype(np.uint8)
     start = time.process_time()
-    path = calibration_report(
+    path = write_calibration_report(
         replace(result, views=many, fit=fit),
         tmp_path / "r.html",
         detections=[found_of(v, noise) for v in many],
@@ -254,6 +254,6 @@ def test_rejected_images_are_shown_different_reasons_first() -> None:
     views = [
         UnusedWithImage(f"f{k}", 100.0, "blurred" if k < 3 else "blank", image) for k in range(4)
     ]
-    shown = rejected_pictures([Unused("none", 100.0, "blank"), *views], 2)
+    shown = show_rejected([Unused("none", 100.0, "blank"), *views], 2)
     assert [p.caption for p in shown] == ["100×: blurred (f0)", "100×: blank (f3)"]
     assert shown[0].width == shown[0].height == 200

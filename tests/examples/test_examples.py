@@ -16,7 +16,7 @@ from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 # They make their recordings and calibrations themselves.
 pytestmark = pytest.mark.timeout(400)
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def ran(name: str, *arguments: object) -> str:

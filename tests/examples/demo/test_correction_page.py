@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.demo.correction_page import DemoRow, write_correction_report
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report import DemoRow, correction_report
 
 ROWS = (
     DemoRow("without correction", 6.81, 7.0),
@@ -19,7 +19,7 @@ ROWS = (
 
 
 def page_of(tmp_path: Path, *args: object, **options: object) -> str:
-    path = correction_report(*args, tmp_path / "demo.html", **options)  # type: ignore[arg-type]
+    path = write_correction_report(*args, tmp_path / "demo.html", **options)  # type: ignore[arg-type]
     return path.read_text(encoding="utf-8")
 
 
@@ -70,7 +70,7 @@ def test_strange_errors_still_give_a_page(tmp_path: Path) -> None:
 
 def test_no_rows_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="at least one"):
-        correction_report([], [], tmp_path / "demo.html")
+        write_correction_report([], [], tmp_path / "demo.html")
     assert not list(tmp_path.iterdir())
 
 

@@ -13,12 +13,14 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.calibration.numbers import format_px, plain
-from semcal_ros.report.html.encode import Picture, captioned_pictures, picture_of_figure
+from semcal_ros.report.html.encode import Picture, encode_figure, encode_pictures
 from semcal_ros.report.html.page import render, write_page
-from semcal_ros.report.html.style import INK, OURS, REFERENCE, legend, new_figure, tidy
+from semcal_ros.report.html.style import INK, OURS, REFERENCE, add_legend, create_figure, style_axes
+from semcal_ros.report.html.text import format_px, remove_control_characters
 
-__all__ = ["DemoRow", "correction_report"]
+__all__ = ["DemoRow", "write_correction_report"]
+
+_HERE = Path(__file__).resolve().parent
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class DemoRow:
         return f"{pair[0]:g} px" if pair[0] == pair[1] else f"{pair[0]:g} to {pair[1]:g} px"
 
 
-def correction_report(
+def write_correction_report(
     rows: Sequence[DemoRow],
     images: Sequence[tuple[str, NDArray[Any]]],
     path: str | os.PathLike[str],
@@ -88,20 +90,23 @@ def correction_report(
     if not rows:
         raise InvalidValueError("a correction report without rows", expected="at least one DemoRow")
     values = {
-        "title": plain(title),
-        "rows": [(plain(row.label), format_px(row.rms_px), row.paper_text) for row in rows],
-        "chart": [_bars(rows)],
-        "notes": [plain(note) for note in notes],
-        "images": captioned_pictures(images),
+        "title": remove_control_characters(title),
+        "rows": [
+            (remove_control_characters(row.label), format_px(row.rms_px), row.paper_text)
+            for row in rows
+        ],
+        "chart": [_plot_errors(rows)],
+        "notes": [remove_control_characters(note) for note in notes],
+        "images": encode_pictures(images),
     }
-    return write_page(path, render("correction.html.j2", values))
+    return write_page(path, render("correction.html.j2", values, folder=_HERE))
 
 
-def _bars(rows: Sequence[DemoRow]) -> Picture:
+def _plot_errors(rows: Sequence[DemoRow]) -> Picture:
     """Measured error of each stage as a bar on a logarithmic axis, the paper's as marks."""
-    figure = new_figure(4.2, 1.2 + 0.55 * len(rows))
+    figure = create_figure(4.2, 1.2 + 0.55 * len(rows))
     axes = figure.add_subplot()
-    tidy(axes, xlabel="RMS error (px, logarithmic)", ylabel="")
+    style_axes(axes, xlabel="RMS error (px, logarithmic)", ylabel="")
     axes.set_xscale("log")
     measured = np.array([row.rms_px for row in rows], dtype=np.float64)
     known = np.isfinite(measured) & (measured > 0.0)
@@ -124,12 +129,12 @@ def _bars(rows: Sequence[DemoRow]) -> Picture:
     # numbers.
     axes.set_yticks(places, [f"{k + 1}" for k in places], color=INK)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    legend(axes, loc="best")
+    add_legend(axes, loc="best")
     stages = "; ".join(
         f"{row.label}: {format_px(row.rms_px)}, paper {row.paper_text}" for row in rows
     )
-    return picture_of_figure(
+    return encode_figure(
         figure,
-        plain(f"RMS error of each stage. {stages}."),
+        remove_control_characters(f"RMS error of each stage. {stages}."),
         "The numbers at the left are those of the table's rows.",
     )
