@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "applications": {"core"},
     "text_files": {"core"},
     "config": {"core", "text_files"},
-    "middleware": {"core"},
+    "middleware": {"core", "text_files"},
     # The target of the visual servo is drawn as it is defined.
     "synthetic": {"core", "applications"},
     "bridge": {"core", "config"},
