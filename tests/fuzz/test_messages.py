@@ -216,7 +216,7 @@ def _magnification_configs(draw: st.DrawFn) -> MicroscopeConfig:
             st.just("data")
             | st.just("a.b[1].c")
             | st.sampled_from(["data", "data[0]", "data[7]", "a.b", "a.b[0]", "data.real", "a[0]"])
-            | st.integers(1, 300).map(lambda digits: f"data[{'9' * digits}]")
+            | st.integers(1, 249).map(lambda digits: f"data[{'9' * digits}]")
         ),
         unit="1" if quantity == "magnification" else draw(st.sampled_from(["m", "um", "nm", "pm"])),
         display_width_m=draw(width) if quantity == "magnification" else None,
