@@ -17,7 +17,7 @@ from semcal_ros.core.calibration.calibrate import calibrate_views
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.pda import pda_functions
-from semcal_ros.core.calibration.problem import Priors, Setup
+from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction

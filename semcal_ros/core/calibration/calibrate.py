@@ -21,11 +21,8 @@ from semcal_ros.core.calibration.joint import (
 )
 from semcal_ros.core.calibration.outliers import OutlyingView, find_change_point, outlying_views
 from semcal_ros.core.calibration.pda import pda_functions
-from semcal_ros.core.calibration.problem import (
-    Priors,
-    Setup,
-    variance_factor,
-)
+from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.summary import about_field, data_warnings, statistics_of
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel

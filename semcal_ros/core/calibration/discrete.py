@@ -18,8 +18,8 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.distortion_centre import DistortionCentre, find_distortion_centre
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.normal_equations import Problem, State
+from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import (
-    Setup,
     adjust,
     build_problem,
     constant_functions,

@@ -20,9 +20,9 @@ from semcal_ros.core.calibration.normal_equations import (
     State,
     reduced_normal_equations,
 )
+from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import (
     Functions,
-    Setup,
     adjust,
     build_problem,
     constant_functions,

@@ -17,7 +17,8 @@ import numpy as np
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
-from semcal_ros.core.calibration.problem import Setup, variance_factor
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 

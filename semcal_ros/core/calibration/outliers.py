@@ -19,7 +19,8 @@ from semcal_ros.core.calibration.normal_equations import (
     reduced_normal_equations,
     whitened_norm,
 )
-from semcal_ros.core.calibration.problem import Setup, variance_factor
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.views import GridView
 
 __all__ = ["ChangePoint", "OutlyingView", "find_change_point", "outlying_views"]

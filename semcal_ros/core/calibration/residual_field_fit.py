@@ -21,7 +21,8 @@ from semcal_ros.core.calibration.normal_equations import (
     whitened_rows,
     with_height_prior,
 )
-from semcal_ros.core.calibration.problem import Setup, variance_factor
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 
 __all__ = [

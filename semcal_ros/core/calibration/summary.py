@@ -11,7 +11,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
 from semcal_ros.core.calibration.joint import FittedField
-from semcal_ros.core.calibration.problem import Setup
+from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = ["about_field", "data_warnings", "statistics_of"]
