@@ -6,6 +6,7 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from semcal_ros.core.calibration.normal_equations import (
     view_costs,
 )
 
-__all__ = ["BundleResult", "refine"]
+__all__ = ["BundleResult", "BundleStatus", "refine"]
 
 
 _MAX_ITERATIONS = 60
@@ -36,6 +37,15 @@ _FOLLOWING_STEPS = 6
 _NEGLIGIBLE = 1e-2
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-7
+
+
+class BundleStatus(Enum):
+    """How an adjustment ended; the values are the sentences of the calibration file."""
+
+    SMALL_DECREASE = "converged: relative decrease below the tolerance"
+    NO_DESCENT = "converged: no step lowers the cost"
+    ITERATION_LIMIT = "stopped at the iteration limit"
+    NO_PROJECTION = "a point has no projection at the start"
 
 
 @dataclass(frozen=True)
@@ -60,8 +70,8 @@ class BundleResult:
         (K, K) of theta for unit variance of the whitened residuals.
     height_variance_m2
         (V,) posterior variance of the heights.
-    iterations, converged, reason
-        How the iteration ended.
+    iterations, status
+        Number of steps, and why there were no more.
     """
 
     state: State
@@ -73,8 +83,12 @@ class BundleResult:
     covariance: Array
     height_variance_m2: Array
     iterations: int
-    converged: bool
-    reason: str
+    status: BundleStatus
+
+    @property
+    def converged(self) -> bool:
+        """Whether the cost is at a minimum."""
+        return self.status in (BundleStatus.SMALL_DECREASE, BundleStatus.NO_DESCENT)
 
     def rms_px(self) -> float:
         """RMS distance of observed and projected corners, px."""
@@ -120,36 +134,37 @@ def refine(
     costs = view_costs(problem, state)
     cost = float(costs.sum()) + prior_cost(problem, state)
     if not np.isfinite(cost):
-        return _no_result(problem, state)
+        return _make_empty_result(problem, state)
     if fixed_theta:
-        state, costs, iterations, reason = _refined_poses(
+        state, costs, iterations, status = _refine_poses(
             problem, state, costs, max_iterations, tolerance
         )
         cost = float(costs.sum()) + prior_cost(problem, state)
-        return _result(problem, state, cost, iterations, reason)
-    damping, iterations, reason = _FIRST_DAMPING, 0, ""
-    while not reason and iterations < max_iterations:
+        return _make_result(problem, state, cost, iterations, status)
+    damping, iterations, status = _FIRST_DAMPING, 0, BundleStatus.ITERATION_LIMIT
+    while iterations < max_iterations:
         iterations += 1
         normal = normal_equations(problem, state)
         while True:
             step = _step(problem, state, normal, damping)
-            trial, trial_costs = _with_poses_that_follow(problem, state, costs, step)
+            trial, trial_costs = _refine_following_poses(problem, state, costs, step)
             trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
             if trial_cost <= cost or damping >= _MAX_DAMPING:
                 break
             damping *= 10.0
         if trial_cost > cost:
-            reason = "converged: no step lowers the cost"
+            status = BundleStatus.NO_DESCENT
             break
         decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
         damping = max(0.1 * damping, _MIN_DAMPING)
         predicted = float(step.predicted.sum()) + step.predicted_prior
         if decrease <= tolerance * cost and predicted <= 1e3 * tolerance * (1.0 + cost):
-            reason = "converged: relative decrease below the tolerance"
-    return _result(problem, state, cost, iterations, reason)
+            status = BundleStatus.SMALL_DECREASE
+            break
+    return _make_result(problem, state, cost, iterations, status)
 
 
-def _with_poses_that_follow(
+def _refine_following_poses(
     problem: Problem, state: State, costs: Array, step: _Step
 ) -> tuple[State, Array]:
     """The state after a step, and its costs per view.
@@ -165,7 +180,7 @@ def _with_poses_that_follow(
         return trial, trial_costs
     part = part_of(problem, short)
     start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
-    own, own_costs, _, _ = _refined_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
+    own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
     rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
     rotations[short], translations[short] = own.rotations, own.translations_m
     trial = State(trial.theta, rotations, translations)
@@ -173,16 +188,16 @@ def _with_poses_that_follow(
     return trial, trial_costs
 
 
-def _refined_poses(
+def _refine_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
-) -> tuple[State, Array, int, str]:
+) -> tuple[State, Array, int, BundleStatus]:
     """Levenberg-Marquardt on each view by itself, for all views at once.
 
-    Returns the state, the costs of the views, the number of iterations, and why they ended (empty at the limit).
+    Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
     damping = np.full(len(costs), _FIRST_DAMPING)
-    iterations, reason = 0, ""
-    while not reason and iterations < max_iterations:
+    iterations = 0
+    while iterations < max_iterations:
         iterations += 1
         normal = normal_equations(problem, state)
         pose = normal.matrix[:, 10:, 10:].copy()
@@ -205,12 +220,12 @@ def _refined_poses(
         predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, 10:], change)
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
-            reason = "converged: relative decrease below the tolerance"
-    return state, costs, iterations, reason
+            return state, costs, iterations, BundleStatus.SMALL_DECREASE
+    return state, costs, iterations, BundleStatus.ITERATION_LIMIT
 
 
-def _result(
-    problem: Problem, state: State, cost: float, iterations: int, reason: str
+def _make_result(
+    problem: Problem, state: State, cost: float, iterations: int, status: BundleStatus
 ) -> BundleResult:
     normal = normal_equations(problem, state)
     information, gradient, back_camera, _ = schur_complement(problem, normal, 0.0)
@@ -232,13 +247,12 @@ def _result(
         covariance=covariance,
         height_variance_m2=(own + coupled) * problem.unit_m**2,
         iterations=iterations,
-        converged=reason.startswith("converged"),
-        reason=reason or "stopped at the iteration limit",
+        status=status,
     )
 
 
-def _no_result(problem: Problem, state: State) -> BundleResult:
-    """What is known when some point has no projection at the start: nothing."""
+def _make_empty_result(problem: Problem, state: State) -> BundleResult:
+    """The result where some point has no projection at the start: nothing is known."""
     groups, size = len(problem.designs), len(state.theta)
     return BundleResult(
         state=state,
@@ -250,6 +264,5 @@ def _no_result(problem: Problem, state: State) -> BundleResult:
         covariance=np.full((size, size), np.inf),
         height_variance_m2=np.full(len(problem.group), np.inf),
         iterations=0,
-        converged=False,
-        reason="a point has no projection at the start",
+        status=BundleStatus.NO_PROJECTION,
     )

@@ -263,7 +263,7 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
     factor = variance_factor(fit.problem, fit.result)
     warnings = []
     if not fit.result.converged:
-        warnings.append(f"the adjustment did not converge: {fit.result.reason}")
+        warnings.append(f"the adjustment did not converge: {fit.result.status.value}")
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     if misfit > _MISFIT:
@@ -284,7 +284,7 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
     details = {
         "iterations": fit.result.iterations,
         "converged": fit.result.converged,
-        "reason": fit.result.reason,
+        "reason": fit.result.status.value,
         "selection_rounds": fit.rounds,
         "variance_factor": factor,
         "excess_sigma_px": fit.excess_px,
@@ -356,7 +356,7 @@ def _separate(g: float, centre: Any, result: BundleResult) -> dict[str, Any]:
         "p_value": centre.p_value,
         "rms_px": result.rms_px(),
         "iterations": result.iterations,
-        "reason": result.reason,
+        "reason": result.status.value,
     }
 
 
