@@ -51,7 +51,8 @@ def corners(quick: bool) -> None:
             results["cv2"].append(opencv_corners(image))
 
         times = interleaved({"ours": ours, "cv2": theirs}, 2 if quick else 5)
-        mine: LatticeDetection = results["ours"][0]  # type: ignore[assignment]
+        mine = results["ours"][0]
+        assert isinstance(mine, LatticeDetection), mine
         found, false, rms, right = against(truth, mine.xy)
         score = None
         sigma = None

@@ -29,6 +29,7 @@ from semcal_ros import Calibration
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.errors import Rejection
 
 OUTPUT = Path("demo_output")
 CALIBRATED = (100, 250, 600, 1200, 2500, 4000, 6000, 8000, 10000)
@@ -100,9 +101,10 @@ def reprojection_rms(
     square = np.median(np.diff(np.unique(view.board_xy_m[:, 0].round(12))))
     errors = []
     for image in images.values():
-        xy = find_lattice(image).xy
-        if len(xy) == 0:
+        detection = find_lattice(image)
+        if isinstance(detection, Rejection):
             continue
+        xy = detection.xy
         board = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
         corner = np.round(board[:, :2] / board[:, 2:] / square) * square
         seen = np.column_stack([corner, np.ones(len(corner))]) @ h.T
@@ -129,6 +131,7 @@ def measure(received: Received, cal: Calibration) -> dict[str, list[float]]:
         stamps = stamps_at(g, received)
         first = next(s for s in stamps if s in received.images["image_rect"])
         found = find_lattice(received.images["image_rect"][first])
+        assert not isinstance(found, Rejection), found.reason
         view = GridView(float(g), found.ij * frames_at(g)[0]["square_m"], found.xy, found.sigma_px)
         for topic in STAGES:
             images = {s: received.images[topic][s] for s in stamps if s in received.images[topic]}

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from sensor_msgs.msg import Image
@@ -17,8 +18,9 @@ from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fi
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
+from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.nodes.common.parameters import Setting
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.common.services import trigger_service
@@ -31,7 +33,6 @@ from semcal_ros.nodes.workers.calibration_worker import (
     Stage,
     without_images,
 )
-from semcal_ros.workflows.find_grid import FoundView
 
 __all__ = ["CalibrationServer", "main"]
 
@@ -131,10 +132,13 @@ class CalibrationServer(StreamNode):
         grey = to_gray(frame.image, frame.encoding)
         detection = find_lattice(grey)
         message = Image()
-        picture = corner_overlay(grey, detection.xy, detection.reason)
+        if isinstance(detection, Rejection):
+            picture = corner_overlay(grey, np.empty((0, 2)), detection.reason)
+        else:
+            picture = corner_overlay(grey, detection.xy, "")
         fill_image(message, picture, "bgr8", frame.header)
         self._overlay.publish(message)
-        if not detection.accepted:
+        if isinstance(detection, Rejection):
             raise CalibrationError(
                 f"no grid found at {frame.magnification:g}x: {detection.reason}",
                 expected="an image filled by the chess grid",

@@ -15,14 +15,13 @@ from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
+from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
-    FoundView,
     Progress,
-    RejectedView,
     collect_views,
     find_views,
     named_frames,
@@ -62,10 +61,7 @@ def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> C
         return collected
     kept = {view.name for view in result.views}
     found = {view.name: view for view in collected.found}
-    out = [
-        RejectedView(o.view.name, o.view.magnification, o.reason, found[o.view.name].image)
-        for o in result.outliers
-    ]
+    out = [replace(o, image=found[o.name].image) for o in result.outliers]
     return replace(
         collected,
         views=tuple(v for v in collected.views if v.name in kept),

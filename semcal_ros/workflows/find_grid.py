@@ -13,16 +13,21 @@ from joblib import Parallel, cpu_count, delayed
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
-from semcal_ros.core.calibration.views import GridView, SquareAssignment, views_from_detections
-from semcal_ros.core.corners import LatticeDetection, find_lattice
-from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.calibration.views import (
+    FoundView,
+    GridView,
+    RejectedView,
+    SquareAssignment,
+    ViewStatus,
+    views_from_detections,
+)
+from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.errors import CalibrationError, Rejection
 from semcal_ros.files.recordings import Recording
 
 __all__ = [
     "CollectedViews",
-    "FoundView",
     "Progress",
-    "RejectedView",
     "collect_views",
     "find_views",
     "named_frames",
@@ -33,26 +38,6 @@ Progress = Callable[[int], object]
 
 # Fewer images are found sooner than other processes have started.
 _TOO_FEW_TO_SHARE = 12
-
-
-@dataclass(frozen=True)
-class FoundView:
-    """One image with its corners."""
-
-    name: str
-    magnification: float
-    image: NDArray[Any]
-    detection: LatticeDetection
-
-
-@dataclass(frozen=True)
-class RejectedView:
-    """One image that was not used, and why."""
-
-    name: str
-    magnification: float
-    reason: str
-    image: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,10 +54,13 @@ class CollectedViews:
     image_size: tuple[int, int]
 
 
-def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView:
+def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView | RejectedView:
     # The images are the parallel work; threads inside OpenCV would only compete.
     cv2.setNumThreads(1)
-    return FoundView(name, magnification, image, find_lattice(image))
+    detection = find_lattice(image)
+    if isinstance(detection, Rejection):
+        return RejectedView(name, magnification, detection, image)
+    return FoundView(name, magnification, image, detection)
 
 
 def named_frames(recording: Recording) -> Iterator[tuple[str, NDArray[Any], float]]:
@@ -108,11 +96,10 @@ def find_views(
     threads = cv2.getNumThreads()
     try:
         for view in work(delayed(_detect)(*frame) for frame in chain(first, iterator)):
-            if view.detection.accepted:
+            if isinstance(view, FoundView):
                 found.append(view)
             else:
-                reason = view.detection.reason
-                rejected.append(RejectedView(view.name, view.magnification, reason, view.image))
+                rejected.append(view)
             if on_progress is not None:
                 on_progress(1)
     finally:
@@ -149,7 +136,10 @@ def collect_views(
         RejectedView(
             v.name,
             v.magnification,
-            f"image size {v.detection.image_size} is not the {image_size} of most images",
+            Rejection(
+                ViewStatus.OTHER_IMAGE_SIZE,
+                f"image size {v.detection.image_size} is not the {image_size} of most images",
+            ),
         )
         for v in found
         if v.detection.image_size != image_size
@@ -159,7 +149,7 @@ def collect_views(
     judged = len({v.magnification for v in same}) > 1
     misfits = assignment.misfits & judged
     odd = [
-        RejectedView(v.name, v.magnification, _misfit_reason(apparent, squares_m), v.image)
+        RejectedView(v.name, v.magnification, _explain_misfit(apparent, squares_m), v.image)
         for v, apparent, misfit in zip(same, assignment.apparent_m, misfits, strict=True)
         if misfit
     ]
@@ -192,8 +182,9 @@ def _micrometres(sides_m: Iterable[float]) -> str:
     return ", ".join(f"{float(f'{1e6 * side:.3g}'):.6g}" for side in sides_m)
 
 
-def _misfit_reason(apparent_m: float, squares_m: Sequence[float]) -> str:
-    return (
+def _explain_misfit(apparent_m: float, squares_m: Sequence[float]) -> Rejection[ViewStatus]:
+    return Rejection(
+        ViewStatus.UNKNOWN_SQUARES,
         f"the other views make its squares {_micrometres([apparent_m])} um at this magnification, and squares_m has "
-        f"{_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m"
+        f"{_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m",
     )

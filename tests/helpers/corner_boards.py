@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
+from semcal_ros.core.errors import Rejection
 
 
 @dataclass(frozen=True)
@@ -181,3 +184,17 @@ def position_bound(board: Board, ij: NDArray[np.int64]) -> Array:
             share = (gradient[a] * gradient[b] / variance)[hit]
             information[:, a, b] = np.bincount(corner, share, minlength=len(ij))
     return np.asarray(np.linalg.inv(information))
+
+
+def detected(image: NDArray[Any], **options: Any) -> LatticeDetection:
+    """The lattice of an image that must show one."""
+    detection = find_lattice(image, **options)
+    assert isinstance(detection, LatticeDetection), detection.reason
+    return detection
+
+
+def rejected(image: NDArray[Any]) -> Rejection[LatticeStatus]:
+    """Why an image is refused that must be."""
+    detection = find_lattice(image)
+    assert isinstance(detection, Rejection)
+    return detection

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html.parser import HTMLParser
 from typing import Any
 
@@ -10,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.core.corners import LatticeDetection, LatticeStatus
+from semcal_ros.core.errors import Rejection
 
 SIZE = 256
 DISPLAY_M = 0.12
@@ -20,24 +20,9 @@ HOSTILE = "<script>alert('x')</script>\"><img src=//evil.example/a>"
 VOID = {"meta", "img", "image", "path", "br", "link"}
 
 
-@dataclass(frozen=True)
-class Found:
-    name: str
-    magnification: float
-    image: NDArray[Any]
-    detection: LatticeDetection
-
-
-@dataclass(frozen=True)
-class Unused:
-    name: str
-    magnification: float
-    reason: str
-
-
-@dataclass(frozen=True)
-class UnusedWithImage(Unused):
-    image: NDArray[Any]
+def unused(name: str, magnification: float, reason: str, image: Any = None) -> RejectedView:
+    """A view without a grid."""
+    return RejectedView(name, magnification, Rejection(LatticeStatus.NO_LATTICE, reason), image)
 
 
 class Page(HTMLParser):
@@ -96,10 +81,10 @@ def grid_view(g: float, tilt_deg: float, azimuth_deg: float, rng: np.random.Gene
     return GridView(g, board[inside], xy[inside], sigma, f"frame {g:g} {azimuth_deg:g}")
 
 
-def found_of(view: GridView, image: NDArray[Any] | None = None) -> Found:
+def found_of(view: GridView, image: NDArray[Any] | None = None) -> FoundView:
     pixels = np.full((SIZE, SIZE), 90, dtype=np.uint8) if image is None else image
     n = len(view.image_xy)
     detection = LatticeDetection(
-        True, "", np.zeros((n, 2), dtype=np.int64), view.image_xy, view.sigma_px, 22.0, (SIZE, SIZE)
+        np.zeros((n, 2), dtype=np.int64), view.image_xy, view.sigma_px, 22.0, (SIZE, SIZE)
     )
-    return Found(view.name, view.magnification, pixels, detection)
+    return FoundView(view.name, view.magnification, pixels, detection)

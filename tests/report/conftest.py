@@ -13,10 +13,9 @@ from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
     SIZE,
-    Unused,
-    UnusedWithImage,
     found_of,
     grid_view,
+    unused,
 )
 
 
@@ -40,9 +39,9 @@ def page_path(result: CalibrationResult, tmp_path_factory: pytest.TempPathFactor
         path,
         detections=[found_of(v) for v in result.views],
         rejected=[
-            Unused(HOSTILE, 300.0, f"no grid {HOSTILE}"),
-            Unused("b\x00\ud800", 400.0, "blurred"),
-            UnusedWithImage("frame 9", 400.0, "blank", np.full((SIZE, SIZE), 90, dtype=np.uint16)),
+            unused(HOSTILE, 300.0, f"no grid {HOSTILE}"),
+            unused("b\x00\ud800", 400.0, "blurred"),
+            unused("frame 9", 400.0, "blank", np.full((SIZE, SIZE), 90, dtype=np.uint16)),
         ],
         images=[("Setup", np.zeros((40, 60, 3), dtype=np.uint8))],
         title=f"Microscope {HOSTILE}",

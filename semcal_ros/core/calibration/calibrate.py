@@ -19,12 +19,12 @@ from semcal_ros.core.calibration.joint import (
     suited_to_views,
     without_magnification,
 )
-from semcal_ros.core.calibration.outliers import OutlyingView, find_change_point, outlying_views
+from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.summary import about_field, data_warnings, statistics_of
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import GridView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -88,7 +88,7 @@ class CalibrationResult:
     fit: ViewPose
     held_out_rms_px: Mapping[float, float]
     warnings: tuple[str, ...]
-    outliers: tuple[OutlyingView, ...] = ()
+    outliers: tuple[RejectedView, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def calibrate_views(
     options = options or MethodOptions()
     if residual not in RESIDUAL_MODES:
         raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
-    outliers: tuple[OutlyingView, ...] = ()
+    outliers: tuple[RejectedView, ...] = ()
     if method == "joint":
         fit, setup, outliers = _fit_joint(setup, residual, on_stage)
         fitted = _about_joint(setup, fit)
@@ -245,17 +245,20 @@ def _model(
 
 def _fit_joint(
     setup: Setup, residual: str, on_stage: Callable[[str, float], None]
-) -> tuple[JointFit, Setup, tuple[OutlyingView, ...]]:
+) -> tuple[JointFit, Setup, tuple[RejectedView, ...]]:
     """The adjustment without the views that disagree with the others, and these."""
-    outliers: list[OutlyingView] = []
+    outliers: list[RejectedView] = []
     while True:
         fit = fit_joint(setup, residual, on_stage)
-        reasons = outlying_views(fit.problem, fit.result)
-        if not reasons:
+        found = find_outliers(fit.problem, fit.result)
+        if not found:
             return fit, setup, tuple(outliers)
-        outliers += [OutlyingView(setup.views[v], reason) for v, reason in reasons.items()]
+        outliers += [
+            RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
+            for v, rejection in found.items()
+        ]
         # At least two views of every magnification stay, so that this ends.
-        views = tuple(v for i, v in enumerate(setup.views) if i not in reasons)
+        views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
 
 

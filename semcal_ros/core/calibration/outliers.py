@@ -21,9 +21,10 @@ from semcal_ros.core.calibration.normal_equations import (
 )
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import ViewStatus
+from semcal_ros.core.errors import Rejection
 
-__all__ = ["ChangePoint", "OutlyingView", "find_change_point", "outlying_views"]
+__all__ = ["ChangePoint", "find_change_point", "find_outliers"]
 
 
 # Half chi-squares, that is 2.7 standard deviations: a recording without jump has one in twenty chances to be suspected.
@@ -89,16 +90,8 @@ _ENOUGH_VIEWS = 3
 _FEW = 0.1
 
 
-@dataclass(frozen=True)
-class OutlyingView:
-    """A view that was left out, and why."""
-
-    view: GridView
-    reason: str
-
-
-def outlying_views(problem: Problem, result: BundleResult) -> Mapping[int, str]:
-    """Index and reason of each view that disagrees with the others.
+def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Rejection[ViewStatus]]:
+    """Find the views that disagree with the others; index and reason of each.
 
     ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification disagree, or many in all,
     it is not single views that are wrong, and none is named.
@@ -116,16 +109,17 @@ def outlying_views(problem: Problem, result: BundleResult) -> Mapping[int, str]:
     # 90 % of normal deviates are below 1.645; the median would only see the stages that stood still.
     spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
     odd = (np.abs(offset) > _HEIGHT_SIGMAS * spread) | (misfit > _MISFIT_RATIO)
-    reasons: dict[int, str] = {}
+    outliers: dict[int, Rejection[ViewStatus]] = {}
     if odd.mean() > _FEW:
-        return reasons
+        return outliers
     for own in members:
         if len(own) >= _ENOUGH_VIEWS and 2 * odd[own].sum() >= len(own):
             continue
         for v in own[odd[own]]:
-            reasons[int(v)] = (
+            outliers[int(v)] = Rejection(
+                ViewStatus.OUTLIER,
                 f"does not agree with the other views at its magnification: {1e6 * offset[v]:.0f} um of height, where "
                 f"{1e6 * spread:.0f} um are usual, and residuals {misfit[v]:.1f} times the usual; wrong magnification, "
-                "or a square named wrongly"
+                "or a square named wrongly",
             )
-    return reasons
+    return outliers

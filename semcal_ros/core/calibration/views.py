@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
 __all__ = [
+    "FoundView",
     "GridView",
+    "RejectedView",
     "SquareAssignment",
+    "ViewStatus",
     "assign_squares",
     "excess_sigma_px",
     "views_from_detections",
     "with_excess",
 ]
-
-if TYPE_CHECKING:
-    from semcal_ros.core.corners import LatticeDetection
-
 
 # Relative error of the size of a square that tilt, height, noise and the microscope's own scale do not explain.
 _MISFIT = 0.12
@@ -115,6 +116,62 @@ def _all_positive(covariance: Array, n: int) -> bool:
     if not np.all((xx > 0.0) & (xx * yy > xy * xy)):
         return False
     return bool(np.all(np.abs(xy - covariance[:, 1, 0]) <= 1e-6 * np.sqrt(xx * yy)))
+
+
+@dataclass(frozen=True)
+class FoundView:
+    """One image with its corners.
+
+    Attributes
+    ----------
+    name
+        For messages and reports, such as the number of the frame.
+    magnification
+        Magnification of the image.
+    image
+        (h, w) grey values.
+    detection
+        The corners.
+    """
+
+    name: str
+    magnification: float
+    image: AnyImage
+    detection: LatticeDetection
+
+
+class ViewStatus(Enum):
+    """Why an image with a grid is not used."""
+
+    OTHER_IMAGE_SIZE = "other image size"
+    UNKNOWN_SQUARES = "squares of no known size"
+    OUTLIER = "outlier"
+
+
+@dataclass(frozen=True)
+class RejectedView:
+    """One image that was not used.
+
+    Attributes
+    ----------
+    name, magnification
+        As in :class:`FoundView`.
+    rejection
+        Why: a :class:`ViewStatus`, or a :class:`~semcal_ros.core.corners.LatticeStatus` where no
+        grid was found.
+    image
+        (h, w) grey values where they are at hand, or None.
+    """
+
+    name: str
+    magnification: float
+    rejection: Rejection[Any]
+    image: AnyImage | None = None
+
+    @property
+    def reason(self) -> str:
+        """The reason in words."""
+        return self.rejection.reason
 
 
 @dataclass(frozen=True)
@@ -222,7 +279,7 @@ def views_from_detections(
     Raises
     ------
     CalibrationError
-        If there is no detection, or one is not accepted.
+        If there is no detection.
     """
     if not detections:
         raise CalibrationError(
@@ -230,11 +287,6 @@ def views_from_detections(
             expected="images that show a chess grid",
             do="check focus, contrast and that the grid fills the image",
         )
-    for detection in detections:
-        if not detection.accepted:
-            raise CalibrationError(
-                f"a rejected view ({detection.reason})", expected="accepted views"
-            )
     widths = np.array([d.image_size[0] for d in detections], dtype=np.float64)
     nominal = np.asarray(magnifications, dtype=np.float64) * widths / display_width_m
     spacing = np.array([d.spacing_px for d in detections])

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from semcal_ros.core.corners.detection import LatticeDetection, find_lattice
+from semcal_ros.core.corners.detection import LatticeDetection, LatticeStatus, find_lattice
 
-__all__ = ["LatticeDetection", "find_lattice"]
+__all__ = ["LatticeDetection", "LatticeStatus", "find_lattice"]

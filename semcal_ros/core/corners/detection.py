@@ -11,9 +11,10 @@ from semcal_ros.core.arrays import Array, Image, Indices
 from semcal_ros.core.corners.lattice import Lattice, grow_best_lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.saddle import find_saddles, prepare_image, screen_image
+from semcal_ros.core.corners.saddle import LatticeStatus, find_saddles, prepare_image, screen_image
+from semcal_ros.core.errors import Rejection
 
-__all__ = ["LatticeDetection", "find_lattice"]
+__all__ = ["LatticeDetection", "LatticeStatus", "find_lattice"]
 
 
 SCALES_PX = (2.5, 1.5, 4.2, 7.0)
@@ -41,10 +42,6 @@ class LatticeDetection:
 
     Attributes
     ----------
-    accepted
-        Whether the view can be used.
-    reason
-        Why it cannot be used; "" when accepted.
     ij
         (n, 2) lattice indices. The origin is arbitrary; the image of the axes is right-handed
         (positive determinant with x right and y down).
@@ -60,13 +57,11 @@ class LatticeDetection:
     covariance_px2
         (n, 2, 2) covariance of each position, px^2.
     blur_px
-        Median standard deviation of the blur of the edges, px; NaN when nothing was fitted.
+        Median standard deviation of the blur of the edges, px.
     rejected_xy
         (k, 2) where lattice points in the image that were not good enough were expected, px.
     """
 
-    accepted: bool
-    reason: str
     ij: Indices
     xy: Array
     sigma_px: Array
@@ -82,7 +77,9 @@ class LatticeDetection:
         return len(self.rejected_xy)
 
 
-def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection:
+def find_lattice(
+    image: ArrayLike, *, databar_rows: int = 0
+) -> LatticeDetection | Rejection[LatticeStatus]:
     """Find the corners of a chess board seen in part or as a whole, at any rotation and tilt.
 
     Candidates are maxima of minus the determinant of the Hessian at several scales; a lattice is
@@ -99,9 +96,8 @@ def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection
 
     Returns
     -------
-    LatticeDetection
-        With ``accepted`` False and a reason if the image is blank, saturated, shows no lattice, or
-        one that goes over into another.
+    The corners, or a rejection if the image is blank, saturated, shows no lattice, or one that goes
+    over into another.
 
     Raises
     ------
@@ -110,36 +106,39 @@ def find_lattice(image: ArrayLike, *, databar_rows: int = 0) -> LatticeDetection
     """
     grey = prepare_image(image, databar_rows)
     size = (grey.shape[1], grey.shape[0])
-    scaled, reason = screen_image(grey)
-    if reason:
-        return _refused(reason, size)
+    scaled = screen_image(grey)
+    if isinstance(scaled, Rejection):
+        return scaled
     best = _best_corners(scaled, size)
     if best is None:
-        return _refused("no chess lattice: no regular pattern of saddle points", size)
+        return Rejection(
+            LatticeStatus.NO_LATTICE, "no chess lattice: no regular pattern of saddle points"
+        )
     corners, filled = best
     if corners.quality < 0.5:
-        return _refused(
+        return Rejection(
+            LatticeStatus.NO_LATTICE,
             f"no chess lattice: only {round(100 * corners.quality)} % of the expected corners"
             " look like corners",
-            size,
         )
     if corners.foreign > max(FOREIGN_MAX * len(corners.ij), MINIMUM_CORNERS // 2):
-        return _refused(
+        return Rejection(
+            LatticeStatus.TWO_BOARDS,
             f"two boards: {corners.foreign} corners do not continue the lattice of the other"
             f" {len(corners.ij)}",
-            size,
         )
     if len(corners.ij) < MINIMUM_CORNERS and filled < FILLED / 2.0:
-        return _refused(
+        return Rejection(
+            LatticeStatus.NO_LATTICE,
             f"no chess lattice: only {len(corners.ij)} regular corners, in"
             f" {max(1, round(100 * filled))} % of the image",
-            size,
         )
     if len(corners.ij) < MINIMUM_CORNERS:
-        return _refused(
-            f"too few corners: {len(corners.ij)} found, at least {MINIMUM_CORNERS} needed", size
+        return Rejection(
+            LatticeStatus.TOO_FEW_CORNERS,
+            f"too few corners: {len(corners.ij)} found, at least {MINIMUM_CORNERS} needed",
         )
-    return _accepted(corners, size)
+    return _make_detection(corners, size)
 
 
 def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, float] | None:
@@ -179,13 +178,7 @@ def _filled(lattice: Lattice, size: tuple[int, int]) -> float:
     return area / (size[0] * size[1])
 
 
-def _refused(reason: str, size: tuple[int, int]) -> LatticeDetection:
-    return LatticeDetection(
-        False, reason, np.zeros((0, 2), np.int64), np.zeros((0, 2)), np.zeros(0), float("nan"), size
-    )
-
-
-def _accepted(corners: RefinedCorners, size: tuple[int, int]) -> LatticeDetection:
+def _make_detection(corners: RefinedCorners, size: tuple[int, int]) -> LatticeDetection:
     centre = np.array([(size[0] - 1) / 2.0, (size[1] - 1) / 2.0])
     nearest = int(np.argmin(np.linalg.norm(corners.xy - centre, axis=1)))
     maps = fit_local_maps(
@@ -194,8 +187,6 @@ def _accepted(corners: RefinedCorners, size: tuple[int, int]) -> LatticeDetectio
     spacing = float(np.linalg.svd(maps.axes[0], compute_uv=False)[0])
     trace = np.trace(corners.covariance, axis1=1, axis2=2)
     return LatticeDetection(
-        True,
-        "",
         corners.ij,
         corners.xy,
         np.sqrt(trace / 2.0),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.arrays import Array, Image, check_image
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, Rejection
 
-__all__ = ["SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
+__all__ = ["LatticeStatus", "SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
 
 
 # Below this part of the response of the strong saddles a maximum is taken for noise. The response
@@ -20,6 +21,17 @@ __all__ = ["SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
 RELATIVE_THRESHOLD = 0.1
 STRONG_RANK = 12
 MAX_POINTS = 6000
+
+
+class LatticeStatus(Enum):
+    """Why an image gives no lattice."""
+
+    NOT_FINITE = "values that are not finite"
+    BLANK = "blank"
+    SATURATED = "saturated"
+    NO_LATTICE = "no chess lattice"
+    TWO_BOARDS = "two boards"
+    TOO_FEW_CORNERS = "too few corners"
 
 
 @dataclass(frozen=True)
@@ -127,24 +139,30 @@ def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(values[:rows], dtype=np.float32)
 
 
-def screen_image(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], str]:
-    """The image scaled to a contrast of about 1, and a reason to refuse it ("" if none)."""
+def screen_image(image: Image) -> Image | Rejection[LatticeStatus]:
+    """The image scaled to a contrast of about 1, unless it is blank or saturated."""
     sample = image[::2, ::2]
     if not np.all(np.isfinite(image)):
-        return image, "the image has values that are not finite"
+        return Rejection(LatticeStatus.NOT_FINITE, "the image has values that are not finite")
     low, high = (float(v) for v in np.percentile(sample, [1.0, 99.0]))
     top, bottom = float(image.max()), float(image.min())
     if top - bottom <= 0.0:
-        return image, "the image is blank: every pixel has the same value"
+        return Rejection(LatticeStatus.BLANK, "the image is blank: every pixel has the same value")
     at_limit = max(float(np.mean(sample >= top)), float(np.mean(sample <= bottom)))
     if high <= low or at_limit > 0.9:
-        return image, "the image is blank or saturated: nearly all pixels have the same value"
+        return Rejection(
+            LatticeStatus.BLANK,
+            "the image is blank or saturated: nearly all pixels have the same value",
+        )
     if float(np.mean((sample >= top) | (sample <= bottom))) > SATURATED_MAX and _two_levels(sample):
-        return (image - np.float32(low)) / np.float32(high - low), ""
+        return (image - np.float32(low)) / np.float32(high - low)
     if at_limit > SATURATED_MAX:
         part = round(100.0 * at_limit)
-        return image, f"the image is saturated: {part} % of the pixels are at a limit"
-    return (image - np.float32(low)) / np.float32(high - low), ""
+        return Rejection(
+            LatticeStatus.SATURATED,
+            f"the image is saturated: {part} % of the pixels are at a limit",
+        )
+    return (image - np.float32(low)) / np.float32(high - low)
 
 
 def _two_levels(sample: NDArray[np.float32]) -> bool:

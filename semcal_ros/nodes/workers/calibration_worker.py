@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
-from semcal_ros.workflows.find_grid import FoundView
 
 __all__ = [
     "CalibrationJob",

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.report.html.encode import (
     Picture,
     convert_to_8_bits,
@@ -22,9 +20,7 @@ from semcal_ros.report.html.encode import (
 from semcal_ros.report.html.text import remove_control_characters
 
 __all__ = [
-    "ExampleView",
     "Overlay",
-    "UnusedView",
     "choose_examples",
     "overlay_corners",
     "show_rejected",
@@ -38,45 +34,6 @@ _MARK_OF_SPACING = 0.2
 _MARK_LIMITS_PX = (0.8, 4.0)
 _JPEG_QUALITY = 70
 _REJECTED_WIDTH = 200
-
-
-class ExampleView(Protocol):
-    """What the report needs of an image in which the grid was found."""
-
-    @property
-    def name(self) -> str:
-        """Name for the reader."""
-
-    @property
-    def magnification(self) -> float:
-        """Magnification of the image."""
-
-    @property
-    def image(self) -> NDArray[Any]:
-        """The image, (height, width) or (height, width, 3)."""
-
-    @property
-    def detection(self) -> LatticeDetection:
-        """The corners in it."""
-
-
-class UnusedView(Protocol):
-    """What the report needs of an image that was not used.
-
-    An attribute ``image`` with the pixels, where there is one, is shown too.
-    """
-
-    @property
-    def name(self) -> str:
-        """Name for the reader."""
-
-    @property
-    def magnification(self) -> float:
-        """Magnification of the image."""
-
-    @property
-    def reason(self) -> str:
-        """Why it was not used."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +62,10 @@ class Overlay:
     caption: str
 
 
-def choose_examples(views: Sequence[ExampleView]) -> list[ExampleView]:
-    """For each magnification, ascending, the accepted view with most corners."""
-    best: dict[float, ExampleView] = {}
+def choose_examples(views: Sequence[FoundView]) -> list[FoundView]:
+    """For each magnification, ascending, the view with most corners."""
+    best: dict[float, FoundView] = {}
     for view in views:
-        if not view.detection.accepted:
-            continue
         known = best.get(view.magnification)
         if known is None or len(view.detection.xy) > len(known.detection.xy):
             best[view.magnification] = view
@@ -129,7 +84,7 @@ def _crosses(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
 
 
-def overlay_corners(view: ExampleView) -> Overlay:
+def overlay_corners(view: FoundView) -> Overlay:
     """The view shrunk to a thumbnail, with a cross at each corner and a square where one was refused."""
     small, factor = shrink(convert_to_8_bits(view.image), _OVERLAY_WIDTH)
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
@@ -155,19 +110,19 @@ def overlay_corners(view: ExampleView) -> Overlay:
     )
 
 
-def show_rejected(views: Sequence[UnusedView], count: int) -> list[Picture]:
+def show_rejected(views: Sequence[RejectedView], count: int) -> list[Picture]:
     """Thumbnails of rejected images that carry their pixels, different reasons first."""
     ranked: list[tuple[int, int]] = []
     seen: Counter[str] = Counter()
     for index, view in enumerate(views):
-        if getattr(view, "image", None) is not None:
+        if view.image is not None:
             ranked.append((seen[view.reason], index))
             seen[view.reason] += 1
     pictures = []
     for _, index in sorted(ranked)[:count]:
         view = views[index]
-        image: NDArray[Any] = getattr(view, "image")  # noqa: B009
-        small, _ = shrink(convert_to_8_bits(image), _REJECTED_WIDTH)
+        assert view.image is not None
+        small, _ = shrink(convert_to_8_bits(view.image), _REJECTED_WIDTH)
         text = remove_control_characters(f"{view.magnification:g}×: {view.reason} ({view.name})")
         src = encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY))
         alt = f"Rejected image, {text}"

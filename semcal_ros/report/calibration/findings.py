@@ -9,6 +9,7 @@ import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.cells import (
     assign_cells,
@@ -18,7 +19,6 @@ from semcal_ros.report.calibration.cells import (
 )
 from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
 from semcal_ros.report.calibration.error_figures import normalise_residuals
-from semcal_ros.report.calibration.examples import UnusedView
 from semcal_ros.report.calibration.geometry import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.report.calibration.numbers import tabulate_views
 from semcal_ros.report.html.text import format_magnification, remove_control_characters
@@ -55,7 +55,7 @@ def _join_names(items: Sequence[str]) -> str:
     return ", ".join(items[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def collect_warnings(result: CalibrationResult, rejected: Sequence[UnusedView] = ()) -> list[str]:
+def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
     """The warnings of the calibration, then what an expert would see in the report's pictures."""
     found = [
         *result.warnings,
@@ -70,7 +70,7 @@ def collect_warnings(result: CalibrationResult, rejected: Sequence[UnusedView] =
     return [_format_sentence(text) for text in dict.fromkeys(found)]
 
 
-def _check_views(result: CalibrationResult, rejected: Sequence[UnusedView]) -> list[str]:
+def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) -> list[str]:
     found = []
     total = len(rejected) + len(result.views)
     if len(rejected) > _REJECTED_SHARE * total:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.coverage_figures import (
@@ -22,8 +23,6 @@ from semcal_ros.report.calibration.coverage_figures import (
 )
 from semcal_ros.report.calibration.error_figures import plot_residual_histogram, plot_rms
 from semcal_ros.report.calibration.examples import (
-    ExampleView,
-    UnusedView,
     choose_examples,
     overlay_corners,
     show_rejected,
@@ -66,8 +65,8 @@ def write_calibration_report(
     result: CalibrationResult,
     path: str | os.PathLike[str],
     *,
-    detections: Sequence[ExampleView] = (),
-    rejected: Sequence[UnusedView] = (),
+    detections: Sequence[FoundView] = (),
+    rejected: Sequence[RejectedView] = (),
     images: Sequence[tuple[str, NDArray[Any]]] = (),
     title: str = "SEM calibration",
 ) -> Path:
@@ -148,7 +147,7 @@ def write_calibration_report(
     return write_page(path, render("calibration.html.j2", values))
 
 
-def _choose_evenly(views: list[ExampleView], count: int) -> list[ExampleView]:
+def _choose_evenly(views: list[FoundView], count: int) -> list[FoundView]:
     """At most ``count`` of the views, evenly chosen, with the first and the last."""
     if len(views) <= count:
         return views

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
@@ -32,7 +33,8 @@ def _misnamed(views, index, factor):
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor):
     views = _views(name)
     result = calibrate_views(_misnamed(views, 14, factor), **OPTIONS)
-    assert [o.view.name for o in result.outliers] == [views[14].name]
+    assert [o.name for o in result.outliers] == [views[14].name]
+    assert result.outliers[0].rejection.status is ViewStatus.OUTLIER
     assert "wrong magnification" in result.outliers[0].reason
     assert len(result.views) == len(views) - 1
     # As good as if that view had never been recorded.

@@ -21,7 +21,7 @@ def _covariances(n, seed=0):
 
 def _detection(ij, xy, spacing_px, covariance_px2):
     sigma = np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2.0)
-    return LatticeDetection(True, "", ij, xy, sigma, spacing_px, (512, 512), covariance_px2)
+    return LatticeDetection(ij, xy, sigma, spacing_px, (512, 512), covariance_px2)
 
 
 def _spacings(g, squares, factor):
@@ -60,14 +60,9 @@ def test_views_get_metres():
     assert assignment.square_m.tolist() == pytest.approx([10e-6])
 
 
-def test_no_or_rejected_detections_are_refused():
+def test_no_detections_are_refused():
     with pytest.raises(CalibrationError, match="no image"):
         views_from_detections([], [], display_width_m=0.12, squares_m=SQUARES)
-    rejected = LatticeDetection(
-        False, "blank", np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0.0, (512, 512)
-    )
-    with pytest.raises(CalibrationError, match="blank"):
-        views_from_detections([rejected], [100.0], display_width_m=0.12, squares_m=SQUARES)
 
 
 def test_whitening_turns_the_covariance_into_the_unit_matrix():

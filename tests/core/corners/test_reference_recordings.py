@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.corners import find_lattice
+from tests.helpers.corner_boards import detected
 
 
 def true_corners(frame: dict[str, Any], truth: dict[str, Any]) -> Array:
@@ -46,8 +46,7 @@ def test_every_magnification_of_the_grid_recording(reference_data: Path) -> None
                 continue
             message: Any = reader.deserialize(raw, connection.msgtype)
             picture = np.asarray(message.data).reshape(message.height, message.step)
-            detection = find_lattice(picture[:, : message.width])
-            assert detection.accepted, (k, detection.reason)
+            detection = detected(picture[:, : message.width])
             xy = true_corners(truth["frames"][k], truth)
             visible = xy[np.all((xy > 5) & (xy < 506), axis=1)]
             assert np.mean(cKDTree(detection.xy).query(visible)[0] < 1.0) > 0.97, k
@@ -68,8 +67,7 @@ def test_photographs_of_a_board_with_a_border(reference_data: Path, name: str) -
     assert found
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     corners = cv2.cornerSubPix(picture, corners, (5, 5), (-1, -1), stop)
-    detection = find_lattice(picture)
-    assert detection.accepted
+    detection = detected(picture)
     reference = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     distance = cKDTree(reference).query(detection.xy)[0]
     # The finder drops corners that are touched by something else, and adds none.

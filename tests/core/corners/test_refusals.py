@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import InvalidValueError
-from tests.helpers.corner_boards import Board
+from tests.helpers.corner_boards import Board, rejected
 
 
 def blobs(seed: int) -> NDArray[np.uint8]:
@@ -32,35 +32,39 @@ def smooth_noise(seed: int, scale_px: float) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize(
-    ("image", "word"),
+    ("image", "status"),
     [
-        (np.full((128, 128), 90, np.uint8), "blank"),
-        (np.full((128, 128), 255, np.uint8), "blank"),
-        (np.full((128, 128), np.nan), "finite"),
-        (np.random.default_rng(0).poisson(60.0, (256, 256)).astype(np.uint8), "no chess lattice"),
-        (blobs(1), "no chess lattice"),
-        (blobs(2), "no chess lattice"),
+        (np.full((128, 128), 90, np.uint8), LatticeStatus.BLANK),
+        (np.full((128, 128), 255, np.uint8), LatticeStatus.BLANK),
+        (np.full((128, 128), np.nan), LatticeStatus.NOT_FINITE),
+        (
+            np.random.default_rng(0).poisson(60.0, (256, 256)).astype(np.uint8),
+            LatticeStatus.NO_LATTICE,
+        ),
+        (blobs(1), LatticeStatus.NO_LATTICE),
+        (blobs(2), LatticeStatus.NO_LATTICE),
     ],
     ids=["blank", "all white", "not finite", "noise on nothing", "gold", "more gold"],
 )
-def test_boardless_images_are_refused_with_a_reason(image: NDArray[np.generic], word: str) -> None:
-    detection = find_lattice(image)
-    assert not detection.accepted
-    assert word in detection.reason
-    assert len(detection.xy) == len(detection.ij) == len(detection.sigma_px) == 0
+def test_boardless_images_are_refused_with_a_reason(
+    image: NDArray[np.generic], status: LatticeStatus
+) -> None:
+    rejection = rejected(image)
+    assert rejection.status is status
+    assert status.value in rejection.reason
 
 
 @pytest.mark.parametrize("scale_px", [0.0, 1.0, 2.0, 4.0, 8.0, 15.0])
 def test_random_texture_of_any_grain_is_refused(scale_px: float) -> None:
     for seed in range(2):
-        detection = find_lattice(smooth_noise(seed, scale_px))
-        assert not detection.accepted and detection.reason
+        assert rejected(smooth_noise(seed, scale_px)).reason
 
 
 def test_saturated_board_is_refused() -> None:
     picture = Board(30.0, electrons=30.0).render(np.random.default_rng(0), np.float64)
-    detection = find_lattice(np.clip(600.0 * picture, 0.0, 255.0).astype(np.uint8))
-    assert not detection.accepted and "saturated" in detection.reason
+    rejection = rejected(np.clip(600.0 * picture, 0.0, 255.0).astype(np.uint8))
+    assert rejection.status is LatticeStatus.SATURATED
+    assert "saturated" in rejection.reason
 
 
 def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
@@ -72,9 +76,7 @@ def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
         "squares with gaps": (x % 30 < 24) & (y % 30 < 24),
     }
     for name, pattern in patterns.items():
-        detection = find_lattice(rng.poisson(50.0 + 100.0 * pattern).astype(np.uint8))
-        assert not detection.accepted, name
-        assert detection.reason
+        assert rejected(rng.poisson(50.0 + 100.0 * pattern).astype(np.uint8)).reason, name
 
 
 def joined(first: Board, second: Board) -> NDArray[np.uint8]:
@@ -90,29 +92,28 @@ def joined(first: Board, second: Board) -> NDArray[np.uint8]:
     ids=["turned by 5 deg", "shifted by a quarter"],
 )
 def test_two_boards_that_join_are_refused(turn: float, offset: tuple[float, float]) -> None:
-    detection = find_lattice(
+    rejection = rejected(
         joined(Board(15.0, turn_deg=10.0), Board(15.0, turn_deg=turn, offset=offset))
     )
-    assert not detection.accepted and "two boards" in detection.reason
+    assert rejection.status is LatticeStatus.TWO_BOARDS
+    assert "two boards" in rejection.reason
 
 
 @pytest.mark.parametrize(("square", "turn"), [(15.0, 35.0), (24.0, 40.0)])
 def test_two_boards_never_give_a_mixed_lattice(square: float, turn: float) -> None:
     boards = Board(15.0, turn_deg=10.0), Board(square, turn_deg=turn, offset=(0.1, 0.6))
     detection = find_lattice(joined(*boards))
-    if detection.accepted:
+    if isinstance(detection, LatticeDetection):
         miss = [cKDTree(b.corners(0.0)[1]).query(detection.xy)[0].max() for b in boards]
         # All corners belong to one board.
         assert min(miss) < 1.0 < max(miss)
     else:
-        assert "two boards" in detection.reason
+        assert detection.status is LatticeStatus.TWO_BOARDS
 
 
 def test_too_few_corners_are_refused() -> None:
-    detection = find_lattice(
-        Board(210.0, turn_deg=10.0, electrons=50.0).render(np.random.default_rng(0))
-    )
-    assert not detection.accepted and detection.reason
+    board = Board(210.0, turn_deg=10.0, electrons=50.0)
+    assert rejected(board.render(np.random.default_rng(0))).reason
 
 
 @pytest.mark.parametrize(

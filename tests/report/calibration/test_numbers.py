@@ -42,7 +42,7 @@ from semcal_ros.report.html.text import (
     format_px,
     remove_control_characters,
 )
-from tests.helpers.report_samples import SIZE, Unused, camera_at
+from tests.helpers.report_samples import SIZE, camera_at, unused
 
 
 def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResult) -> None:
@@ -241,7 +241,7 @@ def test_a_pattern_in_the_residuals_is_found_and_noise_is_not(result: Calibratio
 def test_many_rejected_views_are_a_finding_with_the_commonest_reason(
     result: CalibrationResult,
 ) -> None:
-    rejected = [Unused(f"{k}", 100.0, "blurred" if k else "blank") for k in range(12)]
+    rejected = [unused(f"{k}", 100.0, "blurred" if k else "blank") for k in range(12)]
     found = collect_warnings(result, rejected)
     assert found == ["12 of 28 views were rejected, 11 of them for this reason: blurred."]
 

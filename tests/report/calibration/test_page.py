@@ -14,7 +14,7 @@ import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report import write_calibration_report
@@ -37,12 +37,10 @@ from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
     SIZE,
-    Found,
     Page,
-    Unused,
-    UnusedWithImage,
     found_of,
     grid_view,
+    unused,
 )
 
 SECTIONS = [
@@ -185,8 +183,6 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
     image = np.zeros((1280, 1280), dtype=np.uint16)
     xy = np.array([[0.0, 0.0], [639.5, 639.5], [1279.0, 1279.0]])
     detection = LatticeDetection(
-        True,
-        "",
         np.zeros((3, 2), dtype=np.int64),
         xy,
         np.full(3, 0.1),
@@ -194,7 +190,7 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
         (1280, 1280),
         rejected_xy=np.array([[99.5, 199.5]]),
     )
-    overlay = overlay_corners(Found("a", 100.0, image, detection))
+    overlay = overlay_corners(FoundView("a", 100.0, image, detection))
     assert (overlay.width, overlay.height) == (320, 320)
     starts = re.findall(r"M([-\d.]+) ([\d.]+)h([\d.]+)", overlay.marks)
     centres = np.array([[float(x) + 0.5 * float(h), float(y)] for x, y, h in starts])
@@ -205,15 +201,11 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
     assert np.allclose(middle, [25.0, 50.0], atol=0.11)
 
 
-def test_examples_are_the_richest_accepted_views(result: CalibrationResult) -> None:
-    found = [found_of(v) for v in result.views]
-    lost = replace(found[0], detection=replace(found[0].detection, accepted=False, reason="x"))
-    best = choose_examples([lost, *found[1:]])
+def test_examples_are_the_richest_views(result: CalibrationResult) -> None:
+    best = choose_examples([found_of(v) for v in result.views])
     assert [b.magnification for b in best] == [100.0, 400.0, 1500.0, 5000.0]
     for view in best:
         own = [v for v in result.views if v.magnification == view.magnification]
-        if view.magnification == 100.0:
-            own = own[1:]
         assert len(view.detection.xy) == max(len(v.image_xy) for v in own)
 
 
@@ -238,7 +230,7 @@ def test_fast_and_small_enough_with_many_views(result: CalibrationResult, tmp_pa
         replace(result, views=many, fit=fit),
         tmp_path / "r.html",
         detections=[found_of(v, noise) for v in many],
-        rejected=[UnusedWithImage(f"lost {k}.", 100.0, f"blurred {k}", noise) for k in range(1000)],
+        rejected=[unused(f"lost {k}.", 100.0, f"blurred {k}", noise) for k in range(1000)],
     )
     # Measured: 7 to 9 s of one core for 105 views of 250 corners.
     assert time.process_time() - start < 40.0
@@ -251,9 +243,7 @@ def test_fast_and_small_enough_with_many_views(result: CalibrationResult, tmp_pa
 
 def test_rejected_images_are_shown_different_reasons_first() -> None:
     image = np.zeros((600, 600), dtype=np.uint8)
-    views = [
-        UnusedWithImage(f"f{k}", 100.0, "blurred" if k < 3 else "blank", image) for k in range(4)
-    ]
-    shown = show_rejected([Unused("none", 100.0, "blank"), *views], 2)
+    views = [unused(f"f{k}", 100.0, "blurred" if k < 3 else "blank", image) for k in range(4)]
+    shown = show_rejected([unused("none", 100.0, "blank"), *views], 2)
     assert [p.caption for p in shown] == ["100×: blurred (f0)", "100×: blank (f3)"]
     assert shown[0].width == shown[0].height == 200
