@@ -1,7 +1,7 @@
 """Point clouds and triangle meshes as PLY and STL files.
 
-Lengths in these files are in a unit of the reader's choice, by default nm: mesh viewers take what is 1e-7 wide for
-nothing. A PLY says its unit in a comment; an STL cannot.
+Lengths in these files are in a unit that the caller chooses, by default nm: mesh viewers show nothing of a mesh that is
+1e-7 wide. A PLY says its unit in a comment; an STL cannot.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from trimesh.exchange.ply import export_ply
+from trimesh.exchange.stl import export_stl
 
 from semcal_ros.applications.reconstruction import SurfaceMesh
+from semcal_ros.core.arrays import Array32
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 
-__all__ = ["MESH_SUFFIXES", "UNITS_PER_M", "mesh_bytes", "save_cloud", "save_mesh"]
+__all__ = ["MESH_SUFFIXES", "UNITS_PER_M", "encode_mesh", "save_cloud", "save_mesh"]
 
 MESH_SUFFIXES = (".ply", ".stl")
 UNITS_PER_M: Mapping[str, float] = {"m": 1.0, "um": 1e6, "nm": 1e9}
@@ -44,11 +47,11 @@ def save_mesh(path: str | Path, mesh: SurfaceMesh, *, unit: str = "nm") -> None:
         As :func:`~semcal_ros.files.atomic.atomic_write_bytes`.
     """
     target = Path(path)
-    atomic_write_bytes(target, mesh_bytes(mesh, target.suffix, unit=unit))
+    atomic_write_bytes(target, encode_mesh(mesh, target.suffix, unit=unit))
 
 
-def mesh_bytes(mesh: SurfaceMesh, suffix: str, *, unit: str = "nm") -> bytes:
-    """The contents of the file of :func:`save_mesh`."""
+def encode_mesh(mesh: SurfaceMesh, suffix: str, *, unit: str = "nm") -> bytes:
+    """Encode the file of :func:`save_mesh`."""
     scale = _scale(unit)
     if suffix.lower() not in MESH_SUFFIXES:
         raise InvalidValueError(f"a mesh as '{suffix}'", expected=" or ".join(MESH_SUFFIXES))
@@ -59,9 +62,9 @@ def mesh_bytes(mesh: SurfaceMesh, suffix: str, *, unit: str = "nm") -> bytes:
         process=False,
     )
     if suffix.lower() == ".stl":
-        return bytes(trimesh.exchange.stl.export_stl(made))
+        return bytes(export_stl(made))
     made.vertex_attributes["sigma"] = (mesh.sigma_m * scale).astype(np.float32)
-    return _with_unit(trimesh.exchange.ply.export_ply(made, vertex_normal=True), unit)
+    return _add_unit(export_ply(made, vertex_normal=True), unit)
 
 
 def save_cloud(
@@ -93,23 +96,21 @@ def save_cloud(
     if target.suffix.lower() != ".ply":
         raise InvalidValueError(f"a cloud of points as '{target.suffix}'", expected=".ply")
     points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3) * scale
-    table: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate("xyz")}
+    table: dict[str, Array32] = {}
     for name, values in (columns or {}).items():
-        table[name] = np.asarray(values, dtype=np.float64)
+        table[name] = np.asarray(values, dtype=np.float32)
         if table[name].shape != (len(points),):
             raise InvalidValueError(
                 f"{name} of shape {table[name].shape}", expected=f"({len(points)},)"
             )
-    rows = np.zeros(len(points), dtype=[(name, "<f4") for name in table])
-    for name, column in table.items():
-        rows[name] = column
-    header = ["ply", "format binary_little_endian 1.0", f"comment unit {unit}"]
-    header += [f"element vertex {len(points)}", *(f"property float {name}" for name in table)]
-    text = "\n".join([*header, "end_header", ""])
-    atomic_write_bytes(target, text.encode("ascii") + rows.tobytes())
+    cloud: Any = trimesh.PointCloud(points)
+    # The exporter writes these, though a cloud, unlike a mesh, does not have them by itself.
+    cloud.vertex_attributes = table
+    atomic_write_bytes(target, _add_unit(export_ply(cloud, vertex_normal=False), unit))
 
 
-def _with_unit(data: bytes, unit: str) -> bytes:
+def _add_unit(data: bytes, unit: str) -> bytes:
+    """Add the unit as a comment to the header of a PLY; trimesh writes no comments of a caller."""
     first, _, rest = data.partition(b"\nelement ")
     return first + f"\ncomment unit {unit}\nelement ".encode("ascii") + rest
 

@@ -11,7 +11,7 @@ import trimesh
 from semcal_ros.applications.reconstruction import SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.bags.simulated import write_simulated
-from semcal_ros.files.meshes import mesh_bytes, save_cloud, save_mesh
+from semcal_ros.files.meshes import encode_mesh, save_cloud, save_mesh
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
@@ -102,8 +102,22 @@ def test_mesh_files_come_back(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_cloud_says_its_unit_and_keeps_its_columns(tmp_path):
+    points = 1e-6 * np.arange(12.0).reshape(4, 3)
+    columns = {"sigma": np.arange(4.0), "on_ball": np.array([0.0, 1.0, 1.0, 0.0])}
+    save_cloud(tmp_path / "a.ply", points, columns, unit="um")
+    header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode().splitlines()
+    assert "comment unit um" in header
+    back = trimesh.load(tmp_path / "a.ply", process=False)
+    np.testing.assert_allclose(back.vertices, 1e6 * points)
+    data = back.metadata["_ply_raw"]["vertex"]["data"]
+    assert {name: data[name].ravel().tolist() for name in columns} == {
+        name: values.tolist() for name, values in columns.items()
+    }
+
+
 def test_units_and_suffixes_are_checked(tmp_path):
-    assert len(mesh_bytes(tetrahedron(), ".PLY", unit="um")) > 100
+    assert len(encode_mesh(tetrahedron(), ".PLY", unit="um")) > 100
     with pytest.raises(InvalidValueError, match="unit"):
         save_mesh(tmp_path / "a.ply", tetrahedron(), unit="inch")
     with pytest.raises(InvalidValueError):
