@@ -36,7 +36,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.files.tables import write_csv
-from semcal_ros.files.video import VIDEO_CODECS, film_of
+from semcal_ros.files.video import VIDEO_CODECS, open_video
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     camera_of,
@@ -351,7 +351,7 @@ def _film(
     frames = sum(len(s.images) for s in shots)
     from semcal_ros.report.cantilever_figures import draw_deflection
 
-    with film_of(video, (width, height), frames, fps, (low, high)) as film:
+    with open_video(video, (width, height), frames, fps, (low, high)) as film:
         assert film is not None
         for one, measured in zip(shots, series, strict=True):
             pose = _pose_of(len(one.images), poses)

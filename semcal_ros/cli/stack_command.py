@@ -29,7 +29,7 @@ from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
-from semcal_ros.files.video import VIDEO_CODECS, Film, film_of
+from semcal_ros.files.video import VIDEO_CODECS, VideoWriter, open_video
 from semcal_ros.workflows.follow_drift import Follower, with_frame_time
 from semcal_ros.workflows.select_frames import Job, Survey, surveyed
 
@@ -106,7 +106,7 @@ def command(
         usable = _usable(survey)
         stack = Stack(survey.size, interpolation)
         grey = _video_levels(survey)
-        with film_of(video, survey.size, len(survey.chosen), fps, grey) as film:
+        with open_video(video, survey.size, len(survey.chosen), fps, grey) as film:
             _add_frames(opened, survey, usable, stack, film)
         notes = opened.notes
     image = stack.result()
@@ -201,7 +201,7 @@ def _add_frames(
     survey: Survey,
     usable: Mask,
     stack: Stack,
-    film: Film | None,
+    film: VideoWriter | None,
 ) -> None:
     number_of = {index: number for number, index in enumerate(survey.chosen)}
     with progress(opened.frame_count, "averaging") as bar:

@@ -20,7 +20,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Packages of ROS come from a distribution or from requirements/ros-*.txt.
 ROS = re.compile(r"rclpy|rcl_interfaces|ament_index_python|std_srvs|launch\w*|\w+_msgs")
 # Distributions that rosdep cannot install, as package.xml says.
-NO_ROSDEP_KEY = {"apsw", "backports.zstd", "pydantic", "tifffile"}
+NO_ROSDEP_KEY = {"apsw", "av", "backports.zstd", "pydantic", "tifffile"}
 ROSDEP_KEYS = {
     "opencv-python-headless": "python3-opencv",
     "pillow": "python3-pil",
