@@ -28,6 +28,8 @@ from tests.helpers.project import NODES, ROOT
 
 DOC = ROOT / "doc"
 PAGES = [ROOT / "README.md", *sorted(DOC.glob("*.md"))]
+ROOTS = (ROOT, ROOT / "semcal_ros")
+FOLDERS = {path.name for root in ROOTS for path in root.iterdir() if path.is_dir()}
 COMMANDS = {
     path.stem.removesuffix("_command")
     for path in (ROOT / "semcal_ros" / "cli").glob("*_command.py")
@@ -64,6 +66,21 @@ def test_relative_links_resolve(page: Path) -> None:
         if not found.exists() or (anchor and anchor not in _anchors(found)):
             broken.append(target)
     assert not broken
+
+
+def test_named_files_and_modules_exist() -> None:
+    """Paths in code style, from the root or from the package, and what `python -m` is told to run."""
+    missing = []
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        text = page.read_text(encoding="utf-8")
+        for path in re.findall(r"`((?:[\w.]+/)+[\w.]*)`", text):
+            if path.partition("/")[0] in FOLDERS and not any((r / path).exists() for r in ROOTS):
+                missing.append(f"{page.name}: {path}")
+        for module in re.findall(r"python -m ((?:benchmarks|examples|semcal_ros)[\w.]*)", text):
+            base = ROOT / module.replace(".", "/")
+            if not base.with_suffix(".py").exists() and not (base / "__main__.py").exists():
+                missing.append(f"{page.name}: python -m {module}")
+    assert missing == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
