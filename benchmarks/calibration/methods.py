@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from benchmarks.calibration.cases import HEIGHT_SIGMA_M, Array, Case, PixelSize
 from benchmarks.calibration.opencv import OpenCv
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.pda import pda_functions
@@ -234,7 +234,10 @@ def pda(work: Work, order: int = 2, degree: int | None = None) -> Answer:
 def joint(work: Work, residual: str) -> Answer:
     c = work.case
     result = calibrate_views(
-        c.seen, image_size=c.image_size, display_width_m=c.display_width_m, residual=residual
+        c.seen,
+        image_size=c.image_size,
+        display_width_m=c.display_width_m,
+        options=CalibrationOptions(residual=residual),
     )
     return by_cameras(result.model.at)
 

@@ -28,6 +28,7 @@ from joblib import Parallel, cpu_count, delayed
 from examples.visual_servo.loop import Case, Run, Task, servo_run
 from semcal_ros import Calibration
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
+from semcal_ros.core.calibration.calibrate import CalibrationOptions
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import (
     DRIFTS,
@@ -62,7 +63,9 @@ def calibrations(microscope: VirtualMicroscope, seed: int) -> tuple[Calibration,
     common = {"display_width_m": microscope.display_width_m, "squares_m": SQUARES_M}
     continuous = calibrate_found(found, rejected, **common).calibration
     some = [view for view in found if view.magnification in DISCRETE]
-    discrete = calibrate_found(some, [], method="discrete", **common).calibration
+    discrete = calibrate_found(
+        some, [], options=CalibrationOptions(method="discrete"), **common
+    ).calibration
     return continuous, discrete
 
 

@@ -14,7 +14,12 @@ from semcal_ros.cli.common import (
     progress,
     require_folder,
 )
-from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, MethodOptions
+from semcal_ros.core.calibration.calibrate import (
+    METHODS,
+    RESIDUAL_MODES,
+    CalibrationOptions,
+    MethodOptions,
+)
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_found
 from semcal_ros.workflows.find_grid import find_views, named_frames
@@ -91,10 +96,9 @@ def command(
             rejected,
             display_width_m=microscope.display_width_m,
             squares_m=microscope.squares_m,
-            method=method,
-            options=MethodOptions(pda_order, legendre, tau),
-            breakpoints=breakpoints,
-            residual=residual,
+            options=CalibrationOptions(
+                method, MethodOptions(pda_order, legendre, tau), breakpoints, residual
+            ),
         )
     done.calibration.save(output)
     _tell(done, notes)

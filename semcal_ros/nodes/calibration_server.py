@@ -17,7 +17,7 @@ from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES
+from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
@@ -193,8 +193,7 @@ class CalibrationServer(StreamNode):
                 views,
                 config.display_width_m,
                 config.squares_m,
-                values["method"],
-                values["residual"],
+                CalibrationOptions(method=values["method"], residual=values["residual"]),
             )
             self._running = CalibrationProcess(job)
             return self._running

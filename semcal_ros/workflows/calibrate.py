@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
-from semcal_ros.core.calibration.calibrate import CalibrationResult, MethodOptions, calibrate_views
+from semcal_ros.core.calibration.calibrate import (
+    CalibrationOptions,
+    CalibrationResult,
+    MethodOptions,
+    calibrate_views,
+)
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import CalibrationError
@@ -76,13 +81,13 @@ def calibrate_found(
     *,
     display_width_m: float,
     squares_m: Sequence[float],
-    method: str = "joint",
-    options: MethodOptions | None = None,
-    breakpoints: Sequence[float] = (),
-    residual: str = "auto",
+    options: CalibrationOptions | None = None,
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> RecordingCalibration:
-    """Calibrate from found corners; ``on_stage`` is told what begins and what fraction of the work is done."""
+    """Calibrate from found corners.
+
+    ``on_stage`` is called with what begins and the fraction of the work that is done.
+    """
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
     factor = collected.assignment.scale_factor
     _check_factor(factor, display_width_m)
@@ -90,10 +95,7 @@ def calibrate_found(
         collected.views,
         image_size=collected.image_size,
         display_width_m=display_width_m,
-        method=method,
         options=options,
-        breakpoints=breakpoints,
-        residual=residual,
         on_stage=lambda name, part: on_stage(name, 0.95 * part),
     )
     on_stage("summary", 0.95)
@@ -120,10 +122,7 @@ def calibrate_recording(
     path: Path,
     config: MicroscopeConfig,
     *,
-    method: str = "joint",
-    options: MethodOptions | None = None,
-    breakpoints: Sequence[float] = (),
-    residual: str = "auto",
+    options: CalibrationOptions | None = None,
     on_progress: Progress | None = None,
 ) -> RecordingCalibration:
     """Calibrate from a recording: a bag, or a folder of SEM TIFF files.
@@ -142,10 +141,7 @@ def calibrate_recording(
         rejected,
         display_width_m=config.display_width_m,
         squares_m=config.squares_m,
-        method=method,
         options=options,
-        breakpoints=breakpoints,
-        residual=residual,
     )
 
 
@@ -171,10 +167,9 @@ def calibrate(
         A ``msg_configs`` name or file; the default is ``generic``.
     display_width_m, squares_m
         Replace the values of ``config``.
-    method
-        ``"joint"``, ``"pda"`` or ``"discrete"``.
-    options, breakpoints, residual
-        As for :func:`~semcal_ros.core.calibration.calibrate.calibrate_views`.
+    method, options, breakpoints, residual
+        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
+        is ``method_options``.
 
     Examples
     --------
@@ -192,14 +187,14 @@ def calibrate(
         chosen = replace(chosen, display_width_m=float(display_width_m))
     if squares_m is not None:
         chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
+    chosen_options = CalibrationOptions(
+        method, options or MethodOptions(), tuple(breakpoints), residual
+    )
     if isinstance(source, (str, os.PathLike)):
         done = calibrate_recording(
             Path(source),
             chosen,
-            method=method,
-            options=options,
-            breakpoints=breakpoints,
-            residual=residual,
+            options=chosen_options,
         )
         return done.calibration
     frames = (
@@ -212,8 +207,5 @@ def calibrate(
         rejected,
         display_width_m=chosen.display_width_m,
         squares_m=chosen.squares_m,
-        method=method,
-        options=options,
-        breakpoints=breakpoints,
-        residual=residual,
+        options=chosen_options,
     ).calibration

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from semcal_ros import Calibration, SemcalError
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -20,7 +20,10 @@ def calibration(request):
         microscope.camera_at, [500.0, 1000.0, 2000.0, 4000.0], views=3, noise_px=0.05
     )
     result = calibrate_views(
-        views, image_size=(512, 512), display_width_m=0.12, method=request.param
+        views,
+        image_size=(512, 512),
+        display_width_m=0.12,
+        options=CalibrationOptions(request.param),
     )
     return Calibration.from_model(result.model)
 

@@ -15,15 +15,19 @@ from semcal_ros.core.calibration.evaluate import ViewPose, fit_poses, rms_by_mag
 from semcal_ros.core.calibration.joint import (
     RESIDUAL_MODES,
     JointFit,
+    adapt_priors,
     fit_joint,
-    suited_to_views,
     without_magnification,
 )
 from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
-from semcal_ros.core.calibration.summary import about_field, data_warnings, statistics_of
+from semcal_ros.core.calibration.summary import (
+    collect_statistics,
+    describe_field,
+    list_undetermined,
+)
 from semcal_ros.core.calibration.views import GridView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -31,7 +35,14 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-__all__ = ["METHODS", "RESIDUAL_MODES", "CalibrationResult", "MethodOptions", "calibrate_views"]
+__all__ = [
+    "METHODS",
+    "RESIDUAL_MODES",
+    "CalibrationOptions",
+    "CalibrationResult",
+    "MethodOptions",
+    "calibrate_views",
+]
 
 Functions = Mapping[str, ContinuousFunction]
 
@@ -60,6 +71,56 @@ class MethodOptions:
     pda_order: int = 2
     legendre_degree: int | None = None
     tau_px: float | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What a user chooses of a calibration.
+
+    Attributes
+    ----------
+    method
+        ``"joint"`` (one adjustment over everything), ``"discrete"`` (each magnification by itself,
+        linear between) or ``"pda"`` (the paper's differential equations through the discrete
+        results).
+    method_options
+        Options of the paper's methods.
+    breakpoints
+        Magnifications at which the microscope switches its scan range, so that scale, aspect and
+        skew jump (only ``"joint"``). A jump that the views ask for elsewhere is reported as a
+        warning.
+    residual
+        Whether a residual field describes what the distortion parameters cannot (only
+        ``"joint"``): ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
+
+    Raises
+    ------
+    InvalidValueError
+        For an unknown method or mode, or an option that the method does not have.
+    """
+
+    method: str = "joint"
+    method_options: MethodOptions = MethodOptions()
+    breakpoints: tuple[float, ...] = ()
+    residual: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InvalidValueError(f"method {self.method!r}", expected=" or ".join(METHODS))
+        if self.residual not in RESIDUAL_MODES:
+            raise InvalidValueError(
+                f"residual {self.residual!r}", expected=" or ".join(RESIDUAL_MODES)
+            )
+        if self.method == "joint":
+            return
+        if self.breakpoints:
+            raise InvalidValueError(
+                f"breakpoints with method {self.method}", expected='method "joint"'
+            )
+        if self.residual == "on":
+            raise InvalidValueError(
+                f"a residual field with method {self.method}", expected='method "joint"'
+            )
 
 
 @dataclass(frozen=True)
@@ -92,7 +153,7 @@ class CalibrationResult:
 
 
 @dataclass(frozen=True)
-class _Fitted:
+class _MethodFit:
     """What the methods have in common: functions, covariance, and the same without one magnification."""
 
     functions: Functions
@@ -105,9 +166,8 @@ class _Fitted:
     residual: ResidualField | None = None
 
 
-def _checked(views: Sequence[GridView], method: str) -> tuple[GridView, ...]:
-    if method not in METHODS:
-        raise InvalidValueError(f"method {method!r}", expected=" or ".join(METHODS))
+def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
+    """The views in the order of their magnifications."""
     if not views:
         raise CalibrationError(
             "no usable view",
@@ -135,11 +195,8 @@ def calibrate_views(
     *,
     image_size: tuple[int, int],
     display_width_m: float,
-    method: str = "joint",
+    options: CalibrationOptions | None = None,
     priors: Priors | None = None,
-    options: MethodOptions | None = None,
-    breakpoints: Sequence[float] = (),
-    residual: str = "auto",
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> CalibrationResult:
     """Calibrate the microscope from views of a planar grid.
@@ -152,20 +209,11 @@ def calibrate_views(
         (width, height) of the images, px.
     display_width_m
         Display width to which the magnifications refer, m.
-    method
-        ``"joint"`` (one adjustment over everything), ``"discrete"`` (each magnification by itself, linear between) or
-        ``"pda"`` (the paper's differential equations through the discrete results).
+    options
+        Method, breakpoints and residual field; None for the defaults.
     priors
         Weak prior knowledge; the defaults suit any SEM, and follow the views where their perspective is that of a
         photograph.
-    options
-        Of the paper's methods.
-    breakpoints
-        Magnifications at which the microscope switches its scan range, so that scale, aspect and skew jump (only
-        ``"joint"``). A jump that the views ask for elsewhere is reported as a warning.
-    residual
-        Whether a residual field describes what the distortion parameters cannot (only ``"joint"``): ``"on"``,
-        ``"off"``, or ``"auto"``, where cross-validation decides.
     on_stage
         Called with the name of what begins and the fraction of the work that is done, 0 to 1 (only ``"joint"``, which
         begins anew after leaving out views).
@@ -175,47 +223,37 @@ def calibrate_views(
     CalibrationError
         If the views do not allow a calibration.
     InvalidValueError
-        For an unknown method or option.
+        For breakpoints outside of the magnifications of the views.
     """
-    ordered = _checked(views, method)
+    options = options or CalibrationOptions()
+    ordered = _check_views(views)
     magnifications = np.unique([v.magnification for v in ordered])
-    breaks = _checked_breakpoints(breakpoints, magnifications, method)
+    breaks = _check_breakpoints(options.breakpoints, magnifications)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
     if priors is None:
-        setup = suited_to_views(setup)
-    options = options or MethodOptions()
-    if residual not in RESIDUAL_MODES:
-        raise InvalidValueError(f"residual {residual!r}", expected=" or ".join(RESIDUAL_MODES))
+        setup = adapt_priors(setup)
     outliers: tuple[RejectedView, ...] = ()
-    if method == "joint":
-        fit, setup, outliers = _fit_joint(setup, residual, on_stage)
-        fitted = _about_joint(setup, fit)
-    elif residual == "on":
-        raise InvalidValueError(f"a residual field with method {method}", expected='method "joint"')
+    if options.method == "joint":
+        joint, setup, outliers = _fit_without_outliers(setup, options.residual, on_stage)
+        fit = _fit_joint(setup, joint)
     else:
-        fitted = _fit_discrete(setup, method, options)
+        fit = _fit_discrete(setup, options.method, options.method_options)
 
-    model = _model(setup, fitted.functions, fitted.covariance, method, fitted.residual)
-    poses = fit_poses(
-        setup.views, model.at, height_sigma_m=fitted.height_sigma_m, starts=fitted.poses
-    )
-    held_out = _held_out(setup, fitted, method)
-    warnings = (*fitted.warnings, *data_warnings(setup, model))
-    statistics = statistics_of(
-        setup, fitted.details, fitted.height_sigma_m, poses, held_out, warnings
+    model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual)
+    poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
+    held_out = _predict_held_out(setup, fit, options.method)
+    warnings = (*fit.warnings, *list_undetermined(setup, model))
+    statistics = collect_statistics(
+        setup, fit.details, fit.height_sigma_m, poses, held_out, warnings
     )
     return CalibrationResult(
         replace(model, statistics=statistics), setup.views, poses, held_out, warnings, outliers
     )
 
 
-def _checked_breakpoints(
-    breakpoints: Sequence[float], magnifications: Array, method: str
-) -> tuple[float, ...]:
+def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> tuple[float, ...]:
     low, high = magnifications[0], magnifications[-1]
     breaks = tuple(sorted({float(b) for b in breakpoints}))
-    if breaks and method != "joint":
-        raise InvalidValueError(f"breakpoints with method {method}", expected='method "joint"')
     if not all(low < b <= high for b in breaks):
         raise InvalidValueError(
             f"breakpoints {', '.join(f'{b:g}' for b in breaks)}",
@@ -224,7 +262,7 @@ def _checked_breakpoints(
     return breaks
 
 
-def _model(
+def _make_model(
     setup: Setup,
     functions: Functions,
     covariance: Array,
@@ -243,14 +281,14 @@ def _model(
     )
 
 
-def _fit_joint(
+def _fit_without_outliers(
     setup: Setup, residual: str, on_stage: Callable[[str, float], None]
 ) -> tuple[JointFit, Setup, tuple[RejectedView, ...]]:
     """The adjustment without the views that disagree with the others, and these."""
     outliers: list[RejectedView] = []
     while True:
         fit = fit_joint(setup, residual, on_stage)
-        found = find_outliers(fit.problem, fit.result)
+        found = find_outliers(fit.adjustment.problem, fit.adjustment.result)
         if not found:
             return fit, setup, tuple(outliers)
         outliers += [
@@ -262,11 +300,12 @@ def _fit_joint(
         setup = replace(setup, views=views)
 
 
-def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
-    factor = variance_factor(fit.problem, fit.result)
+def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
+    adjustment, result = fit.adjustment, fit.adjustment.result
+    factor = variance_factor(adjustment.problem, result)
     warnings = []
-    if not fit.result.converged:
-        warnings.append(f"the adjustment did not converge: {fit.result.status.value}")
+    if not result.converged:
+        warnings.append(f"the adjustment did not converge: {result.status.value}")
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     if misfit > _MISFIT:
@@ -275,39 +314,39 @@ def _about_joint(setup: Setup, fit: JointFit) -> _Fitted:
             "do not follow the microscope everywhere, or the grid is not regular"
             + ("; record more magnifications" if len(setup.magnifications) > 1 else "")
         )
-    jump = find_change_point(setup, fit.problem, fit.result)
-    if jump is not None:
+    change = find_change_point(setup, adjustment.problem, result)
+    if change is not None:
         warnings.append(
-            f"the scale seems to jump by {100.0 * jump.relative:.2g} +- {100.0 * jump.sigma:.1g} % between "
-            f"magnifications {jump.below:g} and {jump.above:g}: if the microscope switches its scan range there, "
+            f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
+            f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range there, "
             "calibrate with this breakpoint"
         )
-    if not fit.settled:
+    if not adjustment.settled:
         warnings.append("the choice of the number of coefficients did not settle")
     details = {
-        "iterations": fit.result.iterations,
-        "converged": fit.result.converged,
-        "reason": fit.result.status.value,
-        "selection_rounds": fit.rounds,
+        "iterations": result.iterations,
+        "converged": result.converged,
+        "reason": result.status.value,
+        "selection_rounds": adjustment.rounds,
         "variance_factor": factor,
         "excess_sigma_px": fit.excess_px,
-        "coefficients": {name: [f.kind, f.smooth_size] for name, f in fit.functions.items()},
+        "coefficients": {name: [f.kind, f.smooth_size] for name, f in adjustment.functions.items()},
         "breakpoints": list(setup.breakpoints),
-        "residual_field": about_field(fit.field),
+        "residual_field": describe_field(fit.field),
     }
-    return _Fitted(
+    return _MethodFit(
         fit.padded,
         fit.covariance * factor,
         lambda index: without_magnification(fit, index),
-        fit.problem.height_sigma_m,
-        (fit.result.state.rotations, fit.result.state.translations_m),
+        adjustment.problem.height_sigma_m,
+        (result.state.rotations, result.state.translations_m),
         details,
         tuple(warnings),
         None if fit.field is None else fit.field.field,
     )
 
 
-def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
+def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodFit:
     discrete = fit_discrete(setup, tau_px=options.tau_px)
 
     def functions_of(keep: Mask) -> tuple[Functions, Array]:
@@ -334,13 +373,13 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
         "converged": not failed,
         "options": asdict(options),
         "separate": [
-            _separate(float(g), centre, result)
+            _describe_separate(float(g), centre, result)
             for g, centre, result in zip(
                 setup.magnifications, discrete.centres, discrete.results, strict=True
             )
         ],
     }
-    return _Fitted(
+    return _MethodFit(
         functions,
         covariance,
         lambda index: (functions_of(np.arange(count) != index)[0], None),
@@ -351,7 +390,7 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _Fitted:
     )
 
 
-def _separate(g: float, centre: Any, result: BundleResult) -> dict[str, Any]:
+def _describe_separate(g: float, centre: Any, result: BundleResult) -> dict[str, Any]:
     return {
         "magnification": g,
         "distortion": not centre.degenerate,
@@ -363,7 +402,7 @@ def _separate(g: float, centre: Any, result: BundleResult) -> dict[str, Any]:
     }
 
 
-def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
+def _predict_held_out(setup: Setup, fit: _MethodFit, method: str) -> dict[float, float]:
     """Error at each magnification under a calibration from all others; empty for a single magnification."""
     out: dict[float, float] = {}
     count = len(setup.magnifications)
@@ -372,22 +411,22 @@ def _held_out(setup: Setup, fitted: _Fitted, method: str) -> dict[float, float]:
     for index, g in enumerate(setup.magnifications):
         mine = [i for i, v in enumerate(setup.views) if v.magnification == g]
         own = [setup.views[i] for i in mine]
-        starts = None if fitted.poses is None else (fitted.poses[0][mine], fitted.poses[1][mine])
+        starts = None if fit.poses is None else (fit.poses[0][mine], fit.poses[1][mine])
         try:
-            camera_at = _predictor(setup, *fitted.without(index), index, method)
-            height = fitted.height_sigma_m[mine]
-            fit = fit_poses(own, camera_at, height_sigma_m=height, starts=starts)
+            camera_at = _make_predictor(setup, *fit.without(index), index, method)
+            height = fit.height_sigma_m[mine]
+            poses = fit_poses(own, camera_at, height_sigma_m=height, starts=starts)
         except (CalibrationError, InvalidValueError):
             # The method has no answer there: that is an infinite error, not a missing one.
             out[float(g)] = float("inf")
             continue
-        out.update(rms_by_magnification(fit))
+        out.update(rms_by_magnification(poses))
     return out
 
 
-def _predictor(
+def _make_predictor(
     setup: Setup, functions: Functions, residual: ResidualField | None, index: int, method: str
 ) -> Callable[[float], ScanCamera]:
     size = sum(f.size for f in functions.values()) + (0 if residual is None else residual.size)
     rest = replace(setup, magnifications=np.delete(setup.magnifications, index))
-    return _model(rest, functions, np.zeros((size, size)), method, residual).at
+    return _make_model(rest, functions, np.zeros((size, size)), method, residual).at

@@ -46,10 +46,11 @@ from semcal_ros.core.camera.residual_field import ResidualField
 
 __all__ = [
     "RESIDUAL_MODES",
+    "Adjustment",
     "FittedField",
     "JointFit",
+    "adapt_priors",
     "fit_joint",
-    "suited_to_views",
     "without_magnification",
 ]
 
@@ -99,51 +100,58 @@ class FittedField:
 
 
 @dataclass(frozen=True)
+class Adjustment:
+    """Continuous functions with a chosen number of coefficients, adjusted to the views.
+
+    Attributes
+    ----------
+    functions
+        The functions.
+    problem, result
+        The adjustment that gave their coefficients.
+    rounds
+        How often the number of coefficients was chosen.
+    settled
+        Whether the last choice was that of the round before.
+    """
+
+    functions: Functions
+    problem: Problem
+    result: BundleResult
+    rounds: int
+    settled: bool
+
+
+@dataclass(frozen=True)
 class JointFit:
     """Outcome of :func:`fit_joint`.
 
     Attributes
     ----------
-    functions, result, problem
+    adjustment
         The adjustment with the chosen number of coefficients.
     padded, covariance
-        The same functions with some coefficients more, which are zero, and the covariance of all of them, followed by
-        the coefficients of the field, for unit variance of the residuals.
-    rounds, settled
-        How the choice came about.
+        The same functions with a few more coefficients, which are zero, and the covariance of all of them, followed by
+        that of the coefficients of the field, for unit variance of the residuals.
     field
         The residual field, or None.
     excess_px
         1-sigma per axis, px, by which all corners scatter beyond their own.
     """
 
-    functions: Functions
-    result: BundleResult
-    problem: Problem
+    adjustment: Adjustment
     padded: Functions
     covariance: Array
-    rounds: int
-    settled: bool
     field: FittedField | None
     excess_px: float
 
 
-@dataclass(frozen=True)
-class _Stage:
-    """An adjustment on the way."""
-
-    functions: Functions
-    problem: Problem
-    result: BundleResult
-    rounds: int
-    settled: bool
-
-
-def _height_sigma(setup: Setup, result: BundleResult) -> Array:
+def _update_height_sigma(setup: Setup, result: BundleResult) -> Array:
     """(V,) expectation-maximisation update of the spread of the heights.
 
-    Views without tilt have a spread of their own: nobody turns the stage about the very point that is looked at, so
-    that tilting changes the height, while views from above may all share one.
+    Views without tilt have a spread of their own: the axis of the stage hardly ever passes through
+    the point that is looked at, so that tilting changes the height, while views from above may all
+    share one.
     """
     square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
     flat = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
@@ -156,7 +164,7 @@ def _height_sigma(setup: Setup, result: BundleResult) -> Array:
     return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior))
 
 
-def enriched(
+def refit_functions(
     functions: Functions, sizes: Mapping[str, tuple[str, int]]
 ) -> dict[str, ContinuousFunction]:
     """Functions of other kinds and sizes through the values of the given ones, by least squares."""
@@ -172,7 +180,7 @@ def enriched(
     return out
 
 
-def _thinned(view: GridView) -> GridView:
+def _thin_view(view: GridView) -> GridView:
     """The view with a spread of at most so many corners as its pose and a rough camera need."""
     if len(view.board_xy_m) <= _ENOUGH_CORNERS:
         return view
@@ -180,7 +188,7 @@ def _thinned(view: GridView) -> GridView:
     return view.chosen(keep)
 
 
-def suited_to_views(setup: Setup) -> Setup:
+def adapt_priors(setup: Setup) -> Setup:
     """The setup with priors for a photographic lens where the views show that strong a perspective."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
@@ -189,7 +197,7 @@ def suited_to_views(setup: Setup) -> Setup:
     return replace(setup, priors=setup.priors.of_wide_views(start.rho))
 
 
-def _started(setup: Setup) -> tuple[Functions, State, Array]:
+def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
     """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
@@ -201,18 +209,18 @@ def _started(setup: Setup) -> tuple[Functions, State, Array]:
     state, _ = resolve_mirrored_tilts(problem, state)
 
     size = min(3, max(1, len(setup.magnifications) - 1))
-    functions = enriched(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
+    functions = refit_functions(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, height)
     result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
     for _ in range(_HEIGHT_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
-        height = _height_sigma(setup, result)
+        height = _update_height_sigma(setup, result)
         problem = replace(problem, height_sigma_m=height)
         result = refine(problem, result.state, tolerance=_COARSE)
     return with_coefficients(functions, result.state.theta), result.state, height
 
 
-def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
+def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
     """The functions with some more coefficients than were chosen, all zero."""
     out = dict(functions)
     low, high = functions["scale"].g_range
@@ -225,8 +233,8 @@ def _with_reserve(functions: Functions) -> dict[str, ContinuousFunction]:
     return out
 
 
-def _covariance_with_reserve(
-    setup: Setup, padded: Functions, stage: _Stage, field: FittedField | None
+def _pad_covariance(
+    setup: Setup, padded: Functions, adjustment: Adjustment, field: FittedField | None
 ) -> Array:
     """Covariance of the padded functions' coefficients and of the field's.
 
@@ -235,10 +243,10 @@ def _covariance_with_reserve(
     estimate may be wrong on top of that.
     """
     views = setup.views if field is None else corrected(setup, field.field).views
-    problem = build_problem(setup, padded, views, stage.problem.height_sigma_m)
-    state = replace(stage.result.state, theta=theta_of(padded))
+    problem = build_problem(setup, padded, views, adjustment.problem.height_sigma_m)
+    state = replace(adjustment.result.state, theta=theta_of(padded))
     result = refine(problem, state, max_iterations=0)
-    factor = variance_factor(stage.problem, stage.result)
+    factor = variance_factor(adjustment.problem, adjustment.result)
     if field is None:
         reduced = reduced_normal_equations(
             problem, state.theta, result.information, result.gradient
@@ -254,13 +262,13 @@ def _covariance_with_reserve(
     return covariance + np.outer(moved, moved) / factor
 
 
-def _selected(
+def _select_and_adjust(
     setup: Setup,
     functions: Functions,
     state: State,
     height_sigma_m: Array,
     sizes: Mapping[str, tuple[str, int]] | None = None,
-) -> _Stage:
+) -> Adjustment:
     """Choose the number of coefficients of every function until the choice no longer changes."""
     problem = build_problem(setup, functions, setup.views, height_sigma_m)
     result = refine(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
@@ -272,70 +280,74 @@ def _selected(
         if settled:
             break
         sizes = chosen
-        functions = enriched(with_coefficients(functions, result.state.theta), chosen)
-        problem = build_problem(setup, functions, setup.views, _height_sigma(setup, result))
+        functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
+        problem = build_problem(setup, functions, setup.views, _update_height_sigma(setup, result))
         result = refine(
             problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
         )
     functions = with_coefficients(functions, result.state.theta)
-    return _Stage(functions, problem, result, rounds, settled)
+    return Adjustment(functions, problem, result, rounds, settled)
 
 
-def _finished(setup: Setup, stage: _Stage) -> _Stage:
+def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     """The exact adjustment with the chosen functions, all tilts having been tried both ways."""
-    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
-    height = _height_sigma(setup, stage.result)
+    thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
+    height = _update_height_sigma(setup, adjustment.result)
     turned, _ = resolve_mirrored_tilts(
-        build_problem(thin, stage.functions, thin.views, height), stage.result.state
+        build_problem(thin, adjustment.functions, thin.views, height), adjustment.result.state
     )
-    problem = build_problem(setup, stage.functions, setup.views, height)
+    problem = build_problem(setup, adjustment.functions, setup.views, height)
     result = refine(problem, turned)
-    functions = with_coefficients(stage.functions, result.state.theta)
-    return replace(stage, functions=functions, problem=problem, result=result)
+    functions = with_coefficients(adjustment.functions, result.state.theta)
+    return replace(adjustment, functions=functions, problem=problem, result=result)
 
 
-def _with_field(setup: Setup, stage: _Stage, always: bool) -> tuple[_Stage, FittedField | None]:
-    """Camera and residual field, or the stage as it is where the field is not worthwhile.
+def _add_field(
+    setup: Setup, adjustment: Adjustment, always: bool
+) -> tuple[Adjustment, FittedField | None]:
+    """Camera and residual field, or the adjustment as it is where the field is not worthwhile.
 
     Each turn solves for both together, and then adjusts poses and camera to observations that the field has corrected.
     In the first turns the strength of the field and the number of coefficients of the functions are chosen anew.
     """
     field = blank = blank_field(setup)
-    start, before = stage, setup
+    start, before = adjustment, setup
     for turn in range(_MAX_FIELD_TURNS):
-        system = field_system(setup, stage.problem, stage.result, field)
+        system = field_system(setup, adjustment.problem, adjustment.result, field)
         if turn < _CHOOSING_TURNS:
             choice = choose_field(setup, system, blank)
             if not (choice.worthwhile or always):
                 return start, None
         theta, field = solve_field(system, choice.prior, blank)
         after = corrected(setup, field)
-        stage = _adjusted(after, stage, theta, choosing=turn < _CHOOSING_TURNS)
+        adjustment = _readjust(after, adjustment, theta, choosing=turn < _CHOOSING_TURNS)
         pairs = zip(before.views, after.views, strict=True)
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
         before = after
         if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
-            return stage, FittedField(field, choice, system, True)
-    return stage, FittedField(field, choice, system, False)
+            return adjustment, FittedField(field, choice, system, True)
+    return adjustment, FittedField(field, choice, system, False)
 
 
-def _sizes_of(stage: _Stage) -> dict[str, tuple[str, int]]:
-    own = stage.functions
+def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
+    own = adjustment.functions
     return {name: (own[name].kind, own[name].smooth_size) for name in _SMOOTH}
 
 
-def _adjusted(setup: Setup, stage: _Stage, theta: Array, *, choosing: bool) -> _Stage:
-    """The stage with other views and coefficients; ``choosing`` the number of coefficients again."""
+def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:
+    """The adjustment with other views and coefficients; ``choosing`` the number of coefficients again."""
     functions, height = (
-        with_coefficients(stage.functions, theta),
-        _height_sigma(setup, stage.result),
+        with_coefficients(adjustment.functions, theta),
+        _update_height_sigma(setup, adjustment.result),
     )
     if choosing:
-        return _selected(setup, functions, stage.result.state, height, _sizes_of(stage))
+        return _select_and_adjust(
+            setup, functions, adjustment.result.state, height, _current_sizes(adjustment)
+        )
     problem = build_problem(setup, functions, setup.views, height)
-    result = refine(problem, replace(stage.result.state, theta=theta), tolerance=_COARSE)
+    result = refine(problem, replace(adjustment.result.state, theta=theta), tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
-    return replace(stage, functions=functions, problem=problem, result=result)
+    return replace(adjustment, functions=functions, problem=problem, result=result)
 
 
 def fit_joint(
@@ -350,39 +362,31 @@ def fit_joint(
     one magnification at a time, until the choice no longer changes. With ``residual`` ``"on"``, or ``"auto"`` where
     cross-validation finds it worthwhile, a residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
     """
-    thin = replace(setup, views=tuple(_thinned(v) for v in setup.views))
+    thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
     on_stage("start values", 0.0)
-    start = _started(thin)
+    start = _fit_start(thin)
     on_stage("number of coefficients", 0.3)
-    stage, field = _selected(setup, *start), None
+    adjustment, field = _select_and_adjust(setup, *start), None
     if residual != "off":
         on_stage("residual field", 0.5)
-        stage, field = _with_field(setup, stage, residual == "on")
-    excess = excess_sigma_px(setup.views, stage.result.residuals_px, 6 * len(setup.views))
+        adjustment, field = _add_field(setup, adjustment, residual == "on")
+    excess = excess_sigma_px(setup.views, adjustment.result.residuals_px, 6 * len(setup.views))
     if excess > 0.0:
         setup = replace(setup, views=with_excess(setup.views, excess))
     final = setup if field is None else corrected(setup, field.field)
     if excess > 0.0:
-        height = _height_sigma(setup, stage.result)
-        stage = _selected(final, stage.functions, stage.result.state, height, _sizes_of(stage))
+        height = _update_height_sigma(setup, adjustment.result)
+        adjustment = _select_and_adjust(
+            final, adjustment.functions, adjustment.result.state, height, _current_sizes(adjustment)
+        )
     on_stage("final adjustment", 0.75)
-    stage = _finished(final, stage)
+    adjustment = _adjust_exactly(final, adjustment)
     if field is not None:
-        system = field_system(setup, stage.problem, stage.result, field.field)
+        system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
-    padded = _with_reserve(stage.functions)
-    covariance = _covariance_with_reserve(setup, padded, stage, field)
-    return JointFit(
-        stage.functions,
-        stage.result,
-        stage.problem,
-        padded,
-        covariance,
-        stage.rounds,
-        stage.settled,
-        field,
-        excess,
-    )
+    padded = _pad_functions(adjustment.functions)
+    covariance = _pad_covariance(setup, padded, adjustment, field)
+    return JointFit(adjustment, padded, covariance, field, excess)
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
@@ -394,10 +398,11 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
         fitted = fit.field
         keep = fitted.system.group != index
         theta, field = solve_field(fitted.system, fitted.choice.prior, fitted.field, keep)
-        return with_coefficients(fit.functions, theta), field
-    information, gradient = fit.result.information.copy(), fit.result.gradient.copy()
+        return with_coefficients(fit.adjustment.functions, theta), field
+    functions, result = fit.adjustment.functions, fit.adjustment.result
+    information, gradient = result.information.copy(), result.gradient.copy()
     information[index] = 0.0
     gradient[index] = 0.0
-    theta = theta_of(fit.functions)
-    matrix, right = reduced_normal_equations(fit.problem, theta, information, gradient)
-    return with_coefficients(fit.functions, theta + solve_scaled(matrix, right)), None
+    theta = theta_of(functions)
+    matrix, right = reduced_normal_equations(fit.adjustment.problem, theta, information, gradient)
+    return with_coefficients(functions, theta + solve_scaled(matrix, right)), None

@@ -1,4 +1,4 @@
-"""What is worth telling of a calibration: statistics for its file, and what the views do not determine."""
+"""Statistics of a calibration for its file, and warnings about what the views do not determine."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from semcal_ros.core.calibration.joint import FittedField
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = ["about_field", "data_warnings", "statistics_of"]
+__all__ = ["collect_statistics", "describe_field", "list_undetermined"]
 
 
-def about_field(fitted: FittedField | None) -> dict[str, Any] | None:
+def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
     """How the residual field was chosen, or None without one."""
     if fitted is None:
         return None
@@ -31,8 +31,8 @@ def about_field(fitted: FittedField | None) -> dict[str, Any] | None:
     }
 
 
-def data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
-    """What the views do not determine beyond the priors."""
+def list_undetermined(setup: Setup, model: CalibrationModel) -> list[str]:
+    """Warnings about what the views do not determine beyond the priors."""
     warnings: list[str] = []
     covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
     assert covariance is not None
@@ -50,7 +50,7 @@ def data_warnings(setup: Setup, model: CalibrationModel) -> list[str]:
     return warnings
 
 
-def statistics_of(
+def collect_statistics(
     setup: Setup,
     details: Mapping[str, Any],
     height_sigma_m: Array,
@@ -58,7 +58,7 @@ def statistics_of(
     held_out: Mapping[float, float],
     warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """Plain numbers and sentences that the calibration file keeps."""
+    """Collect the plain numbers and sentences that the calibration file keeps."""
     inner = [held_out[float(g)] for g in setup.magnifications[1:-1] if float(g) in held_out]
     rms = rms_by_magnification(poses)
     return {

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from semcal_ros.core.calibration.calibrate import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
@@ -46,8 +47,7 @@ class CalibrationJob:
     views: tuple[FoundView, ...]
     display_width_m: float
     squares_m: tuple[float, ...]
-    method: str
-    residual: str
+    options: CalibrationOptions
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,7 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
             (),
             display_width_m=job.display_width_m,
             squares_m=job.squares_m,
-            method=job.method,
-            residual=job.residual,
+            options=job.options,
             on_stage=on_stage,
         )
     except SemcalError as error:
@@ -99,7 +98,7 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
     worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
     low, high = done.calibration.magnification_range
     summary = (
-        f"{job.method} calibration from {len(done.collected.views)} views, {low:g}x to {high:g}x{worst}"
+        f"{job.options.method} calibration from {len(done.collected.views)} views, {low:g}x to {high:g}x{worst}"
         f", in {time.monotonic() - started_s:.1f} s"
     )
     notes = "".join(f"; {warning}" for warning in done.result.warnings)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import MethodOptions, calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, MethodOptions, calibrate_views
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import preset
@@ -25,8 +25,7 @@ def _calibrate(name, method="joint", options=None, magnifications=CALIBRATED, vi
         seen,
         image_size=microscope.image_size,
         display_width_m=microscope.display_width_m,
-        method=method,
-        options=options,
+        options=CalibrationOptions(method, options or MethodOptions()),
     )
 
 
@@ -147,21 +146,14 @@ def test_what_the_views_cannot_determine_is_said():
 
 
 def test_bad_requests_are_refused():
-    views = grid_views(preset("jsm820").camera_at, [1000.0], views=3)
     with pytest.raises(InvalidValueError, match="method"):
-        calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="magic")
+        CalibrationOptions(method="magic")
     with pytest.raises(CalibrationError, match="no usable view"):
         calibrate_views([], image_size=(512, 512), display_width_m=0.12)
     with pytest.raises(CalibrationError, match="at least 4"):
-        calibrate_views(views, image_size=(512, 512), display_width_m=0.12, method="pda")
+        _calibrate("jsm820", "pda", magnifications=[1000.0], views=3)
     with pytest.raises(InvalidValueError, match="order"):
-        calibrate_views(
-            views,
-            image_size=(512, 512),
-            display_width_m=0.12,
-            method="pda",
-            options=MethodOptions(5),
-        )
+        _calibrate("jsm820", "pda", MethodOptions(5), magnifications=[1000.0], views=3)
 
 
 def test_two_views_cannot_determine_scale_aspect_and_skew():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
@@ -29,7 +29,12 @@ def _camera(g, jump=JUMP):
 
 def _calibrated(jump=JUMP, **options):
     views = grid_views(lambda g: _camera(g, jump), CALIBRATED, noise_px=0.05, views=4, seed=2)
-    return calibrate_views(views, image_size=MICROSCOPE.image_size, display_width_m=0.12, **options)
+    return calibrate_views(
+        views,
+        image_size=MICROSCOPE.image_size,
+        display_width_m=0.12,
+        options=CalibrationOptions(**options),
+    )
 
 
 def test_a_jump_is_suspected_and_said_but_not_applied():

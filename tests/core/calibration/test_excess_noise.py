@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -50,7 +50,11 @@ def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
         )
         for v in even
     ]
-    options = {"image_size": (512, 512), "display_width_m": 0.12, "residual": "off"}
+    options = {
+        "image_size": (512, 512),
+        "display_width_m": 0.12,
+        "options": CalibrationOptions(residual="off"),
+    }
     good, bad = (calibrate_views(v, **options) for v in (even, uneven))
     assert good.model.statistics["fit"]["excess_sigma_px"] == 0.0
     # Some thousand corners: known to a few percent.

@@ -7,13 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
 MAGNIFICATIONS = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
-OPTIONS = {"image_size": (512, 512), "display_width_m": 0.12, "residual": "off"}
+OPTIONS = {
+    "image_size": (512, 512),
+    "display_width_m": 0.12,
+    "options": CalibrationOptions(residual="off"),
+}
 
 
 def _views(name="jsm820", views=4, seed=0):

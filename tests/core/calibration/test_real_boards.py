@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import views_from_detections
 from tests.helpers.corner_boards import detected
@@ -66,7 +66,12 @@ def test_held_out_error_is_that_of_five_parameters(photographs, camera, residual
     views = _views(photographs[camera], 25e-3)
     for first in (0, 1):
         seen, judged = views[first::2], views[1 - first :: 2]
-        result = calibrate_views(seen, image_size=SIZE, display_width_m=0.48, residual=residual)
+        result = calibrate_views(
+            seen,
+            image_size=SIZE,
+            display_width_m=0.48,
+            options=CalibrationOptions(residual=residual),
+        )
         assert len(result.views) == len(seen)
         # Nothing is known of the heights of a photographed board.
         own = fit_poses(judged, result.model.at, height_sigma_m=1.0).rms_px()
@@ -80,7 +85,10 @@ def test_the_unit_of_length_does_not_matter(photographs, square_m):
         views = _views(photographs["left"], square)
         scale = square / 25e-3
         model = calibrate_views(
-            views, image_size=SIZE, display_width_m=0.48 * scale, residual="off"
+            views,
+            image_size=SIZE,
+            display_width_m=0.48 * scale,
+            options=CalibrationOptions(residual="off"),
         ).model
         camera = model.at(1.0)
         return camera.m / camera.rho

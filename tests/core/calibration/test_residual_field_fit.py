@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
@@ -41,7 +41,7 @@ def _calibrate(microscope, residual, magnifications=CALIBRATED, **changes):
         _views(microscope, magnifications, NOISE, **changes),
         image_size=microscope.image_size,
         display_width_m=microscope.display_width_m,
-        residual=residual,
+        options=CalibrationOptions(residual=residual),
     )
 
 
@@ -115,7 +115,7 @@ def _calibrate_without(microscope, g):
         views,
         image_size=microscope.image_size,
         display_width_m=microscope.display_width_m,
-        residual="on",
+        options=CalibrationOptions(residual="on"),
     )
 
 
@@ -151,9 +151,7 @@ def test_predicted_errors_are_as_large_as_the_errors():
 
 
 def test_modes_and_methods_are_checked():
-    views = _views(preset("jsm820"), [500.0, 1000.0, 2000.0], NOISE, views=3)
-    options = {"image_size": (512, 512), "display_width_m": 0.12}
     with pytest.raises(InvalidValueError, match="residual"):
-        calibrate_views(views, residual="maybe", **options)
+        CalibrationOptions(residual="maybe")
     with pytest.raises(InvalidValueError, match='method "joint"'):
-        calibrate_views(views, method="discrete", residual="on", **options)
+        CalibrationOptions(method="discrete", residual="on")

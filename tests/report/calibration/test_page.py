@@ -12,7 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.core.calibration.calibrate import (
+    CalibrationOptions,
+    CalibrationResult,
+    calibrate_views,
+)
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
@@ -167,7 +171,10 @@ def test_single_magnification_without_the_optional_parts(tmp_path: Path) -> None
     rng = np.random.default_rng(3)
     views = [grid_view(800.0, t, a, rng) for t, a in ((3.0, 0.0), (25.0, 70.0), (30.0, 190.0))]
     one = calibrate_views(
-        views, image_size=(SIZE, SIZE), display_width_m=DISPLAY_M, method="discrete"
+        views,
+        image_size=(SIZE, SIZE),
+        display_width_m=DISPLAY_M,
+        options=CalibrationOptions("discrete"),
     )
     one = replace(one, warnings=("fewer than 3 views at magnification 800",))
     parsed = Page(write_calibration_report(one, tmp_path / "r.html").read_text(encoding="utf-8"))
