@@ -130,7 +130,9 @@ def tracking(sizes: tuple[int, ...], frames: int) -> None:
 
         def update(images=images, camera=camera, tracker=tracker, stamps=stamps, seen=statuses):
             k = next(stamps)
-            seen.append(tracker.update(images[k % len(images)], 0.1 * k, camera, timing).status)
+            seen.append(
+                tracker.update(images[k % len(images)], 0.1 * k, camera, timing).status_text
+            )
 
         def phase(images=images):
             phase_correlate_pictures(images[0], images[1])

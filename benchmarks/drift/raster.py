@@ -132,7 +132,7 @@ def raster_residual(
             detector=detector or Detector(),
         )
         update = tracker.update(image, start_s, camera, timing)
-        statuses.append(update.status)
+        statuses.append(update.status_text)
         truth = (camera, timing, drift, start_s, zero_m)
         corrected.append(field_residual_px(*truth, update.raster))
         shifted.append(field_residual_px(*truth, RasterDrift(update.drift_m, np.zeros(2))))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.table import show
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.estimates import DriftStatus
 from semcal_ros.core.drift.tracker import DriftTracker
 
 SIZE, SCENE = 128, 512
@@ -72,7 +73,7 @@ def main() -> None:
         update = tracker.update(image, INTERVAL_S * k)
         errors[k] = update.drift_px - truth
         sigmas[k] = np.sqrt(np.diag(update.covariance)[:2])
-        keyframes += update.status == "keyframe"
+        keyframes += update.status is DriftStatus.KEYFRAME
         refused += not update.accepted
         if k == min(WARM, frames - 1):
             warm = memory_mb()

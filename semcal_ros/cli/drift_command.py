@@ -103,7 +103,7 @@ def command(
         click.echo(rate_text(path))
     if forecast is not None:
         then_s = float(path.time_s[-1]) + forecast
-        click.echo(forecast_text(follower.tracker.outlook().at(then_s), forecast))
+        click.echo(forecast_text(follower.tracker.predictor().at(then_s), forecast))
     click.echo(f"drift: {output}")
     if plot is not None:
         click.echo(f"plot: {plot}")
@@ -137,7 +137,7 @@ def _followed(
 def _rows(stamps_ns: Sequence[int], path: DriftPath) -> list[tuple[object, ...]]:
     sigma_m = path.sigma_m
     return [
-        (stamp_ns, *path.drift_m[k], *sigma_m[k], *path.drift_px[k], path.status[k])
+        (stamp_ns, *path.drift_m[k], *sigma_m[k], *path.drift_px[k], path[k].status_text)
         for k, stamp_ns in enumerate(stamps_ns)
     ]
 

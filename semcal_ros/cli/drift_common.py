@@ -9,7 +9,7 @@ import numpy as np
 
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.estimates import DriftForecast, DriftPath
+from semcal_ros.core.drift.estimates import DriftEstimate, DriftPath
 
 __all__ = [
     "echo_nominal_unit",
@@ -54,7 +54,7 @@ def rate_text(path: DriftPath) -> str:
     return f"final drift rate: x {parts[0]}, y {parts[1]} nm/s"
 
 
-def forecast_text(forecast: DriftForecast, after_s: float) -> str:
+def forecast_text(forecast: DriftEstimate, after_s: float) -> str:
     """A forecast with its 1-sigma in nm."""
     parts = _lengths(forecast.drift_m, np.sqrt(np.diag(forecast.covariance)[:2]))
     return f"drift {after_s:g} s after the last frame: x {parts[0]}, y {parts[1]} nm"

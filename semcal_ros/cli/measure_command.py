@@ -311,7 +311,7 @@ def _rows(shots: list[_Shots], series: list[Series], poses: int | None) -> list[
                     *(float(v) for v in frame.tip_px),
                     float(frame.bending.rms_m),
                     int(np.count_nonzero(frame.bending.used)),
-                    measured.drift.status[k],
+                    measured.drift[k].status_text,
                 )
             )
     return rows

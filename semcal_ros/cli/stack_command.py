@@ -189,7 +189,7 @@ def _usable(survey: Survey) -> Mask:
     usable = survey.path.trusted
     if not usable.any():
         raise BagError(
-            f"{len(usable)} frames and none with a known drift, the first: {survey.path.status[0]}",
+            f"{len(usable)} frames and none with a known drift, the first: {survey.path[0].status_text}",
             expected="a specimen with structure",
             do="look at `semcal drift`, or average the frames where they are with --no-drift",
         )
@@ -210,7 +210,7 @@ def _add_frames(
             number = number_of.get(index)
             if number is None or (film is None and not usable[number]):
                 continue
-            drift = None if survey.path is None else survey.path.raster(number)
+            drift = None if survey.path is None else survey.path[number].raster
             grey = to_gray(frame.image, frame.encoding)
             camera, scan = survey.job.camera(frame), survey.job.microscope.scan
             picture, valid = stack.rectified(grey, camera, drift, scan)

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from semcal_ros.core.arrays import Array, Indices, Mask
-from semcal_ros.core.drift.estimates import DriftPath, kind_of
+from semcal_ros.core.drift.estimates import DriftPath, DriftStatus, omit_numbers
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.style import (
@@ -127,10 +127,7 @@ def plot_drift(path: DriftPath, title: str = "") -> Figure:
 
 def _group_rejections(path: DriftPath) -> list[_Kind]:
     """Frames that were not used, by the reason without its numbers, the most frequent first."""
-    texts = [
-        "" if good else kind_of(status.removeprefix("coasting: "))
-        for good, status in zip(path.accepted, path.status, strict=True)
-    ]
+    texts = [omit_numbers(update.reason) for update in path.updates]
     counts = Counter(t for t in texts if t).most_common()
     last = len(_MARKS) - 1
     groups = [(text, {text}) for text, _ in counts]
@@ -241,7 +238,7 @@ def _mark_end(
 def _draw_key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
     """What the marks mean, with the number of frames of each kind."""
     axes.set_axis_off()
-    keyframes = sum(status == "keyframe" for status in path.status)
+    keyframes = sum(u.status is DriftStatus.KEYFRAME for u in path.updates)
     used = int(path.accepted.sum())
     tracked = f"{used} of {len(path)} frames tracked, {keyframes} of them as keyframe"
     entries = [("o", "#2a788e", tracked)]

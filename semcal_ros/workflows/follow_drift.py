@@ -12,8 +12,12 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
-from semcal_ros.core.drift.frame_time import LEFT_IN, REMOVED, estimate_frame_time
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
+from semcal_ros.core.drift.frame_time import (
+    SHEAR_OF_SHIFT_DISTORTED,
+    SHEAR_OF_SHIFT_RECTIFIED,
+    estimate_frame_time,
+)
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.files.recordings import RecordedFrame
@@ -98,7 +102,7 @@ class Follower:
             What was known at each frame when it came, without hindsight.
         """
         if live or self.history is None:
-            return path_of_updates(self.updates)
+            return DriftPath(tuple(self.updates))
         if self._smoothed is None or len(self._smoothed) != len(self.updates):
             self._smoothed = self.history.smooth()
         return self._smoothed
@@ -127,8 +131,8 @@ def timing_seen(
     if config.scan is not None or len(follower.updates) < 2:
         return config, ""
     path = follower.path(live=False)
-    shear_of_shift = LEFT_IN if model is None else REMOVED
-    found = estimate_frame_time(path, follower.updates, shear_of_shift=shear_of_shift)
+    shear_of_shift = SHEAR_OF_SHIFT_DISTORTED if model is None else SHEAR_OF_SHIFT_RECTIFIED
+    found = estimate_frame_time(path, shear_of_shift=shear_of_shift)
     if found.observable:
         seen = _with_sigma(found.frame_time_s, found.sigma_s)
         note = f"the configuration has no scan; the frames are sheared as if one pass took {seen} s"

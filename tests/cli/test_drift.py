@@ -23,6 +23,7 @@ from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.files.bags.reader import BagWriter, blank_message, open_bag
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
+from tests.helpers.drift_scenes import make_drift_update
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
 
@@ -118,22 +119,16 @@ def test_a_forecast_holds_the_drift_to_come(gold, tmp_path, capsys):
 
 
 def test_the_rate_is_given_with_two_digits_of_its_uncertainty():
-    covariance = np.zeros((2, 4, 4))
-    covariance[:, [2, 3], [2, 3]] = [(0.123e-9) ** 2, (4.56e-9) ** 2]
-    two, velocity = np.zeros((2, 2)), np.array([[0.0, 0.0], [1.23456e-9, -20e-9]])
+    variances = [0.0, 0.0, (0.123e-9) ** 2, (4.56e-9) ** 2]
     path = DriftPath(
-        time_s=np.arange(2.0),
-        drift_m=two,
-        velocity_m_s=velocity,
-        acceleration_m_s2=two,
-        covariance=covariance,
-        drift_px=two,
-        sigma_px=two,
-        residual=two[0],
-        status=("", ""),
-        accepted=two[0] == 0,
-        restarted=two[0] != 0,
-        calibrated=True,
+        [
+            make_drift_update(time_s=0.0),
+            make_drift_update(
+                time_s=1.0,
+                velocity_m_s=np.array([1.23456e-9, -20e-9]),
+                covariance=np.diag(variances),
+            ),
+        ]
     )
     assert rate_text(path) == "final drift rate: x 1.23 +- 0.12, y -20.00 +- 4.56 nm/s"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.estimates import DriftStatus, DriftUpdate
 
 
 class Texture:
@@ -85,6 +88,29 @@ def small_camera(magnification: float, size: int = 192) -> ScanCamera:
         width=size,
         height=size,
     )
+
+
+def make_drift_update(**values: Any) -> DriftUpdate:
+    """A tracked frame without drift; ``values`` replace its own."""
+    usual: dict[str, Any] = {
+        "time_s": 0.0,
+        "drift_m": np.zeros(2),
+        "velocity_m_s": np.zeros(2),
+        "acceleration_m_s2": np.zeros(2),
+        "covariance": np.zeros((4, 4)),
+        "status": DriftStatus.TRACKED,
+        "rejection": None,
+        "residual": 5.0,
+        "px_from_unit": np.eye(2),
+        "overlap": 0.7,
+        "calibrated": True,
+        "restarted": False,
+        "shear_px": np.full(2, np.nan),
+        "shear_covariance": np.full((2, 2), np.inf),
+        "keyframe_time_s": float("nan"),
+        "merged": False,
+    }
+    return DriftUpdate(**usual | values)
 
 
 class DriftingSpecimen:

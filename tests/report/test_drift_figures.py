@@ -14,9 +14,11 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from semcal_ros.core.drift.estimates import DriftPath
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.drift.estimates import DriftPath, DriftStatus
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.report.drift_figures import plot_drift, write_drift_figure
+from tests.helpers.drift_scenes import make_drift_update
 
 REASONS = (
     "image: blank picture (all pixels at 20)",
@@ -35,25 +37,26 @@ def sample(
     t = np.linspace(0.0, 1.0, frames)
     drift = size_m * np.stack([t, 0.3 * np.sin(5.0 * t) - t], axis=1)
     sigma = np.linspace(0.0, 0.02 * size_m, frames)
-    status = ["keyframe"] + ["tracked"] * (frames - 1)
+    velocity = np.gradient(drift, interval_s, axis=0) if frames > 1 else np.zeros((1, 2))
+    updates = [
+        make_drift_update(
+            time_s=50.0 + interval_s * k,
+            drift_m=drift[k],
+            velocity_m_s=velocity[k],
+            covariance=sigma[k] ** 2 * np.diag([1.0, 4.0, 0.01, 0.01]),
+            status=DriftStatus.TRACKED if k else DriftStatus.KEYFRAME,
+            px_from_unit=np.eye(2) / 40e-9,
+        )
+        for k in range(frames)
+    ]
     for k, reason in enumerate(reasons):
-        status[4 + 3 * k] = f"coasting: {reason}"
-    accepted = np.array([not s.startswith("coasting") for s in status])
-    covariance = np.einsum("n,ij->nij", sigma**2, np.diag([1.0, 4.0, 0.01, 0.01]))
-    return DriftPath(
-        time_s=50.0 + interval_s * np.arange(frames),
-        drift_m=drift,
-        velocity_m_s=np.gradient(drift, interval_s, axis=0) if frames > 1 else np.zeros((1, 2)),
-        acceleration_m_s2=np.zeros((frames, 2)),
-        covariance=covariance,
-        drift_px=drift / 40e-9,
-        sigma_px=np.stack([sigma, sigma], axis=1) / 40e-9,
-        residual=np.where(accepted, 5.0, np.nan),
-        status=tuple(status),
-        accepted=accepted,
-        restarted=np.zeros(frames, dtype=bool),
-        calibrated=True,
-    )
+        updates[4 + 3 * k] = replace(
+            updates[4 + 3 * k],
+            status=DriftStatus.COASTING,
+            rejection=Rejection(MatchFailure.AMBIGUOUS, reason),
+            residual=float("nan"),
+        )
+    return DriftPath(updates)
 
 
 def axes_of(figure: Figure, label: str) -> Axes:
@@ -99,9 +102,9 @@ def test_bands_hold_95_percent():
 
 def test_a_band_that_explodes_does_not_flatten_the_curve():
     path = sample(reasons=REASONS[:2])
-    covariance = path.covariance.copy()
-    covariance[4] = np.diag([1.0, 1.0, 1.0, 1.0])  # a metre: nothing is known
-    axes = axes_of(plot_drift(replace(path, covariance=covariance)), "drift (nm)")
+    updates = list(path.updates)
+    updates[4] = replace(updates[4], covariance=np.eye(4))  # a metre: nothing is known
+    axes = axes_of(plot_drift(DriftPath(updates)), "drift (nm)")
     assert np.ptp(axes.get_ylim()) < 3 * 1e9 * np.ptp(path.drift_m)
 
 
@@ -121,7 +124,8 @@ def test_long_recordings_are_told_in_minutes_or_hours(interval_s, unit):
 
 
 def test_pixels_where_there_is_no_camera():
-    figure = plot_drift(replace(sample(size_m=3.0), calibrated=False))
+    path = sample(size_m=3.0)
+    figure = plot_drift(DriftPath([replace(u, calibrated=False) for u in path.updates]))
     assert axes_of(figure, "drift (px)")
     assert axes_of(figure, "drift rate (px/s)")
 
@@ -198,11 +202,5 @@ def test_files_of_each_kind(tmp_path: Path, suffix, start):
 
 
 def test_an_empty_path_is_refused():
-    path = sample(3)
-    none = {
-        name: getattr(path, name)[:0]
-        for name in ("time_s", "drift_m", "velocity_m_s", "covariance", "drift_px", "sigma_px")
-    }
-    empty = replace(path, **none, residual=path.residual[:0], status=(), accepted=path.accepted[:0])
     with pytest.raises(InvalidValueError, match="without frames"):
-        plot_drift(empty)
+        plot_drift(DriftPath([]))

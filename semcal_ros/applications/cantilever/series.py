@@ -264,7 +264,7 @@ class _Work:
 
     def view(self, axis: Axis, frame: int) -> PixelSamples:
         """Pixels in coordinates of the axis, freed of drift, and their grey levels."""
-        x, y = self._plane.specimen(self._pixels, self._path.raster(frame))
+        x, y = self._plane.specimen(self._pixels, self._path[frame].raster)
         grey = self._images[frame].ravel()[self._pixels].astype(np.float64)
         return (*axis.coordinates(x, y), grey)
 

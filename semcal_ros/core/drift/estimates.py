@@ -1,10 +1,12 @@
-"""Settings and results of the live drift tracker."""
+"""Settings and results of drift tracking."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -12,28 +14,29 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.process_noise import ProcessNoise
-from semcal_ros.core.drift.state import MOVING, DriftState
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.drift.state import MOTION_SIZE, DriftState
+from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import RegistrationSettings
 
 __all__ = [
-    "DriftForecast",
+    "DriftEstimate",
     "DriftPath",
     "DriftPredictor",
     "DriftSettings",
+    "DriftStatus",
     "DriftUpdate",
-    "kind_of",
-    "path_of_updates",
+    "omit_numbers",
 ]
 
 
 _NUMBER = re.compile(r"-?\d[\d.]*")
 
 
-def kind_of(status: str) -> str:
-    """A status without the numbers of the single frame, so that frames can be counted by kind."""
-    return _NUMBER.sub("\u2026", status)
+def omit_numbers(text: str) -> str:
+    """A text with dots in the place of its numbers, so that frames can be counted by reason."""
+    return _NUMBER.sub("\u2026", text)
 
 
 @dataclass(frozen=True)
@@ -47,23 +50,23 @@ class DriftSettings:
     rekey_overlap
         The keyframe is replaced when less than this fraction of the picture still overlaps with it.
     max_jump
-        A shift between frames beyond this fraction of the field is taken for a move of the stage,
-        not for drift.
+        A shift between frames beyond this fraction of the field is a move of the stage, not
+        drift.
     first_step_px
         Expected drift (1-sigma) between the first two frames, px.
     max_ratio
         Largest change of magnification across which the keyframe is carried by resampling.
     lost_after
-        Number of consecutive frames that cannot be matched after which tracking starts anew at the
+        Number of frames in a row that cannot be matched after which tracking starts again at the
         predicted drift.
     acceleration_psd
         Process noise, m^2/s^3 (px^2/s^3 without a camera); None adapts it to the stream.
     average
         Whether frames are added to their keyframe, so that its noise does not limit what follows.
     max_keyframes, max_keyframe_bytes
-        How many pictures are kept to come back to, and their memory.
+        Number of pictures that are kept to come back to, and their memory.
     interpolation
-        Of the rectification before registration.
+        Interpolation of the rectification before registration.
     """
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
@@ -93,24 +96,57 @@ class DriftSettings:
                 raise InvalidValueError(f"{name} = {getattr(self, name)}", expected=expected)
 
 
+class DriftStatus(Enum):
+    """What the drift at a frame rests on."""
+
+    #: The frame itself, which became a keyframe.
+    KEYFRAME = "keyframe"
+    #: The frame, registered against a keyframe.
+    TRACKED = "tracked"
+    #: The prediction: the frame was not used.
+    COASTING = "coasting"
+
+
 @dataclass(frozen=True)
-class DriftUpdate:
-    """Drift at one frame.
+class DriftEstimate:
+    """Drift at one time.
 
     Attributes
     ----------
     time_s
-        Centre of the frame's acquisition.
+        The time, s.
     drift_m, velocity_m_s, acceleration_m_s2
         (2,) drift since the first frame in the sem frame, its rate, and the rate of that. In px,
-        px/s and px/s^2 of the raw image where ``calibrated`` is false.
+        px/s and px/s^2 of the raw image where there is no camera.
     covariance
         (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all pictures on the way and
-        from what the camera's own covariance leaves open of the scale.
+        from the covariance of the camera's scale.
+    """
+
+    time_s: float
+    drift_m: Array
+    velocity_m_s: Array
+    acceleration_m_s2: Array
+    covariance: Array
+
+    @property
+    def raster(self) -> RasterDrift:
+        """The drift during a frame whose centre is at that time, for a
+        :class:`~semcal_ros.core.rectification.rectifier.Rectifier`.
+        """
+        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
+
+
+@dataclass(frozen=True)
+class DriftUpdate(DriftEstimate):
+    """Drift at the centre of a frame's acquisition.
+
+    Attributes
+    ----------
     status
-        ``"keyframe"``, ``"tracked"`` or ``"coasting: <reason>"``.
-    accepted, reason
-        Whether the drift rests on this frame's own picture; why not.
+        What the drift rests on.
+    rejection
+        Why the frame's own picture was not used; None where it was.
     residual
         RMS grey levels that the shift does not explain; NaN where nothing was registered.
     px_from_unit
@@ -123,23 +159,17 @@ class DriftUpdate:
         Whether tracking went on from here at a drift that was only predicted: the frames from here
         on are consistent with each other, but may show another place than those before.
     shear_px, shear_covariance
-        (2,) by how much more the last row is shifted against the keyframe than the first, what
-        was known of it taken out before, and its (2, 2) covariance; NaN and infinite where it was
-        not measured.
+        (2,) by how much more the last row is shifted against the keyframe than the first, after the
+        known motion was removed, and its (2, 2) covariance; NaN and infinite where it was not
+        measured.
     keyframe_time_s
         Time of the keyframe that the frame was compared with; NaN where there was none.
-    joined
+    merged
         Whether the frame became part of that keyframe's mean.
     """
 
-    time_s: float
-    drift_m: Array
-    velocity_m_s: Array
-    acceleration_m_s2: Array
-    covariance: Array
-    status: str
-    accepted: bool
-    reason: str
+    status: DriftStatus
+    rejection: Rejection[MatchFailure] | None
     residual: float
     px_from_unit: Array
     overlap: float
@@ -148,12 +178,27 @@ class DriftUpdate:
     shear_px: Array
     shear_covariance: Array
     keyframe_time_s: float
-    joined: bool
+    merged: bool
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the drift rests on this frame's own picture."""
+        return self.rejection is None
+
+    @property
+    def reason(self) -> str:
+        """Why it does not; empty where it does."""
+        return "" if self.rejection is None else self.rejection.reason
+
+    @property
+    def status_text(self) -> str:
+        """``"keyframe"``, ``"tracked"`` or ``"coasting: <reason>"``."""
+        return f"{self.status.value}: {self.reason}" if self.reason else self.status.value
 
     @property
     def kind(self) -> str:
-        """The status without its numbers."""
-        return kind_of(self.status)
+        """The status without the numbers of the single frame."""
+        return omit_numbers(self.status_text)
 
     @property
     def units(self) -> str:
@@ -163,56 +208,25 @@ class DriftUpdate:
     @property
     def drift_px(self) -> Array:
         """(2,) drift in ideal pixels of this frame."""
-        return np.asarray(self.px_from_unit @ self.drift_m)
-
-    @property
-    def raster(self) -> RasterDrift:
-        """The drift during this frame, as :class:`~semcal_ros.core.rectification.rectifier.Rectifier` wants it."""
-        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
-
-
-@dataclass(frozen=True)
-class DriftForecast:
-    """Drift at another time, from what is known now.
-
-    Attributes
-    ----------
-    time_s
-        Time of the forecast.
-    drift_m, velocity_m_s, acceleration_m_s2
-        (2,) as in :class:`~semcal_ros.core.drift.estimates.DriftUpdate`.
-    covariance
-        (4, 4) of ``[x, y, vx, vy]``.
-    """
-
-    time_s: float
-    drift_m: Array
-    velocity_m_s: Array
-    acceleration_m_s2: Array
-    covariance: Array
-
-    @property
-    def raster(self) -> RasterDrift:
-        """The drift during a frame at that time, for a rectifier."""
-        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
+        return self.px_from_unit @ self.drift_m
 
 
 @dataclass(frozen=True)
 class DriftPredictor:
-    """All that a forecast needs; it never changes, so that another thread may hold it.
+    """All that a prediction needs. It never changes, so that another thread may hold it.
 
     Attributes
     ----------
     state
         The drift at the last frame.
-    restlessness
-        How much it is expected to change.
+    process_noise
+        Process noise of the drift.
     camera
         Camera of the last frame, or None for drift in px.
     """
 
     state: DriftState
-    restlessness: ProcessNoise
+    process_noise: ProcessNoise
     camera: ScanCamera | None
 
     @property
@@ -220,7 +234,7 @@ class DriftPredictor:
         """Centre of the acquisition of the last frame."""
         return self.state.time_s
 
-    def at(self, time_s: float) -> DriftForecast:
+    def at(self, time_s: float) -> DriftEstimate:
         """Drift at a time.
 
         Raises
@@ -232,16 +246,16 @@ class DriftPredictor:
             raise InvalidValueError(
                 f"a forecast for {time_s} s", expected=f"a time after {self.time_s} s"
             )
-        move, noise = self.restlessness.over(time_s - self.time_s)
-        # As Move does it, without what only a tracker needs: this is worked out for every frame.
-        motion = move @ self.state.mean[:MOVING].reshape(3, 2)
-        both = np.zeros((4, MOVING))
-        both[0::2, 0::2] = both[1::2, 1::2] = move[:2]
-        covariance = both @ self.state.covariance[:MOVING, :MOVING] @ both.T
+        transition, noise = self.process_noise.discretise(time_s - self.time_s)
+        # As Predict does it, without the keyframes: this is computed for every frame.
+        motion = transition @ self.state.mean[:MOTION_SIZE].reshape(3, 2)
+        both = np.zeros((4, MOTION_SIZE))
+        both[0::2, 0::2] = both[1::2, 1::2] = transition[:2]
+        covariance = both @ self.state.covariance[:MOTION_SIZE, :MOTION_SIZE] @ both.T
         covariance[0::2, 0::2] += noise[:2, :2]
         covariance[1::2, 1::2] += noise[:2, :2]
         covariance += scale_covariance(self.camera, motion[0], motion[1])
-        return DriftForecast(time_s, motion[0], motion[1], motion[2], covariance)
+        return DriftEstimate(time_s, motion[0], motion[1], motion[2], covariance)
 
 
 @dataclass(frozen=True)
@@ -250,81 +264,74 @@ class DriftPath:
 
     Attributes
     ----------
-    time_s
-        (n,) centres of the acquisitions.
-    drift_m, velocity_m_s, acceleration_m_s2
-        (n, 2) drift since the first frame in the sem frame, its rate, and the rate of that; px,
-        px/s and px/s^2 where ``calibrated`` is false.
-    covariance
-        (n, 4, 4) of ``[x, y, vx, vy]``.
-    drift_px
-        (n, 2) drift in ideal pixels of each frame.
-    sigma_px
-        (n, 2) 1-sigma of ``drift_px``.
-    residual
-        (n,) RMS grey levels that the shift does not explain; NaN where nothing was registered.
-    status
-        n texts as in :class:`~semcal_ros.core.drift.estimates.DriftUpdate`.
-    accepted
-        (n,) bool: whether the drift rests on the frame's own picture.
-    restarted
-        (n,) bool: whether tracking went on from the frame at a drift that was only predicted.
-    calibrated
-        False where no camera was given.
+    updates
+        The n frames, live or with hindsight. The properties are their columns.
     """
 
-    time_s: Array
-    drift_m: Array
-    velocity_m_s: Array
-    acceleration_m_s2: Array
-    covariance: Array
-    drift_px: Array
-    sigma_px: Array
-    residual: Array
-    status: tuple[str, ...]
-    accepted: Mask
-    restarted: Mask
-    calibrated: bool
+    updates: Sequence[DriftUpdate]
 
     def __len__(self) -> int:
-        return len(self.status)
+        return len(self.updates)
+
+    def __getitem__(self, index: int) -> DriftUpdate:
+        return self.updates[index]
+
+    @cached_property
+    def time_s(self) -> Array:
+        """(n,) centres of the acquisitions."""
+        return np.array([u.time_s for u in self.updates])
+
+    @cached_property
+    def drift_m(self) -> Array:
+        """(n, 2) drift since the first frame; px where not ``calibrated``."""
+        return np.array([u.drift_m for u in self.updates]).reshape(-1, 2)
+
+    @cached_property
+    def velocity_m_s(self) -> Array:
+        """(n, 2) its rate."""
+        return np.array([u.velocity_m_s for u in self.updates]).reshape(-1, 2)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(n, 4, 4) of ``[x, y, vx, vy]``."""
+        return np.array([u.covariance for u in self.updates]).reshape(-1, 4, 4)
+
+    @cached_property
+    def drift_px(self) -> Array:
+        """(n, 2) drift in ideal pixels of each frame."""
+        return np.array([u.drift_px for u in self.updates]).reshape(-1, 2)
+
+    @cached_property
+    def residual(self) -> Array:
+        """(n,) RMS grey levels that the shift does not explain; NaN where nothing was registered."""
+        return np.array([u.residual for u in self.updates])
+
+    @cached_property
+    def accepted(self) -> Mask:
+        """(n,) bool: whether the drift rests on the frame's own picture."""
+        return np.array([u.accepted for u in self.updates], dtype=bool)
+
+    @cached_property
+    def restarted(self) -> Mask:
+        """(n,) bool: whether tracking went on from the frame at a drift that was only predicted."""
+        return np.array([u.restarted for u in self.updates], dtype=bool)
+
+    @property
+    def calibrated(self) -> bool:
+        """False where no camera was given."""
+        return all(u.calibrated for u in self.updates)
 
     @property
     def trusted(self) -> Mask:
         """(n,) bool: accepted, and tracked all the way back to the first frame."""
-        return np.asarray(self.accepted & ~np.logical_or.accumulate(self.restarted))
+        return self.accepted & ~np.logical_or.accumulate(self.restarted)
 
     @property
     def sigma_m(self) -> Array:
         """(n, 2) 1-sigma of ``drift_m``."""
-        return np.asarray(np.sqrt(self.covariance[:, [0, 1], [0, 1]]))
+        return np.sqrt(self.covariance[:, [0, 1], [0, 1]])
 
     @property
     def velocity_sigma_m_s(self) -> Array:
         """(n, 2) 1-sigma of ``velocity_m_s``."""
-        return np.asarray(np.sqrt(self.covariance[:, [2, 3], [2, 3]]))
-
-    def raster(self, index: int) -> RasterDrift:
-        """The drift during one frame, as :class:`~semcal_ros.core.rectification.rectifier.Rectifier` wants it."""
-        found = (self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
-        return RasterDrift(*(values[index] for values in found))
-
-
-def path_of_updates(updates: Sequence[DriftUpdate]) -> DriftPath:
-    """What was known live, frame by frame."""
-    covariance = np.array([u.covariance for u in updates]).reshape(-1, 4, 4)
-    px_covariance = [u.px_from_unit @ u.covariance[:2, :2] @ u.px_from_unit.T for u in updates]
-    return DriftPath(
-        time_s=np.array([u.time_s for u in updates]),
-        drift_m=np.array([u.drift_m for u in updates]).reshape(-1, 2),
-        velocity_m_s=np.array([u.velocity_m_s for u in updates]).reshape(-1, 2),
-        acceleration_m_s2=np.array([u.acceleration_m_s2 for u in updates]).reshape(-1, 2),
-        covariance=covariance,
-        drift_px=np.array([u.drift_px for u in updates]).reshape(-1, 2),
-        sigma_px=np.sqrt([np.diag(c) for c in px_covariance]).reshape(-1, 2),
-        residual=np.array([u.residual for u in updates]),
-        status=tuple(u.status for u in updates),
-        accepted=np.array([u.accepted for u in updates], dtype=bool),
-        restarted=np.array([u.restarted for u in updates], dtype=bool),
-        calibrated=all(u.calibrated for u in updates),
-    )
+        return np.sqrt(self.covariance[:, [2, 3], [2, 3]])

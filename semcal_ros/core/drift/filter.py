@@ -1,4 +1,4 @@
-"""The drift map while it is being made: what happened, and how restless the drift is."""
+"""The Kalman filter of the drift, its history of events, and the adaptation of its process noise."""
 
 from __future__ import annotations
 
@@ -15,24 +15,27 @@ from semcal_ros.core.drift.state import DriftState
 __all__ = ["DriftFilter"]
 
 
-# Part of the way that the process noise goes with each innovation.
-_PACE = 0.2
-_LARGEST_NIS = 6.0
+# Logarithm by which the process noise changes with an innovation of one unit of excess: some five
+# frames are averaged.
+_ADAPTATION = 0.2
+# A normalised innovation squared (2 on average) counts as at most three times as large as it should
+# be, so that a single outlier raises the process noise by no more than 1.5.
+_MAX_NIS = 6.0
 # Process noise that moves the drift by less than this part of a measurement's sigma between two
-# frames is as good as none.
-_LEAST_MOTION = 0.02
-# Frames in which an acceleration is taken to fade: a longer memory follows a smooth drift more
-# closely and overshoots when a rough one turns.
-_MEMORY = 1.0
-# Numbers of measurements after which the restlessness is estimated anew from all of them.
-_LEARNT = (4, 8, 16)
+# frames has no effect.
+_MIN_MOTION = 0.02
+# Frame intervals in which an acceleration decays: with a longer time constant the filter follows a
+# smooth drift more closely, and overshoots when a rough one turns.
+_TIME_CONSTANT = 1.0
+# Numbers of measurements after which the process noise is estimated again from all of them.
+_ESTIMATE_AFTER = (4, 8, 16)
 
 
 @dataclass
-class _Pending:
-    """A keyframe whose own noise is known only when something is registered against it."""
+class _PendingKeyframe:
+    """A keyframe whose own noise is known only when something has been registered against it."""
 
-    settle: AddKeyframe
+    operation: AddKeyframe
     index: int
     before: DriftState
 
@@ -47,101 +50,109 @@ class DriftFilter:
     acceleration_psd
         Process noise, length^2 / s^3; None estimates it from the innovations.
     history
-        Whether to keep what happened for good.
+        Whether to keep all events, for a smoother.
     """
 
     def __init__(self, start: DriftState, acceleration_psd: float | None, history: bool) -> None:
         self.start = start
         self.state = start
         self.events: list[Event] = []
-        self.restlessness = ProcessNoise(acceleration_psd or 0.0)
+        self.process_noise = ProcessNoise(acceleration_psd or 0.0)
         self.measured = 0
         self._adapts = acceleration_psd is None
         self._history = history
-        self._pending: _Pending | None = None
+        self._pending: _PendingKeyframe | None = None
 
     @property
     def pending(self) -> int | None:
         """The keyframe that nothing was registered against yet."""
-        return None if self._pending is None else self._pending.settle.key
+        return None if self._pending is None else self._pending.operation.key
 
-    def do(self, operation: Operation) -> None:
-        """Something happens to the state."""
-        self.state = operation(self.state, self.restlessness)
+    def apply(self, operation: Operation) -> None:
+        """Apply an operation to the state."""
+        self.state = operation(self.state, self.process_noise)
         self.events.append(operation)
 
-    def mark(self) -> None:
-        """The state of now is that of a frame."""
+    def mark_frame(self) -> None:
+        """Note that the present state is that of a frame."""
         if self._history:
             self.events.append(Mark())
-        elif self._pending is None and self.measured >= _LEARNT[-1]:
+        elif self._pending is None and self.measured >= _ESTIMATE_AFTER[-1]:
             self.events.clear()
 
-    def settle_later(self, key: int, removed: Array, bow: float) -> None:
-        """The frame of now becomes a keyframe that was not measured; its noise is told later.
+    def add_keyframe(self, key: int, removed: Array, acceleration_term_s2: float) -> None:
+        """Make the present frame a keyframe that was not measured; :meth:`set_keyframe_noise` tells
+        its noise later.
 
         The arguments are those of :class:`~semcal_ros.core.drift.operations.AddKeyframe`.
         """
-        settle = AddKeyframe(key, removed, bow, np.zeros((4, 4)), 0.0)
-        self._pending = _Pending(settle, len(self.events), self.state)
-        self.do(settle)
+        operation = AddKeyframe(key, removed, acceleration_term_s2, np.zeros((4, 4)), 0.0)
+        self._pending = _PendingKeyframe(operation, len(self.events), self.state)
+        self.apply(operation)
 
-    def first_velocity(self, sigma: float, psd: float, interval_s: float) -> None:
-        """Prior of the velocity, and of how restless the drift is; the keyframe of the first frame
-        was taken at that velocity, too.
+    def set_motion_prior(self, sigma: float, psd: float, interval_s: float) -> None:
+        """Set the prior of the velocity, and of the process noise unless that was given; the
+        keyframe of the first frame was taken at that velocity, too.
         """
         pending = self._pending
         assert pending is not None
-        given = self.restlessness.psd
-        self.restlessness = ProcessNoise(psd if self._adapts else given, _MEMORY * interval_s)
-        variances = [0.0, sigma**2, self.restlessness.acceleration_variance]
-        widened = Inflate(np.diag(np.repeat(variances, 2)))
-        self.events.insert(pending.index, widened)
+        given = self.process_noise.psd
+        self.process_noise = ProcessNoise(
+            psd if self._adapts else given, _TIME_CONSTANT * interval_s
+        )
+        variances = [0.0, sigma**2, self.process_noise.acceleration_variance]
+        prior = Inflate(np.diag(np.repeat(variances, 2)))
+        self.events.insert(pending.index, prior)
         pending.index += 1
-        pending.before = widened(pending.before, self.restlessness)
-        self._again()
+        pending.before = prior(pending.before, self.process_noise)
+        self._replay_since(pending)
 
-    def settle(self, noise: Array, scan_s: float) -> None:
-        """The noise (4, 4) of the keyframe that was pending, and the time it took."""
+    def set_keyframe_noise(self, noise: Array, scan_s: float) -> None:
+        """Set the noise (4, 4) of the pending keyframe, and the time that it took."""
         pending = self._pending
         if pending is not None:
-            self.events[pending.index] = replace(pending.settle, noise=noise, scan_s=scan_s)
-            self._again()
+            self.events[pending.index] = replace(pending.operation, noise=noise, scan_s=scan_s)
+            self._replay_since(pending)
 
-    def _again(self) -> None:
-        """The state since the pending keyframe; nothing but time has passed."""
-        pending = self._pending
-        assert pending is not None
+    def _replay_since(self, pending: _PendingKeyframe) -> None:
+        """Apply again what happened since the pending keyframe: nothing but time has passed."""
         state = pending.before
         for event in self.events[pending.index :]:
             if isinstance(event, Operation):
-                state = event(state, self.restlessness)
+                state = event(state, self.process_noise)
         self.state = state
 
-    def accept(self, measure: Measure) -> None:
-        """A measurement is used."""
-        self.state = measure(self.state, self.restlessness).state
+    def update(self, measure: Measure) -> None:
+        """Update the state by a measurement."""
+        self.state = measure(self.state, self.process_noise).state
         self.events.append(measure)
         self._pending = None
         self.measured += 1
-        if self._adapts and self.measured in _LEARNT and self.restlessness.psd > 0.0:
-            # The guess that all began with is worth less than what was seen since.
+        if self._adapts and self.measured in _ESTIMATE_AFTER and self.process_noise.psd > 0.0:
+            # The first guess is worth less than what was measured since.
             times = [event.time_s for event in self.events if isinstance(event, Predict)]
             interval_s = float(np.median(np.diff([self.start.time_s, *times])))
-            near = self.restlessness
+            near = self.process_noise
             if interval_s > 0.0:
-                near = replace(near, memory_s=_MEMORY * interval_s)
-            self.restlessness = estimate_process_noise(self.start, self.events, near, (1.0,))
-            self.state = replay(self.start, self.events, self.restlessness)
+                near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
+            self.process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
+            self.state = replay(self.start, self.events, self.process_noise)
 
-    def adapt(self, nis: float, noise: Array, dt_s: float) -> None:
-        """Nudge the process noise until innovations are as large as predicted (2 on average).
+    def adapt_process_noise(self, nis: float, noise: Array, dt_s: float) -> None:
+        """Change the process noise until innovations are as large as predicted.
 
-        ``noise`` (2, 2) is that of the measurement, ``dt_s`` the time since the one before.
+        Parameters
+        ----------
+        nis
+            Normalised innovation squared of the latest shift, 2 on average.
+        noise
+            (2, 2) covariance of the measurement.
+        dt_s
+            Time since the frame before.
         """
         if not self._adapts or self.measured <= 1 or not dt_s > 0.0:
             return
-        excess = float(np.clip(0.5 * nis, 0.0, _LARGEST_NIS)) - 1.0
-        least = 3.0 * _LEAST_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
-        psd = max(self.restlessness.psd * float(np.exp(_PACE * excess)), least)
-        self.restlessness = replace(self.restlessness, psd=psd)
+        excess = float(np.clip(0.5 * nis, 0.0, _MAX_NIS)) - 1.0
+        least = 3.0 * _MIN_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
+        psd = max(self.process_noise.psd * float(np.exp(_ADAPTATION * excess)), least)
+        self.process_noise = replace(self.process_noise, psd=psd)

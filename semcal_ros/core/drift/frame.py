@@ -1,13 +1,17 @@
-"""A frame as it came in, and as it would be if it had been scanned in an instant."""
+"""A frame as it was scanned, and corrected for what moved during the scan.
+
+A specimen that drifts while a frame is scanned line by line is sheared and stretched in it, as by
+the rolling shutter of a camera.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import RESAMPLED_TYPES, Array, check_image
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
+from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.raw_positions import RasterDrift, camera_key, raw_from_output
@@ -17,29 +21,37 @@ from semcal_ros.core.registration.reference import Region
 __all__ = ["MotionCorrector", "ScanFrame", "resampleable"]
 
 
-# Motions that bend a frame by less are left in it.
+# Motions that displace pixels by less are left in a frame: a tenth of what registration resolves.
 _NEGLIGIBLE_PX = 1e-3
-_CAMERAS = 16
+# Cameras whose scanned region is remembered; a zoom passes through more, and comes back to few.
+_MAX_REGIONS = 16
+# Pixels along a side by whose noise a repeated picture is recognised.
 _SAMPLES = 96
+# Points along each edge of a region at which it is checked; distortion is smooth between them.
+_EDGE_POINTS = 17
+# Steps in which a region shrinks until all of its edges were scanned; distortion takes 2.
+_MAX_SHRINKS = 4
+# Pixels that a cubic interpolation reaches beyond a position.
+_REACH_PX = 2.0
 
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """A frame as it came in.
+    """A frame as it was scanned.
 
     Attributes
     ----------
     image
-        Raw picture.
+        The picture.
     camera
         Its camera at the image's size, or None.
     timing
-        Its raster, or None for an instant.
+        Its raster timing, or None for an instant.
     rectified
         Whether the picture already is in the camera's ideal pixels.
     """
 
-    image: NDArray[np.generic]
+    image: AnyImage
     camera: ScanCamera | None
     timing: ScanTiming | None
     rectified: bool = False
@@ -51,7 +63,7 @@ class ScanFrame:
 
     @property
     def sample(self) -> bytes:
-        """Some of its pixels, by which to see that a picture came once more."""
+        """Some of its pixels, by which a picture that comes again is recognised."""
         rows, cols = (max(1, n // _SAMPLES) for n in self.image.shape[:2])
         return np.ascontiguousarray(self.image[::rows, ::cols]).tobytes()
 
@@ -60,81 +72,87 @@ class ScanFrame:
         """(2, 2) px per unit of the drift: per m with a camera, per px without."""
         return np.eye(2) if self.camera is None else self.camera.ideal_from_sem_jacobian
 
+    @property
+    def acquisition_time_s(self) -> float:
+        """Time that it took, s."""
+        return 0.0 if self.timing is None else self.timing.acquisition_time_s
+
+    @property
+    def acceleration_term_s2(self) -> float:
+        """Distance of the mean of an accelerated drift over the frame from the drift at its middle,
+        per unit of acceleration: the mean of t^2 / 2.
+        """
+        return self.acquisition_time_s**2 / 24.0
+
 
 class MotionCorrector:
-    """Frames in ideal pixels, as if scanned in the instant of their centre.
+    """Makes frames in ideal pixels as if they had been scanned in the instant of their centre.
 
     Parameters
     ----------
     interpolation
-        Of the rectification.
+        Interpolation of the rectification.
     """
 
     def __init__(self, interpolation: str) -> None:
         self._rectifier = Rectifier(interpolation)
-        self._scanned: dict[tuple[object, ...], Region] = {}
+        self._regions: LruCache[tuple[object, ...], Region] = LruCache(_MAX_REGIONS)
 
-    def of(self, shot: ScanFrame, motion: Array) -> tuple[NDArray[np.generic], Region]:
-        """The picture without a drift velocity and acceleration (4,) (unit per s and s^2), and the
-        rectangle of it that was scanned.
+    def corrected_image(self, frame: ScanFrame, motion: Array) -> tuple[AnyImage, Region]:
+        """The picture without a motion, and the rectangle of it that was scanned.
+
+        ``motion`` (4,) is the drift velocity (unit per s) and acceleration (unit per s^2).
         """
-        width, height = shot.size
-        camera = None if shot.rectified else shot.camera
-        bent = _bent_px(shot, motion)
+        width, height = frame.size
+        camera = None if frame.rectified else frame.camera
+        displaced = _max_displacement_px(frame, motion)
         drift = None
-        if float(np.max(bent)) > _NEGLIGIBLE_PX:
+        if float(np.max(displaced)) > _NEGLIGIBLE_PX:
             # The rectifier takes px where it is given no camera.
-            unit = np.eye(2) if camera is not None else shot.px_from_unit
+            unit = np.eye(2) if camera is not None else frame.px_from_unit
             drift = RasterDrift(np.zeros(2), unit @ motion[:2], unit @ motion[2:])
         if camera is None and drift is None:
-            return shot.image, (0, 0, width, height)
-        left, top, right, bottom = self._still(shot.size, camera)
+            return frame.image, (0, 0, width, height)
+        left, top, right, bottom = self._regions.get_or_compute(
+            camera_key(frame.size, camera), lambda: _find_scanned_region(frame.size, camera)
+        )
         if drift is not None:
-            x, y = (int(np.ceil(b)) for b in bent)
+            x, y = (int(np.ceil(d)) for d in displaced)
             left, right = min(left + x, width // 3), max(right - x, 2 * width // 3)
             top, bottom = min(top + y, height // 3), max(bottom - y, 2 * height // 3)
-        picture = self._rectifier.rectify(shot.image, camera, drift, shot.timing)
+        picture = self._rectifier.rectify(frame.image, camera, drift, frame.timing)
         return picture, (left, top, right, bottom)
 
-    def _still(self, size: tuple[int, int], camera: ScanCamera | None) -> Region:
-        """What was scanned of a frame that nothing moved in."""
-        key = camera_key(size, camera)
-        if key not in self._scanned:
-            if len(self._scanned) >= _CAMERAS:
-                self._scanned.clear()
-            self._scanned[key] = _scanned(size, camera)
-        return self._scanned[key]
 
-
-def _bent_px(shot: ScanFrame, motion: Array) -> Array:
+def _max_displacement_px(frame: ScanFrame, motion: Array) -> Array:
     """(2,) by how much a motion displaces pixels of a frame at most."""
-    if shot.timing is None:
-        return np.zeros(2)
-    half_s = 0.5 * shot.timing.acquisition_time_s
-    displaced = np.abs(shot.px_from_unit @ motion[:2]) * half_s
-    return np.asarray(displaced + np.abs(shot.px_from_unit @ motion[2:]) * 0.5 * half_s**2)
+    half_s = 0.5 * frame.acquisition_time_s
+    displaced = np.abs(frame.px_from_unit @ motion[:2]) * half_s
+    return displaced + np.abs(frame.px_from_unit @ motion[2:]) * 0.5 * half_s**2
 
 
-def _scanned(size: tuple[int, int], camera: ScanCamera | None) -> Region:
-    """Rectangle of output pixels of which all come from inside of the raw frame."""
+def _find_scanned_region(size: tuple[int, int], camera: ScanCamera | None) -> Region:
+    """Rectangle of output pixels that all come from inside of the raw frame."""
     width, height = size
     left, top, right, bottom = 0, 0, width, height
-    for _ in range(4):
-        x, y = np.linspace(left, right - 1, 17), np.linspace(top, bottom - 1, 17)
+    for _ in range(_MAX_SHRINKS):
+        x, y = (
+            np.linspace(left, right - 1, _EDGE_POINTS),
+            np.linspace(top, bottom - 1, _EDGE_POINTS),
+        )
         edges = [
-            np.stack([np.full(17, float(left)), y], axis=1),
-            np.stack([x, np.full(17, float(top))], axis=1),
-            np.stack([np.full(17, right - 1.0), y], axis=1),
-            np.stack([x, np.full(17, bottom - 1.0)], axis=1),
+            np.stack([np.full(_EDGE_POINTS, float(left)), y], axis=1),
+            np.stack([x, np.full(_EDGE_POINTS, float(top))], axis=1),
+            np.stack([np.full(_EDGE_POINTS, right - 1.0), y], axis=1),
+            np.stack([x, np.full(_EDGE_POINTS, bottom - 1.0)], axis=1),
         ]
         raw = [raw_from_output(edge, size, camera, None, None) for edge in edges]
-        # An interpolation reaches two pixels beyond its position; a hole in the distortion counts
-        # as far outside.
+        # A hole in the distortion counts as far outside.
         lacking = [
-            2.0 - np.nan_to_num(raw[0][:, 0], nan=-width / 8).min(),
-            2.0 - np.nan_to_num(raw[1][:, 1], nan=-height / 8).min(),
-            np.nan_to_num(raw[2][:, 0], nan=1.125 * width).max() - (width - 3.0),
-            np.nan_to_num(raw[3][:, 1], nan=1.125 * height).max() - (height - 3.0),
+            _REACH_PX - np.nan_to_num(raw[0][:, 0], nan=-width / 8).min(),
+            _REACH_PX - np.nan_to_num(raw[1][:, 1], nan=-height / 8).min(),
+            np.nan_to_num(raw[2][:, 0], nan=1.125 * width).max() - (width - 1.0 - _REACH_PX),
+            np.nan_to_num(raw[3][:, 1], nan=1.125 * height).max() - (height - 1.0 - _REACH_PX),
         ]
         steps = [int(np.ceil(max(v, 0.0))) for v in lacking]
         left, top = min(left + steps[0], width // 3), min(top + steps[1], height // 3)
@@ -147,13 +165,13 @@ def _scanned(size: tuple[int, int], camera: ScanCamera | None) -> Region:
     return left, top, right, bottom
 
 
-def resampleable(image: NDArray[np.generic]) -> NDArray[np.generic]:
+def resampleable(image: AnyImage) -> AnyImage:
     """The image in a type that can be resampled.
 
     Raises
     ------
     InvalidValueError
-        If it is no picture.
+        If it is not a picture.
     """
     pixels = check_image(image)
     return pixels if pixels.dtype.name in RESAMPLED_TYPES else pixels.astype(np.float32)

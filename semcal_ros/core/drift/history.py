@@ -1,4 +1,4 @@
-"""A recording while it is tracked, for a second look with hindsight."""
+"""What a tracker did with a recording, for smoothing it with hindsight."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.errors import InvalidValueError
@@ -15,7 +15,7 @@ __all__ = ["DriftHistory"]
 
 
 class DriftHistory:
-    """What a tracker did, in stretches that each begin with zero drift."""
+    """The frames of a tracker, in stretches that each begin with zero drift."""
 
     def __init__(self) -> None:
         self._stretches: list[tuple[DriftFilter, list[DriftUpdate]]] = []
@@ -24,19 +24,19 @@ class DriftHistory:
     def __len__(self) -> int:
         return len(self._cameras)
 
-    def begin(self, drift: DriftFilter) -> None:
-        """A new stretch."""
-        self._stretches.append((drift, []))
+    def begin(self, drift_filter: DriftFilter) -> None:
+        """Begin a new stretch."""
+        self._stretches.append((drift_filter, []))
 
     def add(self, update: DriftUpdate, camera: ScanCamera | None) -> None:
-        """A frame."""
+        """Add a frame."""
         self._stretches[-1][1].append(update)
         self._cameras.append(camera)
 
     def smooth(self) -> DriftPath:
         """The drift of all frames so far, each with the knowledge of all of its stretch.
 
-        How restless it is, is what makes the measurements most likely.
+        The process noise is that which makes the measurements most likely.
 
         Raises
         ------
@@ -46,11 +46,13 @@ class DriftHistory:
         if not self._cameras:
             raise InvalidValueError("no frames", expected="at least one", do="track some first")
         updates: list[DriftUpdate] = []
-        for drift, stretch in self._stretches:
-            restlessness = drift.restlessness
-            if restlessness.psd > 0.0:
-                restlessness = estimate_process_noise(drift.start, drift.events, restlessness)
-            states = smooth(drift.start, drift.events, restlessness)
+        for drift_filter, stretch in self._stretches:
+            process_noise = drift_filter.process_noise
+            if process_noise.psd > 0.0:
+                process_noise = estimate_process_noise(
+                    drift_filter.start, drift_filter.events, process_noise
+                )
+            states = smooth(drift_filter.start, drift_filter.events, process_noise)
             for update, state in zip(stretch, states, strict=True):
                 camera = self._cameras[len(updates)]
                 scale = scale_covariance(camera, state.position, state.velocity)
@@ -60,7 +62,7 @@ class DriftHistory:
                         drift_m=state.position,
                         velocity_m_s=state.velocity,
                         acceleration_m_s2=state.acceleration,
-                        covariance=state.own + scale,
+                        covariance=state.drift_covariance + scale,
                     )
                 )
-        return path_of_updates(updates)
+        return DriftPath(tuple(updates))

@@ -1,8 +1,8 @@
 """The pictures that drift is measured against.
 
-The noise of a reference limits every registration against it, above all in noisy pictures. So each
-frame that was registered well is added to its keyframe, shifted to where the keyframe lies, until
-the noise of the mean no longer matters; then it stays as it is, so that it cannot wander.
+The noise of a reference limits every registration against it. Each frame that was registered well
+is therefore added to its keyframe, shifted to where the keyframe lies, until the noise of the mean
+no longer matters. Then the mean stays as it is, so that it cannot wander.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import AnyImage, Array, Image
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
@@ -21,10 +20,17 @@ from semcal_ros.core.registration.register import Registration, prepare_referenc
 
 __all__ = [
     "Keyframe",
-    "carried",
-    "keyframe_of",
+    "make_keyframe",
+    "resample_keyframe",
     "scale_ratio",
 ]
+
+
+# Fewer common rows or columns are not added to a mean.
+_MIN_COMMON_PX = 8
+# A picture that shrinks by more than this must be blurred first, or it would alias: by a Gaussian
+# that widens 0.45 px, the width of a pixel, to that of a pixel of the new picture.
+_BLUR_BELOW, _PIXEL_SIGMA_PX = 0.95, 0.45
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class Keyframe:
 
     Attributes
     ----------
-    shot
+    frame
         The frame it began with.
     removed
         (4,) drift velocity and acceleration (unit per s and s^2) that were removed from that frame.
@@ -47,9 +53,9 @@ class Keyframe:
         Number of frames in the mean.
     """
 
-    shot: ScanFrame
+    frame: ScanFrame
     removed: Array
-    mean: NDArray[np.float32]
+    mean: Image
     region: Region
     time_s: float
     averaged: int = 1
@@ -57,17 +63,15 @@ class Keyframe:
     @property
     def nbytes(self) -> int:
         """Memory of its pictures."""
-        return self.mean.nbytes + self.shot.image.nbytes
+        return self.mean.nbytes + self.frame.image.nbytes
 
-    def reference(self, settings: RegistrationSettings) -> Reference:
-        """Everything that a registration needs of it."""
+    def prepare_reference(self, settings: RegistrationSettings) -> Reference:
+        """Prepare it for registrations."""
         return prepare_reference(
             self.mean, region=self.region, settings=settings, averaged=float(self.averaged)
         )
 
-    def with_frame(
-        self, picture: NDArray[np.generic], region: Region, registration: Registration
-    ) -> Keyframe:
+    def with_frame(self, picture: AnyImage, region: Region, registration: Registration) -> Keyframe:
         """The keyframe with another frame in its mean, where the two overlap."""
         gray = np.asarray(to_gray(picture), dtype=np.float32)
         shift = registration.shift_px
@@ -83,7 +87,7 @@ class Keyframe:
             last = min(self.region[axis + 2], region[axis + 2] - high - int(whole[axis]))
             spans.append((first, last))
         (left, right), (top, bottom) = spans
-        if right - left < 8 or bottom - top < 8:
+        if min(right - left, bottom - top) < _MIN_COMMON_PX:
             return self
         plain = np.array([1.0])
         corner = left + int(whole[0]), top + int(whole[1])
@@ -98,19 +102,17 @@ class Keyframe:
         return replace(self, mean=mean, averaged=self.averaged + 1)
 
 
-def keyframe_of(
-    shot: ScanFrame, removed: Array, picture: NDArray[np.generic], region: Region, time_s: float
+def make_keyframe(
+    frame: ScanFrame, removed: Array, picture: AnyImage, region: Region, time_s: float
 ) -> Keyframe:
-    """A keyframe of a frame whose picture without the motion ``removed`` (4,) is known."""
+    """A keyframe from a frame and its picture without the motion ``removed`` (4,)."""
     return Keyframe(
-        shot, removed.copy(), np.array(to_gray(picture), dtype=np.float32), region, time_s
+        frame, removed.copy(), np.array(to_gray(picture), dtype=np.float32), region, time_s
     )
 
 
 def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
-    """By which factor the px per unit differ, at least 1; infinite where they cannot be
-    compared.
-    """
+    """Factor by which the px per unit differ, at least 1; infinite where they cannot be compared."""
     if (before.camera is None) != (now.camera is None):
         return float("inf")
     if before.camera is None:
@@ -119,40 +121,39 @@ def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
     return float(max(stretch.max(), 1.0 / stretch.min()))
 
 
-def carried(key: Keyframe, now: ScanFrame) -> Keyframe:
+def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
     """The keyframe as the camera of ``now`` would show it.
 
     Both cameras must be known. Ideal pixels of two magnifications are related by the affine map of
     the reference plane.
     """
-    before, after = key.shot.camera, now.camera
+    before, after = key.frame.camera, now.camera
     if before is None or after is None:
         return key
-    matrix = now.px_from_unit @ np.linalg.inv(key.shot.px_from_unit)
+    matrix = now.px_from_unit @ np.linalg.inv(key.frame.px_from_unit)
     offset = np.array([after.px, after.py]) - matrix @ np.array([before.px, before.py])
     shrink = float(np.sqrt(abs(np.linalg.det(matrix))))
     gray = key.mean
-    if shrink < 0.95:
-        # Structure finer than the new pixels would alias.
-        sigma = 0.45 * float(np.sqrt(1.0 / shrink**2 - 1.0))
+    if shrink < _BLUR_BELOW:
+        sigma = _PIXEL_SIGMA_PX * float(np.sqrt(1.0 / shrink**2 - 1.0))
         gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma), dtype=np.float32)
     warp = np.column_stack([matrix, offset])
     width, height = now.size
     new = cv2.warpAffine(gray, warp, (width, height), flags=cv2.INTER_CUBIC)
-    region = _image_of(key.region, matrix, offset, now.size)
+    region = _map_region(key.region, matrix, offset, now.size)
     mean = np.asarray(new, dtype=np.float32)
     return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged)
 
 
-def _image_of(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:
+def _map_region(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:
     """Upright rectangle inside of the affine image of a rectangle and inside of the picture."""
     left, top, right, bottom = region[0] + 2, region[1] + 2, region[2] - 3, region[3] - 3
     corners = np.array(
         [[left, top], [right, top], [left, bottom], [right, bottom]], dtype=np.float64
     )
-    moved = corners @ matrix.T + offset
-    x0, x1 = max(moved[0, 0], moved[2, 0], 0.0), min(moved[1, 0], moved[3, 0], size[0] - 1.0)
-    y0, y1 = max(moved[0, 1], moved[1, 1], 0.0), min(moved[2, 1], moved[3, 1], size[1] - 1.0)
+    mapped = corners @ matrix.T + offset
+    x0, x1 = max(mapped[0, 0], mapped[2, 0], 0.0), min(mapped[1, 0], mapped[3, 0], size[0] - 1.0)
+    y0, y1 = max(mapped[0, 1], mapped[1, 1], 0.0), min(mapped[2, 1], mapped[3, 1], size[1] - 1.0)
     inside = (int(np.ceil(x0)), int(np.ceil(y0)), int(np.floor(x1)) + 1, int(np.floor(y1)) + 1)
     if inside[2] <= inside[0] or inside[3] <= inside[1]:
         return 0, 0, 1, 1

@@ -1,7 +1,7 @@
-"""What happens to the drift map: time, frames that become keyframes, measurements.
+"""What happens to the state of the drift: time, frames that become keyframes, measurements.
 
-Everything but a measurement is linear with noise of its own: an object that can be done again with
-another restlessness, and undone backwards (:mod:`semcal_ros.core.drift.smoother`).
+Everything but a measurement is a linear map with noise. It is an object, so that it can be done
+again with another process noise and undone backwards (:mod:`semcal_ros.core.drift.smoother`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, equilibrate, invert_scaled
 from semcal_ros.core.drift.process_noise import ProcessNoise
-from semcal_ros.core.drift.state import EACH, MOVING, OWN, DriftState
+from semcal_ros.core.drift.state import BASE_SIZE, KEYFRAME_SIZE, MOTION_SIZE, DriftState
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -21,17 +21,17 @@ __all__ = [
     "CloneKeyframe",
     "CorrectShear",
     "Inflate",
-    "Linear",
     "Marginalise",
     "Measure",
     "MeasureOutcome",
     "Operation",
     "Predict",
+    "Transition",
 ]
 
 
 @dataclass(frozen=True)
-class Linear:
+class Transition:
     """``new = matrix old + offset`` plus noise of ``covariance``, at ``time_s`` with ``keys``."""
 
     matrix: Array
@@ -40,110 +40,130 @@ class Linear:
     time_s: float
     keys: tuple[int, ...]
 
-    def of(self, state: DriftState) -> DriftState:
+    def apply(self, state: DriftState) -> DriftState:
         """The new state."""
         covariance = self.matrix @ state.covariance @ self.matrix.T + self.covariance
         mean = self.matrix @ state.mean + self.offset
         return DriftState(self.time_s, mean, 0.5 * (covariance + covariance.T), self.keys)
 
 
-def _same(state: DriftState) -> Linear:
+def _identity(state: DriftState) -> Transition:
     size = state.mean.size
-    return Linear(np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys)
+    return Transition(
+        np.eye(size), np.zeros(size), np.zeros((size, size)), state.time_s, state.keys
+    )
 
 
 class Operation(ABC):
-    """Something that happens to the state and is linear."""
+    """A linear map of the state."""
 
     @abstractmethod
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """Its matrices for a state."""
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map at a state."""
 
-    def __call__(self, state: DriftState, restlessness: ProcessNoise) -> DriftState:
-        """The state after it."""
-        return self.linear(state, restlessness).of(state)
+    def __call__(self, state: DriftState, process_noise: ProcessNoise) -> DriftState:
+        """The state afterwards."""
+        return self.transition(state, process_noise).apply(state)
 
 
 @dataclass(frozen=True)
 class Predict(Operation):
-    """Time goes on until ``time_s``."""
+    """Time passes until ``time_s``."""
 
     time_s: float
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described in the module.
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class.
 
         Raises
         ------
         InvalidValueError
-            If the time is earlier than the state's, or the restlessness negative.
+            If the time is earlier than the state's, or the process noise is negative.
         """
         dt = self.time_s - state.time_s
-        if not (0.0 <= dt < np.inf and restlessness.psd >= 0.0 and restlessness.memory_s >= 0.0):
+        if not (
+            0.0 <= dt < np.inf and process_noise.psd >= 0.0 and process_noise.time_constant_s >= 0.0
+        ):
             raise InvalidValueError(
-                f"a prediction from {state.time_s} s to {self.time_s} s with {restlessness}",
+                f"a prediction from {state.time_s} s to {self.time_s} s with {process_noise}",
                 expected="a later time and numbers >= 0",
             )
-        step = _same(state)
+        step = _identity(state)
         if dt > 0.0:
-            move, noise = restlessness.over(dt)
+            transition, noise = process_noise.discretise(dt)
             for axis in (0, 1):
-                of_axis = slice(axis, MOVING, 2)
-                step.matrix[of_axis, of_axis] = move
+                of_axis = slice(axis, MOTION_SIZE, 2)
+                step.matrix[of_axis, of_axis] = transition
                 step.covariance[of_axis, of_axis] = noise
         return replace(step, time_s=self.time_s)
 
 
 @dataclass(frozen=True)
 class Inflate(Operation):
-    """Drift, velocity and acceleration become more uncertain: noise of ``covariance`` (6, 6) is
-    added.
-    """
+    """The covariance of drift, velocity and acceleration grows by ``covariance`` (6, 6)."""
 
     covariance: Array
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described."""
-        step = _same(state)
-        step.covariance[:MOVING, :MOVING] = self.covariance
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class."""
+        step = _identity(state)
+        step.covariance[:MOTION_SIZE, :MOTION_SIZE] = self.covariance
         return step
 
 
 @dataclass(frozen=True)
 class AddKeyframe(Operation):
-    """The frame of now becomes keyframe ``key`` without having been measured.
+    """The present frame becomes keyframe ``key`` without having been measured.
 
-    Its picture lies at the drift with its own noise ``noise`` (4, 4); ``removed`` (4,) is the
-    velocity and the acceleration that were taken out of it, ``bow`` is b of the module, ``scan_s``
-    the time it took.
+    Attributes
+    ----------
+    key
+        Number of the keyframe.
+    removed
+        (4,) velocity and acceleration that were taken out of its picture.
+    acceleration_term_s2
+        b of :mod:`semcal_ros.core.drift.state`.
+    noise
+        (4, 4) noise of the position and the shear of its picture.
+    scan_s
+        Time that the frame took, s.
     """
 
     key: int
     removed: Array
-    bow: float
+    acceleration_term_s2: float
     noise: Array
     scan_s: float
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described."""
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class."""
         size = state.mean.size
-        matrix = np.vstack([np.eye(size), np.eye(EACH, size)])
-        matrix[size : size + 2, 4:6] = self.bow * np.eye(2)
-        covariance = np.zeros((size + EACH, size + EACH))
-        covariance[size:, size:] = self.noise + restlessness.within(self.scan_s)
-        offset = np.zeros(size + EACH)
-        offset[size : size + 2] = -self.bow * self.removed[2:]
+        matrix = np.vstack([np.eye(size), np.eye(KEYFRAME_SIZE, size)])
+        matrix[size : size + 2, 4:6] = self.acceleration_term_s2 * np.eye(2)
+        covariance = np.zeros((size + KEYFRAME_SIZE, size + KEYFRAME_SIZE))
+        covariance[size:, size:] = self.noise + process_noise.frame_covariance(self.scan_s)
+        offset = np.zeros(size + KEYFRAME_SIZE)
+        offset[size : size + 2] = -self.acceleration_term_s2 * self.removed[2:]
         offset[size + 2 :] = -self.removed[:2]
-        return Linear(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
+        return Transition(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
 
 
 @dataclass(frozen=True)
 class CloneKeyframe(Operation):
-    """The frame of now becomes keyframe ``key``, as it was measured against ``parent``.
+    """The present frame becomes keyframe ``key``, as it was measured against ``parent``.
 
-    ``shift`` (4,) is what was measured: shift, and shear over the frame time; ``time_ratio`` is the
-    frame time of the parent over that of the frame; ``noise`` (4, 4) is added; ``zoom`` (2, 2) is Z
-    of the module.
+    Attributes
+    ----------
+    key, parent
+        Numbers of the keyframes.
+    shift
+        (4,) what was measured: the shift, and the shear over the frame time.
+    time_ratio
+        Frame time of the parent over that of the frame.
+    noise
+        (4, 4) added to the covariance.
+    zoom
+        (2, 2) Z of :mod:`semcal_ros.core.drift.state`.
     """
 
     key: int
@@ -153,50 +173,52 @@ class CloneKeyframe(Operation):
     noise: Array
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described."""
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class."""
         size = state.mean.size
-        matrix = np.vstack([np.eye(size), np.zeros((EACH, size))])
-        at = state.of(self.parent)
-        matrix[size:, at] = np.diag([1.0, 1.0, self.time_ratio, self.time_ratio])
-        matrix[size : size + 2, MOVING:OWN] = self.zoom
-        covariance = np.zeros((size + EACH, size + EACH))
+        matrix = np.vstack([np.eye(size), np.zeros((KEYFRAME_SIZE, size))])
+        keyframe = state.keyframe_slice(self.parent)
+        matrix[size:, keyframe] = np.diag([1.0, 1.0, self.time_ratio, self.time_ratio])
+        matrix[size : size + 2, MOTION_SIZE:BASE_SIZE] = self.zoom
+        covariance = np.zeros((size + KEYFRAME_SIZE, size + KEYFRAME_SIZE))
         covariance[size:, size:] = self.noise
         offset = np.append(np.zeros(size), self.shift)
-        return Linear(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
+        return Transition(matrix, offset, covariance, state.time_s, (*state.keys, self.key))
 
 
 @dataclass(frozen=True)
 class CorrectShear(Operation):
-    """Another velocity and acceleration ``removed`` (4,) were taken out of keyframe ``key``."""
+    """A further velocity and acceleration ``removed`` (4,) are taken out of keyframe ``key``."""
 
     key: int
     removed: Array
-    bow: float
+    acceleration_term_s2: float
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described."""
-        step = _same(state)
-        at = state.of(self.key)
-        step.offset[at.start : at.start + 2] = -self.bow * self.removed[2:]
-        step.offset[at.start + 2 : at.stop] = -self.removed[:2]
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class."""
+        step = _identity(state)
+        keyframe = state.keyframe_slice(self.key)
+        step.offset[keyframe.start : keyframe.start + 2] = (
+            -self.acceleration_term_s2 * self.removed[2:]
+        )
+        step.offset[keyframe.start + 2 : keyframe.stop] = -self.removed[:2]
         return step
 
 
 @dataclass(frozen=True)
 class Marginalise(Operation):
-    """Keyframe ``key`` is forgotten."""
+    """Keyframe ``key`` leaves the state."""
 
     key: int
 
-    def linear(self, state: DriftState, restlessness: ProcessNoise) -> Linear:
-        """As described."""
-        size, at = state.mean.size, state.of(self.key)
-        kept = np.delete(np.arange(size), np.arange(at.start, at.stop))
+    def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
+        """The map; see the base class."""
+        size, keyframe = state.mean.size, state.keyframe_slice(self.key)
+        kept = np.delete(np.arange(size), np.arange(keyframe.start, keyframe.stop))
         keys = tuple(k for k in state.keys if k != self.key)
         matrix = np.eye(size)[kept]
         empty = np.zeros((kept.size, kept.size))
-        return Linear(matrix, np.zeros(kept.size), empty, state.time_s, keys)
+        return Transition(matrix, np.zeros(kept.size), empty, state.time_s, keys)
 
 
 @dataclass(frozen=True)
@@ -207,12 +229,12 @@ class MeasureOutcome:
     ----------
     state
         The updated state.
-    row
-        (2 or 4, n) derivative of the measurement by the state.
+    jacobian
+        (2 or 4, n) derivative of the measurement with respect to the state.
     innovation, innovation_covariance
-        Measurement minus prediction, and what prediction and noise lead one to expect of it.
+        Measurement minus prediction, and the covariance expected of it.
     gain
-        (n, 2 or 4) by which the innovation changes the state.
+        (n, 2 or 4) Kalman gain.
     nis
         Normalised innovation squared of the shift alone; chi-square with 2 degrees of freedom when
         all is well.
@@ -221,7 +243,7 @@ class MeasureOutcome:
     """
 
     state: DriftState
-    row: Array
+    jacobian: Array
     innovation: Array
     innovation_covariance: Array
     gain: Array
@@ -236,42 +258,42 @@ class Measure:
     Attributes
     ----------
     shift
-        (2,) shift, or (4,) shift and shear as a velocity (the shear over the frame time). What was
-        taken out of the frame before is added: the velocity, and to the shift b times the
-        acceleration.
+        (2,) shift, or (4,) shift and shear as a velocity (the shear over the frame time). The
+        motion that was taken out of the frame is added again: the velocity to the shear, and b
+        times the acceleration to the shift.
     covariance
-        Of ``shift``: the noise of the frame alone.
+        Covariance of ``shift`` from the noise of the frame alone.
     time_ratio
         Frame time of the keyframe over that of the frame.
-    bow
-        b of the module.
+    acceleration_term_s2
+        b of :mod:`semcal_ros.core.drift.state`.
     scan_s
         Time that the frame took.
     zoom
-        (2, 2) Z of the module.
+        (2, 2) Z of :mod:`semcal_ros.core.drift.state`.
     """
 
     key: int
     shift: Array
     covariance: Array
     time_ratio: float = 1.0
-    bow: float = 0.0
+    acceleration_term_s2: float = 0.0
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
-    def row(self, state: DriftState) -> Array:
-        """(2 or 4, n) derivative of the measurement by the state."""
-        count, at = self.shift.size, state.of(self.key).start
-        row = np.zeros((count, state.mean.size))
-        row[:, :count] = np.eye(count)
-        row[:2, 4:6] = self.bow * np.eye(2)
-        row[:2, MOVING:OWN] = -self.zoom
+    def jacobian(self, state: DriftState) -> Array:
+        """(2 or 4, n) derivative of the measurement with respect to the state."""
+        count, start = self.shift.size, state.keyframe_slice(self.key).start
+        jacobian = np.zeros((count, state.mean.size))
+        jacobian[:, :count] = np.eye(count)
+        jacobian[:2, 4:6] = self.acceleration_term_s2 * np.eye(2)
+        jacobian[:2, MOTION_SIZE:BASE_SIZE] = -self.zoom
         factors = [1.0, 1.0, self.time_ratio, self.time_ratio]
-        row[:, at : at + count] = -np.diag(factors[:count])
-        return row
+        jacobian[:, start : start + count] = -np.diag(factors[:count])
+        return jacobian
 
-    def __call__(self, state: DriftState, restlessness: ProcessNoise) -> MeasureOutcome:
-        """The state with the measurement used.
+    def __call__(self, state: DriftState, process_noise: ProcessNoise) -> MeasureOutcome:
+        """The state updated by the measurement.
 
         Raises
         ------
@@ -279,29 +301,29 @@ class Measure:
             If the measurement is not finite or its covariance not positive definite.
         """
         self._check(state)
-        row = self.row(state)
+        jacobian = self.jacobian(state)
         count = self.shift.size
-        noise = self.covariance + restlessness.within(self.scan_s)[:count, :count]
-        innovation = self.shift - row @ state.mean
-        mixed = state.covariance @ row.T
-        expected = row @ mixed + noise
+        noise = self.covariance + process_noise.frame_covariance(self.scan_s)[:count, :count]
+        innovation = self.shift - jacobian @ state.mean
+        mixed = state.covariance @ jacobian.T
+        expected = jacobian @ mixed + noise
         expected = 0.5 * (expected + expected.T)
         # Metres and metres per second differ by orders of magnitude.
         inverse = invert_scaled(expected)
         gain = mixed @ inverse
         # Joseph's form stays symmetric and positive when the measurement is much sharper than the
         # prediction.
-        keep = np.eye(state.mean.size) - gain @ row
-        covariance = keep @ state.covariance @ keep.T + gain @ noise @ gain.T
+        remaining = np.eye(state.mean.size) - gain @ jacobian
+        covariance = remaining @ state.covariance @ remaining.T + gain @ noise @ gain.T
         new = replace(
             state,
             mean=state.mean + gain @ innovation,
             covariance=0.5 * (covariance + covariance.T),
         )
-        nis = _square(innovation[:2], expected[:2, :2])
+        nis = _mahalanobis_square(innovation[:2], expected[:2, :2])
         both = float(innovation @ inverse @ innovation)
         shear_nis = max(both - nis, 0.0)
-        return MeasureOutcome(new, row, innovation, expected, gain, nis, shear_nis)
+        return MeasureOutcome(new, jacobian, innovation, expected, gain, nis, shear_nis)
 
     def _check(self, state: DriftState) -> None:
         if self.key not in state.keys:
@@ -320,10 +342,10 @@ class Measure:
                 expected="finite numbers and a positive definite covariance",
             )
 
-    def of_shift(self) -> Measure:
+    def without_shear(self) -> Measure:
         """The measurement without its shear."""
         return replace(self, shift=self.shift[:2], covariance=self.covariance[:2, :2])
 
 
-def _square(vector: Array, covariance: Array) -> float:
+def _mahalanobis_square(vector: Array, covariance: Array) -> float:
     return float(vector @ np.linalg.solve(covariance, vector))

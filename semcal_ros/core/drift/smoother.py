@@ -1,11 +1,13 @@
-"""Drift of a whole recording, with hindsight.
+"""Drift of a whole recording with hindsight.
 
-What happened to the :class:`~semcal_ros.core.drift.state.DriftState` while a recording was tracked is
-done again with the acceleration noise that makes the measurements most likely, and then undone
-backwards. The recursion is that of Bryson and Frazier (1963; modified by Bierman 1973,
-Int. J. Control 18, 65-75), which needs no inverse of a prediction: positions of keyframes are
-copies of each other, and such an inverse does not exist.
-With white acceleration the result is the cubic smoothing spline through the measurements (Wahba
+The events of a :class:`~semcal_ros.core.drift.filter.DriftFilter` are applied again with the process
+noise that makes the measurements most likely, and then undone backwards. The recursion is that of
+Bryson and Frazier (1963; modified by Bierman 1973,
+Int. J. Control 18, 65-75), which needs no
+inverse of a predicted covariance: positions of keyframes are copies of each other, so that such an
+inverse does not exist.
+
+With a white acceleration the result is the cubic smoothing spline through the measurements (Wahba
 1978, doi:10.1111/j.2517-6161.1978.tb01050.x), with one that lasts a stiffer one.
 """
 
@@ -25,14 +27,23 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["Event", "Mark", "estimate_process_noise", "replay", "smooth"]
 
 
-_OUTLIER_NIS = 25.0
+# A measurement costs no more than one at this normalised innovation squared (twice the outlier's 25
+# for shift and shear): a few outliers do not decide on the process noise.
+_MAX_COST = 50.0
+# The first two measurements are explained by the prior of the velocity.
+_UNCOUNTED = 2
+# Measurements for a likelihood: both components of 600 shifts tell a variance to 4 %.
 _MAX_FOR_LIKELIHOOD = 600
-_LOG_RANGE = (-14.0, 5.0)
+# Fewest measurements from which process noise can be estimated.
+_MIN_FOR_LIKELIHOOD = 4
+# Logarithm of the density relative to the guess: a likelihood is flat beyond. A grid finds the
+# highest maximum, and the golden section refines it by a tenth, far less than what the data can tell.
+_LOG_RANGE, _GRID = (-14.0, 5.0), 9
 
 
 @dataclass(frozen=True)
 class Mark:
-    """The state of now is that of one frame."""
+    """The present state is that of one frame."""
 
 
 Event = Operation | Measure | Mark
@@ -40,106 +51,107 @@ Event = Operation | Measure | Mark
 
 @dataclass(frozen=True)
 class _Update:
-    """What a measurement did: its row, innovation with the inverse of its covariance, and what it
-    left of the prediction's errors.
+    """A measurement: its Jacobian, its innovation with the inverse of its covariance, and the part
+    ``I - K H`` of the prediction's errors that remains.
     """
 
-    row: Array
+    jacobian: Array
     innovation: Array
     inverse: Array
-    kept: Array
+    remaining: Array
 
 
-#: What is needed to come back: the matrix of an operation, a measurement, or the state of a frame.
+#: What the backward pass needs: the matrix of an operation, a measurement, or the state of a frame.
 _Step = Array | _Update | DriftState
 
 
-def _forwards(
-    start: DriftState, events: Sequence[Event], restlessness: ProcessNoise
+def _run_forward(
+    start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
 ) -> tuple[list[_Step], DriftState, float]:
     """The steps, the last state, and minus twice the log likelihood of the measurements."""
     state, cost, count = start, 0.0, 0
     steps: list[_Step] = []
     for event in events:
         if isinstance(event, Operation):
-            linear = event.linear(state, restlessness)
-            state = linear.of(state)
-            steps.append(linear.matrix)
+            transition = event.transition(state, process_noise)
+            state = transition.apply(state)
+            steps.append(transition.matrix)
         elif isinstance(event, Measure):
-            outcome = event(state, restlessness)
+            outcome = event(state, process_noise)
             state = outcome.state
-            kept = np.eye(state.mean.size) - outcome.gain @ outcome.row
+            remaining = np.eye(state.mean.size) - outcome.gain @ outcome.jacobian
             inverse = invert_scaled(outcome.innovation_covariance)
-            steps.append(_Update(outcome.row, outcome.innovation, inverse, kept))
+            steps.append(_Update(outcome.jacobian, outcome.innovation, inverse, remaining))
             count += 1
-            if count > 2:
+            if count > _UNCOUNTED:
                 size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-                cost += min(outcome.nis + outcome.shear_nis, 2.0 * _OUTLIER_NIS) + size
+                cost += min(outcome.nis + outcome.shear_nis, _MAX_COST) + size
         else:
             steps.append(state)
     return steps, state, cost
 
 
-def replay(start: DriftState, events: Sequence[Event], restlessness: ProcessNoise) -> DriftState:
-    """The state after everything happened again."""
-    return _forwards(start, events, restlessness)[1]
+def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoise) -> DriftState:
+    """The state after all events are applied again."""
+    return _run_forward(start, events, process_noise)[1]
 
 
 def smooth(
-    start: DriftState, events: Sequence[Event], restlessness: ProcessNoise
+    start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
 ) -> list[DriftState]:
-    """States at the marks, each with the knowledge of all measurements.
+    """States at the marks, each given all measurements.
 
     Parameters
     ----------
     start
         State before the first event.
     events
-        What happened.
-    restlessness
-        Of the drift.
+        Events of a filter.
+    process_noise
+        Process noise of the drift.
 
     Raises
     ------
     InvalidValueError
-        If a time goes back or the restlessness is negative.
+        If a time goes back or the process noise is negative.
     """
-    steps, last, _ = _forwards(start, events, restlessness)
-    found: list[DriftState] = []
-    # What later measurements say of the state, and how much they know of it.
-    told = np.zeros(last.mean.size)
-    known = np.zeros((last.mean.size, last.mean.size))
+    steps, last, _ = _run_forward(start, events, process_noise)
+    smoothed: list[DriftState] = []
+    # Adjoint of the state and its information: what later measurements say of it.
+    adjoint = np.zeros(last.mean.size)
+    information = np.zeros((last.mean.size, last.mean.size))
     for step in reversed(steps):
         if isinstance(step, _Update):
-            told = step.kept.T @ told - step.row.T @ step.inverse @ step.innovation
-            known = step.row.T @ step.inverse @ step.row + step.kept.T @ known @ step.kept
+            weighted = step.jacobian.T @ step.inverse
+            adjoint = step.remaining.T @ adjoint - weighted @ step.innovation
+            information = weighted @ step.jacobian + step.remaining.T @ information @ step.remaining
         elif isinstance(step, DriftState):
-            mean = step.mean - step.covariance @ told
-            covariance = step.covariance - step.covariance @ known @ step.covariance
+            mean = step.mean - step.covariance @ adjoint
+            covariance = step.covariance - step.covariance @ information @ step.covariance
             covariance = 0.5 * (covariance + covariance.T)
-            found.append(replace(step, mean=mean, covariance=covariance))
+            smoothed.append(replace(step, mean=mean, covariance=covariance))
         else:
-            told, known = step.T @ told, step.T @ known @ step
-    return found[::-1]
+            adjoint, information = step.T @ adjoint, step.T @ information @ step
+    return smoothed[::-1]
 
 
 def estimate_process_noise(
     start: DriftState,
     events: Sequence[Event],
     near: ProcessNoise,
-    memories: Sequence[float] = (0.0, 2.0, 8.0),
+    time_constants: Sequence[float] = (0.0, 2.0, 8.0),
 ) -> ProcessNoise:
-    """The restlessness that makes the measurements most likely.
+    """The process noise that makes the measurements most likely.
 
     Parameters
     ----------
     start, events
         As for :func:`smooth`; from a long recording the first part is taken.
     near
-        One whose density is right within some orders of magnitude, greater than 0, and whose
-        memory is that of few frames.
-    memories
-        Multiples of that memory to choose from; 0 is a white acceleration.
+        A guess whose density is greater than 0 and right within some orders of magnitude, and
+        whose time constant is that of a few frames.
+    time_constants
+        Multiples of that time constant to choose from; 0 is a white acceleration.
 
     Raises
     ------
@@ -149,31 +161,32 @@ def estimate_process_noise(
     if not near.psd > 0.0:
         raise InvalidValueError(f"{near}", expected="a positive density")
     part = list(events)[: 4 * _MAX_FOR_LIKELIHOOD]
-    if sum(isinstance(event, Measure) for event in part) < 4:
+    if sum(isinstance(event, Measure) for event in part) < _MIN_FOR_LIKELIHOOD:
         return near
-    found = [_likely_psd(start, part, near.psd, m * near.memory_s) for m in memories]
-    return min(found, key=lambda pair: pair[0])[1]
+    candidates = [
+        _maximise_likelihood(start, part, near.psd, factor * near.time_constant_s)
+        for factor in time_constants
+    ]
+    return min(candidates, key=lambda pair: pair[0])[1]
 
 
-def _likely_psd(
-    start: DriftState, events: Sequence[Event], near: float, memory_s: float
+def _maximise_likelihood(
+    start: DriftState, events: Sequence[Event], near: float, time_constant_s: float
 ) -> tuple[float, ProcessNoise]:
-    """Minus twice the log likelihood of the best density, and it."""
+    """Minus twice the log likelihood of the best density, and the process noise with it."""
 
-    def of(log_psd: float) -> ProcessNoise:
-        return ProcessNoise(near * float(np.exp(log_psd)), memory_s)
+    def with_density(log_psd: float) -> ProcessNoise:
+        return ProcessNoise(near * float(np.exp(log_psd)), time_constant_s)
 
     def cost(log_psd: float) -> float:
-        return _forwards(start, events, of(log_psd))[2]
+        return _run_forward(start, events, with_density(log_psd))[2]
 
-    grid = np.linspace(*_LOG_RANGE, 9)
-    costs = [cost(float(v)) for v in grid]
-    best = int(np.argmin(costs))
-    low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
+    grid = np.linspace(*_LOG_RANGE, _GRID)
+    best = int(np.argmin([cost(float(v)) for v in grid]))
+    low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _GRID - 1)])
     ratio = 0.5 * (np.sqrt(5.0) - 1.0)
     a, b = high - ratio * (high - low), low + ratio * (high - low)
     cost_a, cost_b = cost(a), cost(b)
-    # Seven steps leave a tenth of the logarithm, far less than what the data can tell.
     for _ in range(7):
         if cost_a < cost_b:
             high, b, cost_b = b, a, cost_a
@@ -183,4 +196,4 @@ def _likely_psd(
             low, a, cost_a = a, b, cost_b
             b = low + ratio * (high - low)
             cost_b = cost(b)
-    return min(cost_a, cost_b), of(0.5 * (low + high))
+    return min(cost_a, cost_b), with_density(0.5 * (low + high))

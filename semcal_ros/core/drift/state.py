@@ -1,22 +1,26 @@
-"""Drift and the positions of its keyframes, estimated together.
+"""State of the Kalman filter: the drift, and the positions of its keyframes.
 
-The state holds the drift p, its velocity v and acceleration a, and for each keyframe j where its
-picture lies: the drift m_j at which it seems to have been taken, and the velocity w_j by which it
-still is sheared. A frame with noise n that is registered against keyframe j has
+The keyframes are landmarks, as in simultaneous localisation and mapping (Smith, Self and Cheeseman
+1990, doi:10.1007/978-1-4613-8997-2_14). The state holds the drift p, its velocity v and its
+acceleration a, and for each keyframe j the drift m_j at which it seems to have been taken and the
+velocity w_j by which it still is sheared. A frame that is registered against keyframe j has
 
     shift = p + a b - m_j - Z e + n,        shear = T v - T_j w_j + n'
 
-with the frame times T, and with b = A^2 / 24 for an acquisition that takes A: so far the mean of an
-accelerated drift is from its middle. A zoom is about the principal point, of which the calibration
-may have an error e (px) that is the same at all magnifications: with Z = J^-1 - J_j^-1 (m per px)
-it looks like a drift when frame and keyframe have different magnifications, and in no other way.
-All of this is linear, so one Kalman filter holds it, with every correlation:
-the noise of a keyframe is shared by all frames that were registered against it and does not average
-out, and coming back to an old keyframe undoes what was lost on the way. A frame that becomes a
-keyframe itself seems to lie at ``m_new = m_j + shift`` exactly, noise and all, so that a chain of
-keyframes is no more than copies of the state.
+with noises n and n', the frame times T, and b = A^2 / 24 for an acquisition that takes A: the mean
+of an accelerated drift over the frame is a b away from the drift at its middle. A zoom is about the
+principal point, of which the calibration may have an error e (px) that is the same at all
+magnifications. With Z = J^-1 - J_j^-1 (m per px) it looks like a drift when frame and keyframe have
+different magnifications, and in no other case.
 
-What happens to the state is in :mod:`semcal_ros.core.drift.operations`. Any length unit will do.
+All of this is linear, so that one Kalman filter holds it, with every correlation. The noise of a
+keyframe is shared by all frames that were registered against it and does not average out; coming
+back to an old keyframe undoes what was lost on the way. A frame that becomes a keyframe itself
+seems to lie at ``m_new = m_j + shift`` exactly, noise and all, so that a chain of keyframes is no
+more than copies of the state.
+
+What happens to the state is in :mod:`semcal_ros.core.drift.operations`. The unit of length is
+arbitrary: m with a camera, px without.
 """
 
 from __future__ import annotations
@@ -27,16 +31,17 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = ["EACH", "MOVING", "OWN", "DriftState", "initial_state"]
+__all__ = ["BASE_SIZE", "KEYFRAME_SIZE", "MOTION_SIZE", "DriftState", "initial_state"]
 
 
-#: Numbers of drift, velocity and acceleration; with the error of the principal point; of a keyframe.
-MOVING, OWN, EACH = 6, 8, 4
+#: Numbers in the state: drift, velocity and acceleration; these with the error of the principal
+#: point; those of each keyframe.
+MOTION_SIZE, BASE_SIZE, KEYFRAME_SIZE = 6, 8, 4
 
 
 @dataclass(frozen=True)
 class DriftState:
-    """State at one time.
+    """State of the filter at one time.
 
     Attributes
     ----------
@@ -46,9 +51,9 @@ class DriftState:
         (8 + 4 k,) ``[x, y, vx, vy, ax, ay, ex, ey]``, then ``[mx, my, wx, wy]`` of each of the k
         keyframes.
     covariance
-        Of ``mean``.
+        Covariance of ``mean``.
     keys
-        Numbers of the keyframes, in the order of the state.
+        Numbers that name the keyframes, in the order of the state.
     """
 
     time_s: float
@@ -77,43 +82,41 @@ class DriftState:
         return self.mean[2:6]
 
     @property
-    def centre_error_px(self) -> tuple[Array, Array]:
-        """(2,) error of the principal point that the zooms so far tell, px, and its covariance."""
-        part = slice(MOVING, OWN)
-        return self.mean[part], self.covariance[part, part]
-
-    @property
-    def own(self) -> Array:
+    def drift_covariance(self) -> Array:
         """(4, 4) covariance of drift and velocity."""
         return self.covariance[:4, :4]
 
-    def of(self, key: int) -> slice:
-        """Where a keyframe's four numbers stand."""
-        start = OWN + EACH * self.keys.index(key)
-        return slice(start, start + EACH)
+    def keyframe_slice(self, key: int) -> slice:
+        """Where the four numbers of a keyframe are in ``mean``."""
+        start = BASE_SIZE + KEYFRAME_SIZE * self.keys.index(key)
+        return slice(start, start + KEYFRAME_SIZE)
 
-    def where(self, key: int) -> Array:
+    def keyframe_state(self, key: int) -> Array:
         """(4,) ``[mx, my, wx, wy]`` of a keyframe."""
-        return self.mean[self.of(key)]
+        return self.mean[self.keyframe_slice(key)]
 
-    def shift_from(self, key: int) -> tuple[Array, Array]:
+    def predict_shift(self, key: int) -> tuple[Array, Array]:
         """Expected shift (2,) of a frame taken now against a keyframe, and its covariance (2, 2)."""
-        row = np.zeros((2, self.mean.size))
-        at = self.of(key).start
-        row[:, :2], row[:, at : at + 2] = np.eye(2), -np.eye(2)
-        return row @ self.mean, row @ self.covariance @ row.T
+        jacobian = np.zeros((2, self.mean.size))
+        start = self.keyframe_slice(key).start
+        jacobian[:, :2], jacobian[:, start : start + 2] = np.eye(2), -np.eye(2)
+        return jacobian @ self.mean, jacobian @ self.covariance @ jacobian.T
 
     def without_keyframes(self) -> DriftState:
-        """The same drift with nothing to compare pictures with: small, for what needs no more."""
-        return DriftState(self.time_s, self.mean[:OWN].copy(), self.covariance[:OWN, :OWN].copy())
+        """The drift alone, which is all that a prediction needs."""
+        return DriftState(
+            self.time_s,
+            self.mean[:BASE_SIZE].copy(),
+            self.covariance[:BASE_SIZE, :BASE_SIZE].copy(),
+        )
 
 
 def initial_state(time_s: float, centre_covariance: Array | None = None) -> DriftState:
-    """The beginning: no drift, by definition, and no velocity known yet.
+    """State at the first frame: zero drift, by definition, and no velocity yet.
 
-    ``centre_covariance`` (2, 2) is that of the principal point, px^2; None where it is known.
+    ``centre_covariance`` (2, 2) is that of the principal point, px^2; None where that is exact.
     """
-    covariance = np.zeros((OWN, OWN))
+    covariance = np.zeros((BASE_SIZE, BASE_SIZE))
     if centre_covariance is not None:
-        covariance[MOVING:, MOVING:] = centre_covariance
-    return DriftState(time_s, np.zeros(OWN), covariance)
+        covariance[MOTION_SIZE:, MOTION_SIZE:] = centre_covariance
+    return DriftState(time_s, np.zeros(BASE_SIZE), covariance)

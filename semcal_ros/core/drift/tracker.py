@@ -1,21 +1,21 @@
 """Live drift: registration against keyframes, filtered, in metres.
 
-Every frame is registered against a keyframe, so that errors do not add up from frame to frame; the
+Every frame is registered against a keyframe, so that errors do not add up from frame to frame. The
 keyframe is replaced before its overlap with the picture is lost, and an old one is used again when
 its place comes back into view. One Kalman filter holds the drift, its velocity and the positions of
 the keyframes (:mod:`semcal_ros.core.drift.state`); it predicts each shift, gates it and bridges
-frames that cannot be used. Sign: drift is the displacement of the specimen, so what lay at X in the
-first frame is seen at X + drift.
+frames that cannot be used.
+
+Drift is the displacement of the specimen: what lay at X in the first frame is seen at X + drift.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
@@ -24,9 +24,9 @@ from semcal_ros.core.drift.camera_uncertainty import (
     scale_covariance,
 )
 from semcal_ros.core.drift.estimates import (
-    DriftForecast,
     DriftPredictor,
     DriftSettings,
+    DriftStatus,
     DriftUpdate,
 )
 from semcal_ros.core.drift.filter import DriftFilter
@@ -34,43 +34,118 @@ from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
     GATE,
     OutlierTest,
-    of_a_contradiction,
-    of_a_pause,
-    of_another_place,
+    inflate_after_pause,
+    inflate_if_contradicted,
+    inflate_when_lost,
 )
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.keyframe import keyframe_of
-from semcal_ros.core.drift.keyframe_store import KeyframeStore
-from semcal_ros.core.drift.matching import Match, is_mergeable, match_keyframe
+from semcal_ros.core.drift.keyframe import make_keyframe
+from semcal_ros.core.drift.keyframe_store import Candidate, KeyframeStore
 from semcal_ros.core.drift.measurement import (
-    acceleration_term_s2,
-    at_itself,
-    becoming_keyframe,
-    loosened,
+    add_zoom_uncertainty,
+    clone_keyframe,
+    exceeds_tolerance,
+    keyframe_noise,
+    make_measurement,
+    measure_itself,
 )
-from semcal_ros.core.drift.operations import Marginalise, Measure, Predict
-from semcal_ros.core.drift.state import initial_state
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.registration.register import Registration
+from semcal_ros.core.drift.operations import CorrectShear, Marginalise, Measure, Predict
+from semcal_ros.core.drift.state import DriftState, initial_state
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
+from semcal_ros.core.registration.reference import Region
+from semcal_ros.core.registration.register import Registration, register
 
-__all__ = ["DriftForecast", "DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
+__all__ = ["DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 
-# Multiple of the first step's sigma within which a shift agrees with what was expected.
-_REACH = 2.0
+# Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
+_REACH_SIGMAS = 2.0
+# The velocity is expected to change by this part of the first step per frame, to begin with.
+_VELOCITY_CHANGE = 0.1
+# A disputed position counts as three standard deviations away.
+_DISPUTED_SIGMAS = 3.0
 # Changes of scale up to which the keyframe stays in use, resampled for each frame.
 _SMALL_ZOOM = 1.15
-# A picture that has come to differ that much from its keyframe needs another one.
-_LIKE_ENOUGH = 0.75
+# A frame whose correlation with its keyframe is lower takes its place: the specimen changes.
+_MIN_CORRELATION = 0.75
+# What frames must be like to become part of their keyframe's mean: a higher correlation, a gain
+# within a factor of two, and a shear that does not blur it.
+_MIN_MERGE_CORRELATION, _MERGE_GAINS, _MAX_MERGE_SHEAR_PX = 0.85, (0.5, 2.0), 0.1
 # A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
 # noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
-# frame's noise, this much, and this much times the part that did not overlap, as seen in the closure
-# of triples of frames.
+# frame's noise, this part, and this part times the fraction that did not overlap, as seen in the
+# closure of triples of frames.
 _COPY_NOISE, _COPY_NOISE_BESIDE = 0.15, 5.0
-_FROZEN = "image: the same picture as the frame before"
-# After so many frame intervals without a frame nothing says that the drift went on as it was.
+# After this number of frame intervals without a frame nothing says that the drift went on as it was.
 _PAUSE = 10.0
+# Keyframes to try; twice as many where nothing matched before.
 _CANDIDATES = 2
+# Registrations of one frame; each removes the shear that the one before it measured.
+_MAX_REGISTRATIONS = 4
+# Part of the picture's height by which drift may shear it.
+_MAX_SHEAR = 0.1
+# Divisions by intervals stay finite.
+_MIN_INTERVAL_S = 1e-9
+
+
+@dataclass
+class _Track:
+    """Everything that is known since the drift was zero.
+
+    ``camera`` and ``time_s`` are those of the latest frame, ``sample`` is some of its pixels, and
+    ``rejected`` is the number of frames in a row that did not match.
+    """
+
+    filter: DriftFilter
+    store: KeyframeStore
+    camera: ScanCamera | None
+    time_s: float
+    sample: bytes
+    outliers: OutlierTest = field(default_factory=OutlierTest)
+    rejected: int = 0
+
+
+@dataclass(frozen=True)
+class _Match:
+    """A registration that holds against a keyframe.
+
+    Attributes
+    ----------
+    candidate
+        The keyframe.
+    registration
+        Shift in px.
+    picture, region
+        The frame as it was compared, and the part of it that was scanned.
+    removed
+        (4,) drift velocity and acceleration that were removed from it.
+    measure
+        The measurement for the filter.
+    keyframe_time_s
+        Time of the keyframe.
+    """
+
+    candidate: Candidate
+    registration: Registration
+    picture: AnyImage
+    region: Region
+    removed: Array
+    measure: Measure
+    keyframe_time_s: float
+
+
+@dataclass(frozen=True)
+class _RejectedMatch:
+    """A registration against a keyframe that is not used.
+
+    ``disputed`` (2, 2) is what a shift that contradicts the prediction adds to the covariance of
+    the drift: one of the two is wrong. It is None where the registration failed.
+    """
+
+    rejection: Rejection[MatchFailure]
+    registration: Registration
+    disputed: Array | None = None
 
 
 class DriftTracker:
@@ -80,36 +155,40 @@ class DriftTracker:
     Parameters
     ----------
     settings
-        How.
+        How to track.
     history
-        Where to keep what a second look with hindsight needs: some kB per frame.
+        Where to keep what a smoother needs: some kB per frame.
     """
 
     def __init__(
         self, settings: DriftSettings | None = None, *, history: DriftHistory | None = None
     ) -> None:
         self.settings = settings or DriftSettings()
-        self._stills = MotionCorrector(self.settings.interpolation)
+        self._corrector = MotionCorrector(self.settings.interpolation)
         self._history = history
-        self.reset()
+        self._track: _Track | None = None
 
     def reset(self) -> None:
         """Forget everything: the next frame has zero drift."""
-        limits = self.settings
-        self._filter: DriftFilter | None = None
-        self._store = KeyframeStore(
-            limits.registration, limits.max_keyframe_bytes, limits.max_keyframes
-        )
-        self._misses = 0
-        self._surprises = OutlierTest()
-        # Camera and time of the frame before.
-        self._last: tuple[ScanCamera | None, float] | None = None
-        self._doubt = np.zeros((2, 2))
-        self._sample = b""
+        self._track = None
+
+    def predictor(self) -> DriftPredictor:
+        """What is known now of the drift at times after that of the last frame.
+
+        Raises
+        ------
+        InvalidValueError
+            If there was no frame yet.
+        """
+        track = self._track
+        if track is None:
+            raise InvalidValueError("a forecast before the first frame", expected="a frame before")
+        state = track.filter.state.without_keyframes()
+        return DriftPredictor(state, track.filter.process_noise, track.camera)
 
     def update(
         self,
-        image: NDArray[np.generic],
+        image: AnyImage,
         time_s: float,
         camera: ScanCamera | None = None,
         timing: ScanTiming | None = None,
@@ -126,11 +205,11 @@ class DriftTracker:
             Start of its acquisition. A time before that of the last frame resets the tracker.
         camera
             Camera of this frame's magnification; None tracks in raw pixels. A stream that gains or
-            loses its camera starts anew, because its unit changes.
+            loses its camera starts again, because its unit changes.
         timing
             Raster timing; None takes the frame as an instant at ``time_s``.
         rectified
-            The picture already is in ideal pixels of ``camera``.
+            Whether the picture already is in ideal pixels of ``camera``.
 
         Raises
         ------
@@ -142,279 +221,410 @@ class DriftTracker:
         picture = resampleable(image)
         height, width = picture.shape[:2]
         fitted = None if camera is None else camera.resized(width, height)
-        shot = ScanFrame(picture, fitted, timing, rectified)
+        frame = ScanFrame(picture, fitted, timing, rectified)
         centre_s = time_s + (timing.centre_offset_s if timing is not None else 0.0)
-        if self._last is not None and (
-            centre_s < self._last[1] or (self._last[0] is None) != (fitted is None)
+        track = self._track
+        if track is not None and (
+            centre_s < track.time_s or (track.camera is None) != (fitted is None)
         ):
-            self.reset()
-        if self._filter is None or len(self._store) == 0:
-            update = self._first(shot, centre_s)
+            track = self._track = None
+        if track is None or len(track.store) == 0:
+            track, update = self._begin(frame, centre_s)
+            self._track = track
         else:
-            self._advance(self._filter, shot, centre_s)
-            update = self._followed(self._filter, shot)
-        assert self._filter is not None
-        self._filter.mark()
-        self._last = fitted, centre_s
+            self._predict(track, frame, centre_s)
+            update = self._follow(track, frame)
+        track.filter.mark_frame()
+        track.camera, track.time_s = fitted, centre_s
         if self._history is not None:
             self._history.add(update, fitted)
         return update
 
-    # -- beginning --------------------------------------------------------------------------------
+    # -- the first frame --------------------------------------------------------------------------
 
-    def _first(self, shot: ScanFrame, centre_s: float) -> DriftUpdate:
+    def _begin(self, frame: ScanFrame, centre_s: float) -> tuple[_Track, DriftUpdate]:
+        """Start with zero drift."""
+        settings = self.settings
+        start = initial_state(centre_s, centre_covariance(frame.camera))
         kept = self._history is not None
-        start = initial_state(centre_s, centre_covariance(shot.camera))
-        self._filter = DriftFilter(start, self.settings.acceleration_psd, history=kept)
+        drift_filter = DriftFilter(start, settings.acceleration_psd, history=kept)
         if self._history is not None:
-            self._history.begin(self._filter)
-        self._sample = shot.sample
-        complaint = self._new_key(self._filter, shot, np.zeros(4))
-        if complaint:
+            self._history.begin(drift_filter)
+        store = KeyframeStore(
+            settings.registration, settings.max_keyframe_bytes, settings.max_keyframes
+        )
+        track = _Track(drift_filter, store, frame.camera, centre_s, frame.sample)
+        rejection = self._add_keyframe(track, frame, np.zeros(4))
+        if rejection is not None:
             # Nothing can be measured against such a picture: wait for a better one.
-            return self._report(shot, f"coasting: {complaint}", None, np.nan)
-        return self._report(shot, "keyframe", None, 1.0)
+            return track, _make_update(start, frame, DriftStatus.COASTING, rejection)
+        state = track.filter.state
+        return track, _make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0)
 
-    def _new_key(self, drift: DriftFilter, shot: ScanFrame, removed: Array) -> str:
-        """This frame becomes a keyframe that was not measured; why it cannot, or an empty
-        string.
-        """
-        picture, region = self._stills.of(shot, removed)
-        keyframe = keyframe_of(shot, removed, picture, region, drift.state.time_s)
-        reference = keyframe.reference(self.settings.registration)
-        if not reference.defect:
-            key, gone = self._store.add(keyframe, reference)
-            drift.settle_later(key, removed, acceleration_term_s2(shot))
-            for old in gone:
-                drift.do(Marginalise(old))
-        return reference.defect
+    def _add_keyframe(
+        self, track: _Track, frame: ScanFrame, removed: Array
+    ) -> Rejection[MatchFailure] | None:
+        """Make this frame a keyframe that was not measured; why it cannot be one, or None."""
+        picture, region = self._corrector.corrected_image(frame, removed)
+        keyframe = make_keyframe(frame, removed, picture, region, track.filter.state.time_s)
+        reference = keyframe.prepare_reference(self.settings.registration)
+        if reference.defect:
+            return Rejection(MatchFailure.UNUSABLE_IMAGE, reference.defect)
+        key, forgotten = track.store.add(keyframe, reference)
+        track.filter.add_keyframe(key, removed, frame.acceleration_term_s2)
+        for old in forgotten:
+            track.filter.apply(Marginalise(old))
+        return None
 
-    def _advance(self, drift: DriftFilter, shot: ScanFrame, centre_s: float) -> None:
-        dt = centre_s - drift.state.time_s
-        if drift.measured == 0 and dt > 0.0 and not np.any(drift.state.own[2:, 2:]):
-            # Until a second frame sets the pace, all that is known of the velocity is how far drift
-            # gets in a frame; a tenth of that is how much the pace is expected to change.
-            unit_from_px = np.linalg.inv(shot.px_from_unit)
+    # -- every other frame ------------------------------------------------------------------------
+
+    def _predict(self, track: _Track, frame: ScanFrame, centre_s: float) -> None:
+        """Predict the state at the time of the frame."""
+        drift_filter = track.filter
+        dt = centre_s - drift_filter.state.time_s
+        if (
+            drift_filter.measured == 0
+            and dt > 0.0
+            and not np.any(drift_filter.state.drift_covariance[2:, 2:])
+        ):
+            # The second frame tells the interval, and how far drift gets in it is all that is known
+            # of the velocity.
+            unit_from_px = np.linalg.inv(frame.px_from_unit)
             step = self.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
-            drift.first_velocity(step / dt, (0.1 * step) ** 2 / dt**3, dt)
-        speed = float(np.hypot(*drift.state.velocity))
-        drift.do(Predict(centre_s))
-        if 0.0 < _PAUSE * drift.restlessness.memory_s < dt:
-            drift.do(of_a_pause(speed, dt))
+            drift_filter.set_motion_prior(step / dt, (_VELOCITY_CHANGE * step) ** 2 / dt**3, dt)
+        speed = float(np.hypot(*drift_filter.state.velocity))
+        drift_filter.apply(Predict(centre_s))
+        if 0.0 < _PAUSE * drift_filter.process_noise.time_constant_s < dt:
+            drift_filter.apply(inflate_after_pause(speed, dt))
+
+    def _follow(self, track: _Track, frame: ScanFrame) -> DriftUpdate:
+        """Register the frame against the best keyframes, until one of them holds."""
+        settings = self.settings
+        sample = frame.sample
+        is_repeated, track.sample = sample == track.sample, sample
+        candidates = track.store.candidates(
+            track.filter.state, frame, settings.rekey_overlap, settings.max_ratio
+        )
+        if not candidates:
+            ratio = track.store.smallest_scale_ratio(frame)
+            reason = f"scale changed by a factor of {ratio:.2f}"
+            return self._restart(track, frame, Rejection(MatchFailure.SCALE_CHANGE, reason))
+        # Where nothing matched before, the picture may be that of any of them.
+        is_steady = track.rejected == 0 and track.filter.pending is None
+        rejected: list[_RejectedMatch] = []
+        for candidate in candidates[: _CANDIDATES if is_steady else 2 * _CANDIDATES]:
+            match = self._match(track, frame, candidate)
+            if isinstance(match, _Match) and is_repeated:
+                # Noise never comes twice: the scan is paused, or the driver sent the frame again.
+                reason = "image: the same picture as the frame before"
+                repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
+                match = _RejectedMatch(repeated, match.registration)
+            if isinstance(match, _Match):
+                refused = self._use(track, frame, match)
+                if refused is None:
+                    return self._finish(track, frame, match)
+                match = refused
+            rejected.append(match)
+        return self._coast(track, frame, rejected, candidates[0].rescaled)
+
+    # -- matching ---------------------------------------------------------------------------------
+
+    def _match(
+        self, track: _Track, frame: ScanFrame, candidate: Candidate
+    ) -> _Match | _RejectedMatch:
+        """Register a frame, and again without the shear that a wrong velocity has left in it.
+
+        The noise of a keyframe that nothing was compared with before becomes known to the filter.
+        """
+        motion = track.filter.state.motion
+        first = motion if _is_removable(motion, frame) else np.zeros(4)
+        match = self._match_once(track, frame, candidate, first)
+        for _ in range(_MAX_REGISTRATIONS - 1):
+            if isinstance(match, _RejectedMatch):
+                break
+            state = match.measure(track.filter.state, track.filter.process_noise).state
+            if not _is_removable(state.motion, frame):
+                # A jump, not a drift: the gate decides.
+                break
+            corrected = self._correct_keyframe(track, candidate, state)
+            if not corrected and not exceeds_tolerance(state.motion - match.removed, frame):
+                break
+            again = self._match_once(track, frame, candidate, state.motion)
+            if isinstance(again, _RejectedMatch):
+                break
+            match = again
+        return match
+
+    def _match_once(
+        self, track: _Track, frame: ScanFrame, candidate: Candidate, motion: Array
+    ) -> _Match | _RejectedMatch:
+        """Register a frame that is corrected for a motion."""
+        store, key = track.store, candidate.key
+        picture, region = self._corrector.corrected_image(frame, motion)
+        reference = (
+            store.resampled_reference(key, frame) if candidate.rescaled else store.reference(key)
+        )
+        shift, covariance = track.filter.state.predict_shift(key)
+        px_from_unit = frame.px_from_unit
+        registration = register(
+            reference,
+            picture,
+            guess_px=px_from_unit @ shift,
+            guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
+            image_region=region,
+            max_shear_px=_MAX_SHEAR * frame.size[1],
+        )
+        if registration.rejection is not None:
+            return _RejectedMatch(registration.rejection, registration)
+        keyframe = store[key]
+        averaged = np.inf if candidate.rescaled else float(store.averaged(key))
+        measure = make_measurement(key, keyframe.frame, frame, registration, motion, averaged)
+        if track.filter.pending == key:
+            track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
+        return _Match(candidate, registration, picture, region, motion, measure, keyframe.time_s)
+
+    def _correct_keyframe(self, track: _Track, candidate: Candidate, state: DriftState) -> bool:
+        """Take the shear out of a keyframe; whether there was any. Only a single frame has one."""
+        keyframe = track.store[candidate.key]
+        velocity = state.keyframe_state(candidate.key)[2:]
+        remaining = np.append(velocity, np.zeros(2))
+        if (
+            candidate.rescaled
+            or keyframe.averaged > 1
+            or not exceeds_tolerance(remaining, keyframe.frame)
+        ):
+            return False
+        removed = keyframe.removed + remaining
+        picture, region = self._corrector.corrected_image(keyframe.frame, removed)
+        corrected = make_keyframe(keyframe.frame, removed, picture, region, keyframe.time_s)
+        track.store.replace(candidate.key, corrected)
+        term_s2 = keyframe.frame.acceleration_term_s2
+        track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
+        return True
 
     # -- measuring --------------------------------------------------------------------------------
 
-    def _followed(self, drift: DriftFilter, shot: ScanFrame) -> DriftUpdate:
-        limits = self.settings
-        self._doubt = np.zeros((2, 2))
-        sample = shot.sample
-        frozen, self._sample = sample == self._sample, sample
-        candidates = self._store.candidates(
-            drift.state, shot, limits.rekey_overlap, limits.max_ratio
-        )
-        if not candidates:
-            ratio = self._store.least_ratio(shot)
-            return self._restarted(drift, shot, f"scale changed by a factor of {ratio:.2f}")
-        refusal: tuple[str, Registration] | None = None
-        # Where nothing matched before, the picture may be that of any of them.
-        tried = _CANDIDATES if self._misses == 0 and drift.pending is None else 2 * _CANDIDATES
-        for candidate in candidates[:tried]:
-            found = match_keyframe(drift, self._store, candidate, shot, self._stills)
-            if isinstance(found, Registration):
-                refusal = refusal or (found.reason, found)
-                continue
-            # Noise never comes twice: the scan is paused, or the driver sent the frame again.
-            reason = _FROZEN if frozen else self._accepted(drift, shot, found)
-            if not reason:
-                return self._kept(drift, shot, found)
-            refusal = refusal or (reason, found.registration)
-        assert refusal is not None
-        return self._missed(drift, shot, *refusal, candidates[0].rescaled)
-
-    def _accepted(self, drift: DriftFilter, shot: ScanFrame, found: Match) -> str:
-        """Use a measurement, or say why not."""
-        state, measure = drift.state, found.measure
-        before = self._store[measure.key].shot
-        expected, _ = state.shift_from(measure.key)
-        away_px = np.abs(shot.px_from_unit @ (measure.shift[:2] - expected))
-        loose = loosened(measure, before, shot) if found.candidate.rescaled else measure
-        outcome = loose(state, drift.restlessness)
-        unexpected = drift.measured == 0 or outcome.nis > GATE
-        # If it is refused, either is wrong, and the one who reads the drift has to be warned.
-        doubt = (measure.shift[:2] - expected) / 3.0
-        self._doubt = np.outer(doubt, doubt)
-        if unexpected and np.any(away_px > self.settings.max_jump * np.array(shot.size)):
-            return f"jump of ({away_px[0]:.0f}, {away_px[1]:.0f}) px: a move of the stage"
+    def _use(self, track: _Track, frame: ScanFrame, match: _Match) -> _RejectedMatch | None:
+        """Update the filter by a match, unless it contradicts the prediction."""
+        drift_filter, state, measure = track.filter, track.filter.state, match.measure
+        expected, _ = state.predict_shift(measure.key)
+        innovation = measure.shift[:2] - expected
+        keyframe = track.store[measure.key]
+        zoomed = measure
+        if match.candidate.rescaled:
+            zoomed = add_zoom_uncertainty(measure, keyframe.frame, frame)
+        outcome = zoomed(state, drift_filter.process_noise)
+        is_first, is_outlier = drift_filter.measured == 0, outcome.nis > GATE
+        deviation = innovation / _DISPUTED_SIGMAS
+        disputed = np.outer(deviation, deviation)
+        x_px, y_px = np.abs(frame.px_from_unit @ innovation)
+        width, height = frame.size
+        max_jump = self.settings.max_jump
+        if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
+            reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
+            rejection = Rejection(MatchFailure.STAGE_MOVE, reason)
+            return _RejectedMatch(rejection, match.registration, disputed)
         if outcome.shear_nis > GATE:
-            measure = measure.of_shift()
-        since_s = state.time_s - (self._last[1] if self._last else state.time_s)
-        # The first step has only a guessed prior, which must not refuse what two looks agree on.
-        if drift.measured > 0 and outcome.nis > GATE:
-            seen = measure.shift[:2] + state.where(measure.key)[:2]
+            measure = measure.without_shear()
+        since_s = state.time_s - track.time_s
+        # The first step has only a guessed prior, which must not refuse what was registered well.
+        if is_outlier and not is_first:
+            position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
             # What moves fast may also turn fast.
-            step_px = float(np.hypot(*(shot.px_from_unit @ state.velocity))) * since_s
-            reach_px = max(_REACH * self.settings.first_step_px, step_px)
-            reach = np.asarray(reach_px * np.linalg.inv(shot.px_from_unit))
-            widened = self._surprises.believed(state, seen, reach, state.time_s - since_s)
-            if widened is None:
-                return f"shift is {np.sqrt(outcome.nis):.0f} deviations from the prediction"
-            drift.do(widened)
-        if found.candidate.ratio > _SMALL_ZOOM:
-            measure = self._carried(drift, shot, found, replace(measure, zoom=loose.zoom))
-        elif found.candidate.rescaled:
+            step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * since_s
+            reach_px = max(_REACH_SIGMAS * self.settings.first_step_px, step_px)
+            reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
+            inflation = track.outliers.explain(state, position, reach, track.time_s)
+            if inflation is None:
+                deviations = np.sqrt(outcome.nis)
+                reason = f"shift is {deviations:.0f} deviations from the prediction"
+                rejection = Rejection(MatchFailure.OUTLIER, reason)
+                return _RejectedMatch(rejection, match.registration, disputed)
+            drift_filter.apply(inflation)
+        if match.candidate.ratio > _SMALL_ZOOM:
+            measure = self._change_scale(track, frame, match, replace(measure, zoom=zoomed.zoom))
+        elif match.candidate.rescaled:
             # A zoom in small steps would make a long chain of keyframes.
-            measure = loose
-        self._doubt = np.zeros((2, 2))
-        drift.accept(measure)
-        drift.adapt(outcome.nis, measure.covariance[:2, :2], since_s)
-        return ""
+            measure = zoomed
+        drift_filter.update(measure)
+        drift_filter.adapt_process_noise(outcome.nis, measure.covariance[:2, :2], since_s)
+        return None
 
-    def _carried(
-        self, drift: DriftFilter, shot: ScanFrame, found: Match, measure: Measure
+    def _change_scale(
+        self, track: _Track, frame: ScanFrame, match: _Match, measure: Measure
     ) -> Measure:
-        """This frame becomes the keyframe of its magnification, by way of one of another; what it
-        says of the drift.
+        """Make this frame the keyframe of its magnification, by way of one of another; its
+        measurement against itself.
         """
-        before, now = self._store[measure.key].shot.camera, shot.camera
+        before, now = track.store[measure.key].frame.camera, frame.camera
         assert before is not None and now is not None
         noise = carry_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
-        key = self._rekey(drift, shot, found, measure, noise)
-        return at_itself(key, measure, found.removed)
+        key = _rekey(track, frame, match, measure, noise)
+        return measure_itself(key, measure, match.removed)
 
-    def _rekey(
-        self, drift: DriftFilter, shot: ScanFrame, found: Match, measure: Measure, noise: Array
-    ) -> int:
-        """Make this frame a keyframe, as it was measured against the one before."""
-        keyframe = keyframe_of(shot, found.removed, found.picture, found.region, drift.state.time_s)
-        key, gone = self._store.add(keyframe)
-        drift.do(becoming_keyframe(key, drift.state, measure, found.removed, noise))
-        for old in gone:
-            drift.do(Marginalise(old))
-        return key
+    # -- afterwards -------------------------------------------------------------------------------
 
-    # -- after ------------------------------------------------------------------------------------
-
-    def _kept(self, drift: DriftFilter, shot: ScanFrame, found: Match) -> DriftUpdate:
-        """Bookkeeping of a frame that was registered: the keyframe in use, and its mean."""
-        self._misses = 0
-        self._surprises.forget(drift.state)
-        registration, candidate = found.registration, found.candidate
-        overlap = registration.alignment.overlap
+    def _finish(self, track: _Track, frame: ScanFrame, match: _Match) -> DriftUpdate:
+        """Choose the keyframe for the frames that follow, and improve its mean."""
+        store, state = track.store, track.filter.state
+        track.rejected = 0
+        track.outliers.reset(state)
+        registration, candidate = match.registration, match.candidate
         if candidate.ratio > _SMALL_ZOOM:
-            return self._report(shot, "keyframe", registration, overlap)
-        self._store.use(candidate.key)
-        status, enough, joined = "tracked", self.settings.rekey_overlap, False
-        unlike = registration.correlation < _LIKE_ENOUGH
-        if unlike or overlap < enough:
-            following = self._store.candidates(drift.state, shot, enough, _SMALL_ZOOM)
-            if unlike or following[0].overlap < enough:
+            return _make_update(state, frame, DriftStatus.KEYFRAME, registration=registration)
+        store.use(candidate.key)
+        status, merged = DriftStatus.TRACKED, False
+        overlap, enough = registration.alignment.overlap, self.settings.rekey_overlap
+        is_changed = registration.correlation < _MIN_CORRELATION
+        if is_changed or overlap < enough:
+            following = store.candidates(state, frame, enough, _SMALL_ZOOM)
+            if is_changed or following[0].overlap < enough:
                 share = _COPY_NOISE + _COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
-                noise = found.measure.covariance[:2, :2] * share
-                measure = found.measure
+                noise = match.measure.covariance[:2, :2] * share
+                measure = match.measure
                 if candidate.rescaled:
-                    before = self._store[candidate.key].shot
-                    measure = loosened(measure, before, shot)
-                self._rekey(drift, shot, found, measure, noise)
-                status = "keyframe"
-        elif joined := self.settings.average and is_mergeable(found, self._store):
-            keyframe = self._store[candidate.key]
-            better = keyframe.with_frame(found.picture, found.region, registration)
-            self._store.replace(candidate.key, better)
-        update = self._report(shot, status, registration, overlap)
-        return replace(update, keyframe_time_s=found.keyframe_time_s, joined=joined)
+                    before = store[candidate.key].frame
+                    measure = add_zoom_uncertainty(measure, before, frame)
+                _rekey(track, frame, match, measure, noise)
+                status = DriftStatus.KEYFRAME
+        elif self.settings.average and _is_mergeable(match, store):
+            keyframe = store[candidate.key]
+            mean = keyframe.with_frame(match.picture, match.region, registration)
+            store.replace(candidate.key, mean)
+            merged = True
+        update = _make_update(track.filter.state, frame, status, registration=registration)
+        return replace(update, keyframe_time_s=match.keyframe_time_s, merged=merged)
 
-    def _missed(
-        self,
-        drift: DriftFilter,
-        shot: ScanFrame,
-        reason: str,
-        registration: Registration,
-        rescaled: bool,
+    def _coast(
+        self, track: _Track, frame: ScanFrame, rejected: list[_RejectedMatch], rescaled: bool
     ) -> DriftUpdate:
-        unusable = reason.startswith("image:")
-        # A blanked beam says nothing about the keyframe.
-        self._misses += 0 if unusable else 1
-        since_s = max(drift.state.time_s - (self._last[1] if self._last else 0.0), 1e-9)
-        nearest = np.asarray(np.linalg.solve(shot.px_from_unit, registration.nearest_px))
-        doubt = of_a_contradiction(drift.state, self._store.current, nearest, since_s)
-        lost = self._misses >= self.settings.lost_after
-        if lost:
-            reach_px = self.settings.max_jump * max(shot.size)
-            pace_px = self.settings.first_step_px / since_s
-            doubt = of_another_place(shot.px_from_unit, reach_px, pace_px)
-        if doubt is not None:
-            drift.do(doubt)
-        if lost or (rescaled and not unusable):
-            return self._restarted(drift, shot, reason)
-        return self._report(
-            shot, f"coasting: {reason}", registration, registration.alignment.overlap
-        )
-
-    def _restarted(self, drift: DriftFilter, shot: ScanFrame, reason: str) -> DriftUpdate:
-        """Go on from the predicted drift with this frame as keyframe."""
-        useless = drift.pending
-        complaint = self._new_key(drift, shot, drift.state.motion)
-        if not complaint:
-            if useless is not None and len(self._store) > 2:
-                # Nothing was ever like it.
-                self._store.forget(useless)
-                drift.do(Marginalise(useless))
-            self._misses = 0
-            self._surprises.forget()
-        status = f"coasting: {complaint or reason}"
-        return self._report(shot, status, None, np.nan, restarted=not complaint)
-
-    def _report(
-        self,
-        shot: ScanFrame,
-        status: str,
-        registration: Registration | None,
-        overlap: float,
-        *,
-        restarted: bool = False,
-    ) -> DriftUpdate:
-        assert self._filter is not None
-        state = self._filter.state
-        reason = status.removeprefix("coasting: ") if status.startswith("coasting") else ""
-        open_ = scale_covariance(shot.camera, state.position, state.velocity)
-        open_[:2, :2] += self._doubt
-        joint = np.full(4, np.nan) if registration is None else registration.alignment.joint_px
-        spread = (
-            np.full((4, 4), np.inf)
-            if registration is None
-            else registration.alignment.joint_covariance
-        )
-        return DriftUpdate(
-            time_s=state.time_s,
-            drift_m=state.position.copy(),
-            velocity_m_s=state.velocity.copy(),
-            acceleration_m_s2=state.acceleration.copy(),
-            covariance=state.own + open_,
-            status=status,
-            accepted=not reason,
-            reason=reason,
-            residual=float("nan") if registration is None else registration.alignment.residual_rms,
-            px_from_unit=shot.px_from_unit,
-            overlap=overlap,
-            calibrated=shot.camera is not None,
-            restarted=restarted,
-            shear_px=joint[2:],
-            shear_covariance=spread[2:, 2:],
-            keyframe_time_s=float("nan"),
-            joined=False,
-        )
-
-    # -- other times ------------------------------------------------------------------------------
-
-    def outlook(self) -> DriftPredictor:
-        """What is known now of the drift at times after the last frame's.
-
-        Raises
-        ------
-        InvalidValueError
-            If there was no frame yet.
+        """Keep the prediction, with a larger covariance where the picture contradicts it; start
+        again from it where the frame or its scale is lost.
         """
-        if self._filter is None or self._last is None:
-            raise InvalidValueError("a forecast before the first frame", expected="a frame before")
-        state = self._filter.state.without_keyframes()
-        return DriftPredictor(state, self._filter.restlessness, self._last[0])
+        # The first one is that of the best keyframe.
+        rejection, registration = rejected[0].rejection, rejected[0].registration
+        disputed = next((r.disputed for r in rejected[::-1] if r.disputed is not None), None)
+        # A blanked beam says nothing about the keyframe.
+        is_of_keyframe = rejection.status not in IMAGE_FAILURES
+        track.rejected += is_of_keyframe
+        state = track.filter.state
+        since_s = max(state.time_s - track.time_s, _MIN_INTERVAL_S)
+        is_lost = track.rejected >= self.settings.lost_after
+        if is_lost:
+            reach_px = self.settings.max_jump * max(frame.size)
+            speed_px_s = self.settings.first_step_px / since_s
+            track.filter.apply(inflate_when_lost(frame.px_from_unit, reach_px, speed_px_s))
+        else:
+            nearest = np.asarray(np.linalg.solve(frame.px_from_unit, registration.nearest_px))
+            inflation = inflate_if_contradicted(state, track.store.current, nearest, since_s)
+            if inflation is not None:
+                track.filter.apply(inflation)
+        if is_lost or (rescaled and is_of_keyframe):
+            return self._restart(track, frame, rejection, disputed)
+        return _make_update(
+            track.filter.state,
+            frame,
+            DriftStatus.COASTING,
+            rejection,
+            registration=registration,
+            disputed=disputed,
+        )
+
+    def _restart(
+        self,
+        track: _Track,
+        frame: ScanFrame,
+        rejection: Rejection[MatchFailure],
+        disputed: Array | None = None,
+    ) -> DriftUpdate:
+        """Go on from the predicted drift with this frame as keyframe."""
+        unmatched = track.filter.pending
+        defect = self._add_keyframe(track, frame, track.filter.state.motion)
+        if defect is None:
+            if unmatched is not None and len(track.store) > 2:
+                # No frame has ever matched it.
+                track.store.forget(unmatched)
+                track.filter.apply(Marginalise(unmatched))
+            track.rejected = 0
+            track.outliers.reset()
+        return _make_update(
+            track.filter.state,
+            frame,
+            DriftStatus.COASTING,
+            defect or rejection,
+            disputed=disputed,
+            restarted=defect is None,
+        )
+
+
+def _is_removable(motion: Array, frame: ScanFrame) -> bool:
+    """Whether a motion can be that of a specimen during a frame."""
+    if frame.timing is None:
+        return True
+    shear_px = np.abs(frame.px_from_unit @ motion[:2]) * frame.timing.frame_time_s
+    return float(np.max(shear_px)) <= _MAX_SHEAR * frame.size[1]
+
+
+def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
+    """Whether a frame makes the mean of its keyframe better."""
+    registration, candidate = match.registration, match.candidate
+    alignment = registration.alignment
+    shear_px = np.nan_to_num(alignment.joint_px[2:], nan=0.0)
+    return (
+        not candidate.rescaled
+        and store.has_room(candidate.key, alignment.overlap)
+        and registration.correlation > _MIN_MERGE_CORRELATION
+        and _MERGE_GAINS[0] < alignment.gain < _MERGE_GAINS[1]
+        and float(np.max(np.abs(shear_px))) < _MAX_MERGE_SHEAR_PX
+    )
+
+
+def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noise: Array) -> int:
+    """Make this frame a keyframe, as it was measured against the one before; its number."""
+    state = track.filter.state
+    keyframe = make_keyframe(frame, match.removed, match.picture, match.region, state.time_s)
+    key, forgotten = track.store.add(keyframe)
+    track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
+    for old in forgotten:
+        track.filter.apply(Marginalise(old))
+    return key
+
+
+def _make_update(
+    state: DriftState,
+    frame: ScanFrame,
+    status: DriftStatus,
+    rejection: Rejection[MatchFailure] | None = None,
+    *,
+    registration: Registration | None = None,
+    overlap: float = float("nan"),
+    disputed: Array | None = None,
+    restarted: bool = False,
+) -> DriftUpdate:
+    """The drift at a frame; ``overlap`` is for a frame without a registration."""
+    covariance = state.drift_covariance + scale_covariance(
+        frame.camera, state.position, state.velocity
+    )
+    if disputed is not None:
+        covariance[:2, :2] += disputed
+    alignment = None if registration is None else registration.alignment
+    return DriftUpdate(
+        time_s=state.time_s,
+        drift_m=state.position.copy(),
+        velocity_m_s=state.velocity.copy(),
+        acceleration_m_s2=state.acceleration.copy(),
+        covariance=covariance,
+        status=status,
+        rejection=rejection,
+        residual=float("nan") if alignment is None else alignment.residual_rms,
+        px_from_unit=frame.px_from_unit,
+        overlap=overlap if alignment is None else alignment.overlap,
+        calibrated=frame.camera is not None,
+        restarted=restarted,
+        shear_px=np.full(2, np.nan) if alignment is None else alignment.joint_px[2:],
+        shear_covariance=(
+            np.full((2, 2), np.inf) if alignment is None else alignment.joint_covariance[2:, 2:]
+        ),
+        keyframe_time_s=float("nan"),
+        merged=False,
+    )

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import binned
 from semcal_ros.core.rectification.raw_positions import RasterDrift
@@ -74,20 +74,24 @@ class FrameDrift:
 
     Attributes
     ----------
-    drift_m, velocity_m_s, covariance, raster
-        As in :class:`~semcal_ros.core.drift.tracker.DriftUpdate`.
+    estimate
+        The drift at the centre of the frame.
     measured
-        The latest frame of which the drift was measured: this one, or one before it.
-    is_forecast
-        Whether it is one before.
+        The latest frame whose drift was measured: this one, or one before it.
     """
 
-    drift_m: Array
-    velocity_m_s: Array
-    covariance: Array
-    raster: RasterDrift
+    estimate: DriftEstimate
     measured: DriftUpdate
-    is_forecast: bool
+
+    @property
+    def is_forecast(self) -> bool:
+        """Whether the drift of this frame itself was not measured."""
+        return self.estimate is not self.measured
+
+    @property
+    def raster(self) -> RasterDrift:
+        """The drift during the frame, for a rectifier."""
+        return self.estimate.raster
 
 
 class LiveDrift:
@@ -217,15 +221,5 @@ class LiveDrift:
 def _at(known: Measured, centre_s: float) -> FrameDrift:
     update = known.update
     if centre_s == update.time_s:
-        return FrameDrift(
-            update.drift_m, update.velocity_m_s, update.covariance, update.raster, update, False
-        )
-    forecast = known.outlook.at(centre_s)
-    return FrameDrift(
-        forecast.drift_m,
-        forecast.velocity_m_s,
-        forecast.covariance,
-        forecast.raster,
-        update,
-        True,
-    )
+        return FrameDrift(update, update)
+    return FrameDrift(known.outlook.at(centre_s), update)

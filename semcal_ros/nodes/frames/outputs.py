@@ -101,17 +101,19 @@ class DriftOutput:
         pose, twist = self._messages
         # A few matrices per frame, which nobody may want.
         if self._drift.get_subscription_count():
-            fill_drift(pose, drift.drift_m, drift.covariance, frame.header)
+            fill_drift(pose, drift.estimate.drift_m, drift.estimate.covariance, frame.header)
             self._drift.publish(pose)
         if self._velocity.get_subscription_count():
-            fill_drift_velocity(twist, drift.velocity_m_s, drift.covariance, frame.header)
+            fill_drift_velocity(
+                twist, drift.estimate.velocity_m_s, drift.estimate.covariance, frame.header
+            )
             self._velocity.publish(twist)
         measured = drift.measured
         self._coasting += not (measured.accepted or drift.is_forecast)
         self._forecast += drift.is_forecast
-        self.trouble = "" if measured.accepted else f"drift {measured.status}"
+        self.trouble = "" if measured.accepted else f"drift {measured.status_text}"
         notes = (
-            ("drift_status", measured.status),
+            ("drift_status", measured.status_text),
             ("drift_residual", float(measured.residual)),
             ("drift_overlap", float(measured.overlap)),
             ("drift_frames_coasted", self._coasting),

@@ -55,7 +55,7 @@ def measured(
     """Measure a frame here and now; raises as :meth:`DriftTracker.update`."""
     started_s = time.monotonic()
     update = tracker.update(image, time_s, camera, timing)
-    return Measured(update, tracker.outlook(), time.monotonic() - started_s)
+    return Measured(update, tracker.predictor(), time.monotonic() - started_s)
 
 
 class DriftProcess:

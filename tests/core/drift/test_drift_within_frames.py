@@ -78,7 +78,7 @@ def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: Sca
         parts = zip(starts, found, strict=True)
         return np.array([left_px(camera, timing, drift, s, zero, f) for s, f in parts])
 
-    after = of([path.raster(k) for k in range(len(path))])
+    after = of([path[k].raster for k in range(len(path))])
     shifted = of([RasterDrift(u.drift_m, np.zeros(2)) for u in updates])
     # A shift of the whole picture leaves half of what the drift moves in a pass: 80 nm in 2 s, in
     # px of 15 nm, or an eighth of it.
@@ -104,7 +104,7 @@ def test_drift_is_continuous_through_a_zoom() -> None:
         truth = drift(np.array([start + timing.centre_offset_s]))[0] - zero
         errors.append(update.drift_m - truth)
         sigmas.append(np.sqrt(np.diag(update.covariance)[:2]))
-        statuses.append(update.status)
+        statuses.append(update.status_text)
     assert not [s for s in statuses if s.startswith("coasting")]
     # On the way back the keyframes of the way out serve again.
     assert [k for k, s in enumerate(statuses) if s == "keyframe"] == [0, 3, 6, 9]
@@ -129,7 +129,7 @@ def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
         assert update.accepted, update.reason
         errors.append(update.drift_px - truth)
         sigmas.append(np.sqrt(np.diag(update.covariance)[:2]))
-        keyframes += update.status == "keyframe"
+        keyframes += update.status_text == "keyframe"
     assert keyframes >= 5
     error, sigma = np.array(errors), np.array(sigmas)
     # Single pictures are good to 0.01 px: nothing of the way is left at its end.

@@ -27,11 +27,11 @@ def feed(tracker: DriftTracker, first: int, last: int) -> None:
 def test_a_forecast_holds_the_drift_to_come_within_its_sigma() -> None:
     tracker = DriftTracker()
     feed(tracker, 0, 20)
-    outlook = tracker.outlook()
-    assert outlook.time_s == 19.0
+    predictor = tracker.predictor()
+    assert predictor.time_s == 19.0
     sigmas = []
     for ahead_s in (0.0, 0.5, 2.0, 5.0):
-        forecast = outlook.at(19.0 + ahead_s)
+        forecast = predictor.at(19.0 + ahead_s)
         sigma = np.sqrt(np.diag(forecast.covariance))
         error = forecast.drift_m - VELOCITY * forecast.time_s
         assert np.all(np.abs(error) < 4.0 * sigma[:2])
@@ -47,10 +47,15 @@ def test_a_forecast_is_what_the_filter_itself_would_predict(ahead_s: float) -> N
     """The forecast is worked out in a shorter way than the filter's own step in time."""
     tracker = DriftTracker()
     feed(tracker, 0, 12)
-    outlook = tracker.outlook()
-    time_s = outlook.time_s + ahead_s
-    forecast, state = outlook.at(time_s), Predict(time_s)(outlook.state, outlook.restlessness)
-    covariance = state.own + scale_covariance(outlook.camera, state.position, state.velocity)
+    predictor = tracker.predictor()
+    time_s = predictor.time_s + ahead_s
+    forecast, state = (
+        predictor.at(time_s),
+        Predict(time_s)(predictor.state, predictor.process_noise),
+    )
+    covariance = state.drift_covariance + scale_covariance(
+        predictor.camera, state.position, state.velocity
+    )
     # Nothing but the order of rounding differs.
     np.testing.assert_allclose(forecast.drift_m, state.position, rtol=1e-12)
     np.testing.assert_allclose(forecast.velocity_m_s, state.velocity, rtol=1e-12)
@@ -62,17 +67,17 @@ def test_a_forecast_is_what_the_filter_itself_would_predict(ahead_s: float) -> N
 def test_an_outlook_stays_as_it_was_while_tracking_goes_on() -> None:
     tracker = DriftTracker()
     feed(tracker, 0, 10)
-    outlook = tracker.outlook()
-    before = outlook.at(10.5)
+    predictor = tracker.predictor()
+    before = predictor.at(10.5)
     feed(tracker, 10, 14)
-    again = outlook.at(10.5)
+    again = predictor.at(10.5)
     np.testing.assert_array_equal(before.drift_m, again.drift_m)
     np.testing.assert_array_equal(before.covariance, again.covariance)
     # At its own time it says what the update said.
     update = tracker.update(
         noisy(TEXTURE.view((0.0, 0.0), SIZE), 5.0, 99).astype(np.float32), 14.0, CAMERA
     )
-    now = tracker.outlook().at(14.0)
+    now = tracker.predictor().at(14.0)
     np.testing.assert_allclose(now.drift_m, update.drift_m)
     np.testing.assert_allclose(now.velocity_m_s, update.velocity_m_s)
 
@@ -80,8 +85,8 @@ def test_an_outlook_stays_as_it_was_while_tracking_goes_on() -> None:
 def test_what_cannot_be_foretold_is_refused() -> None:
     tracker = DriftTracker()
     with pytest.raises(InvalidValueError, match="before the first frame"):
-        tracker.outlook()
+        tracker.predictor()
     feed(tracker, 0, 2)
     for time_s in (0.5, float("nan"), float("inf")):
         with pytest.raises(InvalidValueError, match="after"):
-            tracker.outlook().at(time_s)
+            tracker.predictor().at(time_s)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate, path_of_updates
+from semcal_ros.core.drift.estimates import DriftPath, DriftStatus
 from semcal_ros.core.drift.frame_time import (
-    LEFT_IN,
-    REMOVED,
+    SHEAR_OF_SHIFT_DISTORTED,
+    SHEAR_OF_SHIFT_RECTIFIED,
     FrameTimeEstimate,
     estimate_frame_time,
 )
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
-from tests.helpers.drift_scenes import DriftingSpecimen, small_camera
+from tests.helpers.drift_scenes import DriftingSpecimen, make_drift_update, small_camera
 
 PX_M = 50e-9
 Law = Callable[[np.ndarray], np.ndarray]
@@ -66,34 +66,26 @@ class Stream:
         shear += noise - noise[key]
         own = np.diag([1e-6, 1e-6, velocity_sigma_px_s**2, velocity_sigma_px_s**2]) * PX_M**2
         self.updates = [
-            DriftUpdate(
+            make_drift_update(
                 time_s=float(t[k]),
                 drift_m=position[k] * PX_M,
                 velocity_m_s=velocity[k] * PX_M,
-                acceleration_m_s2=np.zeros(2),
                 covariance=own,
-                status="tracked" if k else "keyframe",
-                accepted=True,
-                reason="",
-                residual=5.0,
+                status=DriftStatus.TRACKED if k else DriftStatus.KEYFRAME,
                 px_from_unit=np.eye(2) / PX_M,
-                overlap=0.7,
-                calibrated=True,
-                restarted=False,
                 shear_px=shear[k] if k else np.full(2, np.nan),
                 shear_covariance=np.eye(2) * 2.0 * sigma_px**2,
                 keyframe_time_s=float(t[key[k]]) if k else float("nan"),
-                joined=False,
             )
             for k in range(frames)
         ]
 
     @property
     def path(self) -> DriftPath:
-        return path_of_updates(self.updates)
+        return DriftPath(tuple(self.updates))
 
-    def estimate(self, shear_of_shift: float = LEFT_IN) -> FrameTimeEstimate:
-        return estimate_frame_time(self.path, self.updates, shear_of_shift=shear_of_shift)
+    def estimate(self, shear_of_shift: float = SHEAR_OF_SHIFT_DISTORTED) -> FrameTimeEstimate:
+        return estimate_frame_time(self.path, shear_of_shift=shear_of_shift)
 
 
 @pytest.mark.parametrize("time_s", [0.9, 0.2])
@@ -169,12 +161,12 @@ def test_noise_alone_tells_nothing() -> None:
 
 def test_a_settling_is_known_as_well_as_the_distortion() -> None:
     """Shift and velocity go together there, so distortion looks like a frame time."""
-    for gradient in (LEFT_IN, -LEFT_IN):
+    for gradient in (SHEAR_OF_SHIFT_DISTORTED, -SHEAR_OF_SHIFT_DISTORTED):
         stream = Stream(settling, 0.4, 2, gradient=gradient, velocity_sigma_px_s=0.01)
         found = stream.estimate()
-        assert found.sigma_s > 0.5 * LEFT_IN * 20.0 / 2**0.5
+        assert found.sigma_s > 0.5 * SHEAR_OF_SHIFT_DISTORTED * 20.0 / 2**0.5
         assert abs(found.frame_time_s - 0.4) < 3.0 * found.sigma_s
-    known = Stream(settling, 0.4, 2, velocity_sigma_px_s=0.01).estimate(REMOVED)
+    known = Stream(settling, 0.4, 2, velocity_sigma_px_s=0.01).estimate(SHEAR_OF_SHIFT_RECTIFIED)
     assert known.observable
     assert known.frame_time_s == pytest.approx(0.4, abs=3.0 * known.sigma_s)
     assert known.sigma_s < 0.6 * found.sigma_s
@@ -194,11 +186,9 @@ def test_a_pass_is_not_longer_than_the_interval() -> None:
 
 def test_bad_arguments_and_short_streams() -> None:
     stream = Stream(wandering(1), 0.8, 1)
-    short = estimate_frame_time(path_of_updates(stream.updates[:5]), stream.updates[:5])
+    short = estimate_frame_time(DriftPath(stream.updates[:5]))
     assert not short.observable
     assert "4 frames" in short.reason
-    with pytest.raises(InvalidValueError, match="60 frames and 59 updates"):
-        estimate_frame_time(stream.path, stream.updates[:-1])
     for value in (0.0, float("nan")):
         with pytest.raises(InvalidValueError, match="shear_of_shift"):
             stream.estimate(value)
@@ -211,14 +201,13 @@ def tracked(law_px: Law, timing: ScanTiming, frames: int, seed: int) -> FrameTim
     unit = np.linalg.inv(camera.ideal_from_sem_jacobian)
     history = DriftHistory()
     tracker = DriftTracker(history=history)
-    updates = []
     for k in range(frames):
         time_s = np.array([0.0, k, k - 0.5 * timing.frame_time_s, k + 0.5 * timing.frame_time_s])
         zero, middle, first, last = law_px(time_s) @ unit.T
         velocity = (last - first) / timing.frame_time_s
         picture = specimen.frame(camera, timing, middle - zero, velocity, 1000 * seed + k)
-        updates.append(tracker.update(picture, float(k), camera))
-    return estimate_frame_time(history.smooth(), updates, shear_of_shift=REMOVED)
+        tracker.update(picture, float(k), camera)
+    return estimate_frame_time(history.smooth(), shear_of_shift=SHEAR_OF_SHIFT_RECTIFIED)
 
 
 @pytest.mark.parametrize(("time_s", "px"), [(0.95, 0.5), (0.4, 1.0)])

@@ -23,8 +23,8 @@ from semcal_ros.core.drift.camera_uncertainty import (
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
     Keyframe,
-    carried,
-    keyframe_of,
+    make_keyframe,
+    resample_keyframe,
     scale_ratio,
 )
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
@@ -64,13 +64,15 @@ def known(shift: tuple[float, float], gain: float = 1.0, offset: float = 0.0) ->
     return Registration(alignment, correlation=1.0, rejection=None)
 
 
-def frame(shift: tuple[float, float], sigma: float, seed: int) -> NDArray[np.float32]:
+def make_picture(shift: tuple[float, float], sigma: float, seed: int) -> NDArray[np.float32]:
     return noisy(TEXTURE.view(shift, SIZE), sigma, seed).astype(np.float32)
 
 
 def keyframe(picture: NDArray[np.generic]) -> Keyframe:
     height, width = picture.shape[:2]
-    return keyframe_of(ScanFrame(picture, None, None), NOWHERE, picture, (0, 0, width, height), 0.0)
+    return make_keyframe(
+        ScanFrame(picture, None, None), NOWHERE, picture, (0, 0, width, height), 0.0
+    )
 
 
 INNER = (slice(40, -40), slice(40, -40))
@@ -80,12 +82,12 @@ INNER = (slice(40, -40), slice(40, -40))
 
 
 def test_another_frame_halves_the_noise_variance() -> None:
-    scene = frame((0.0, 0.0), 0.0, 0)
-    key = keyframe(frame((0.0, 0.0), 10.0, 1))
+    scene = make_picture((0.0, 0.0), 0.0, 0)
+    key = keyframe(make_picture((0.0, 0.0), 10.0, 1))
     for count in range(2, 9):
         # Whole pixels: nothing is interpolated.
         shift = (float(count), -2.0 * count)
-        key = key.with_frame(frame(shift, 10.0, count), EVERYTHING, known(shift))
+        key = key.with_frame(make_picture(shift, 10.0, count), EVERYTHING, known(shift))
         assert key.averaged == count
         variance = float(np.var((key.mean - scene)[INNER]))
         # A variance of 6400 px scatters by 1.8 %.
@@ -95,8 +97,8 @@ def test_another_frame_halves_the_noise_variance() -> None:
 @pytest.mark.parametrize("shift", [(0.5, 0.5), (3.3, -7.8), (-0.2, 0.9), (12.25, 20.5)])
 def test_a_mean_is_neither_moved_nor_blurred(shift: tuple[float, float]) -> None:
     # No noise: all that is left is what the interpolation does to the scene.
-    scene = frame((0.0, 0.0), 0.0, 0)
-    key = keyframe(scene).with_frame(frame(shift, 0.0, 0), EVERYTHING, known(shift))
+    scene = make_picture((0.0, 0.0), 0.0, 0)
+    key = keyframe(scene).with_frame(make_picture(shift, 0.0, 0), EVERYTHING, known(shift))
     error = (key.mean - scene)[INNER]
     # The scene has a contrast of 40; half of the 8-tap interpolation's error is in the mean.
     assert np.sqrt(np.mean(error**2)) < 0.004 * 40.0
@@ -111,11 +113,11 @@ def test_a_mean_is_neither_moved_nor_blurred(shift: tuple[float, float]) -> None
 
 def test_sixteen_frames_at_sub_pixel_shifts_show_the_scene_with_less_noise() -> None:
     rng = np.random.default_rng(1)
-    scene = frame((0.0, 0.0), 0.0, 0)
-    key = keyframe(frame((0.0, 0.0), 8.0, 100))
+    scene = make_picture((0.0, 0.0), 0.0, 0)
+    key = keyframe(make_picture((0.0, 0.0), 8.0, 100))
     for k in range(1, 16):
         shift = tuple(rng.uniform(-6.0, 6.0, 2))
-        key = key.with_frame(frame(shift, 8.0, k), EVERYTHING, known(shift))
+        key = key.with_frame(make_picture(shift, 8.0, k), EVERYTHING, known(shift))
     error = (key.mean - scene)[INNER]
     # White noise would leave 64 / 16; interpolation between pixels averages, and can only lower it.
     assert 0.5 * 64.0 / 16.0 < float(np.var(error)) < 1.05 * 64.0 / 16.0
@@ -126,19 +128,19 @@ def test_sixteen_frames_at_sub_pixel_shifts_show_the_scene_with_less_noise() -> 
 
 
 def test_gain_and_offset_of_a_frame_are_taken_out() -> None:
-    scene = frame((0.0, 0.0), 0.0, 0)
-    image = (0.5 * frame((2.0, -3.0), 0.0, 0) + 30.0).astype(np.float32)
+    scene = make_picture((0.0, 0.0), 0.0, 0)
+    image = (0.5 * make_picture((2.0, -3.0), 0.0, 0) + 30.0).astype(np.float32)
     key = keyframe(scene).with_frame(image, EVERYTHING, known((2.0, -3.0), 0.5, 30.0))
     # Rounding of 32-bit numbers near 200.
     np.testing.assert_allclose(key.mean[INNER], scene[INNER], atol=1e-3)
 
 
 def test_only_what_both_show_is_averaged_and_the_first_picture_stays_as_it_was() -> None:
-    first = frame((0.0, 0.0), 10.0, 1)
+    first = make_picture((0.0, 0.0), 10.0, 1)
     key = keyframe(first)
     shift = (30.0, -20.0)
     region = (5, 8, 150, 140)
-    better = key.with_frame(frame(shift, 10.0, 2), region, known(shift))
+    better = key.with_frame(make_picture(shift, 10.0, 2), region, known(shift))
     changed = better.mean != first
     rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
     # Of the frame's region, seen from the keyframe, without what the interpolation would take from
@@ -147,15 +149,15 @@ def test_only_what_both_show_is_averaged_and_the_first_picture_stays_as_it_was()
     assert (rows[0], rows[-1] + 1) == (8 + 20 + FINE.reach, 140 + 20 - FINE.reach)
     np.testing.assert_array_equal(key.mean, first)
     assert key.averaged == 1
-    assert better.shot is key.shot
+    assert better.frame is key.frame
     # Nothing in common.
     away = (SIZE - 5.0, 0.0)
-    assert key.with_frame(frame(away, 1.0, 2), EVERYTHING, known(away)) is key
+    assert key.with_frame(make_picture(away, 1.0, 2), EVERYTHING, known(away)) is key
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_frames_of_every_type_are_averaged(dtype: type) -> None:
-    picture = np.rint(frame((0.0, 0.0), 0.0, 0)).astype(dtype)
+    picture = np.rint(make_picture((0.0, 0.0), 0.0, 0)).astype(dtype)
     colour = np.repeat(picture[:, :, None], 3, axis=2)
     for image in (picture, colour):
         key = keyframe(image).with_frame(image, EVERYTHING, known((0.0, 0.0)))
@@ -183,7 +185,7 @@ SPECIMEN = DriftingSpecimen(pitch_m=0.05e-6, seed=4)
 STILL = np.zeros(2)
 
 
-def shot_of(camera: ScanCamera, drift_m: Array, seed: int) -> ScanFrame:
+def make_scan_frame(camera: ScanCamera, drift_m: Array, seed: int) -> ScanFrame:
     timing = ScanTiming(0.9, 1, 0.1)
     return ScanFrame(
         SPECIMEN.frame(camera, timing, drift_m, STILL, seed, noise=3.0), camera, timing
@@ -196,14 +198,14 @@ def test_a_carried_keyframe_shows_the_drift_in_pixels_of_the_other_camera(ratio:
     # The same instrument, whose axis does not go through the same pixel at every magnification.
     now = replace(small_camera(2000.0 * ratio), px=101.5, py=88.25, ex=91.0, ey=97.0, skew=-0.01)
     drift = np.array([1.1e-6, -0.6e-6])
-    stills = MotionCorrector("cubic")
-    first = shot_of(before, STILL, 0)
-    key = keyframe_of(first, NOWHERE, *stills.of(first, NOWHERE), 0.0)
-    shot = shot_of(now, drift, 1)
-    other = carried(key, shot)
-    picture = keyframe_of(shot, NOWHERE, *stills.of(shot, NOWHERE), 1.0)
+    corrector = MotionCorrector("cubic")
+    first = make_scan_frame(before, STILL, 0)
+    key = make_keyframe(first, NOWHERE, *corrector.corrected_image(first, NOWHERE), 0.0)
+    frame = make_scan_frame(now, drift, 1)
+    other = resample_keyframe(key, frame)
+    picture = make_keyframe(frame, NOWHERE, *corrector.corrected_image(frame, NOWHERE), 1.0)
     found = register(
-        other.reference(RegistrationSettings()), picture.mean, image_region=picture.region
+        other.prepare_reference(RegistrationSettings()), picture.mean, image_region=picture.region
     )
     assert found.accepted, found.reason
     # Resampling twice by cubic interpolation costs some hundredths of a pixel; noise a hundredth.
@@ -212,7 +214,7 @@ def test_a_carried_keyframe_shows_the_drift_in_pixels_of_the_other_camera(ratio:
     left, top, right, bottom = other.region
     assert 0 <= left < right <= 192
     assert 0 <= top < bottom <= 192
-    assert scale_ratio(key.shot, shot) == pytest.approx(max(ratio, 1 / ratio), rel=0.05)
+    assert scale_ratio(key.frame, frame) == pytest.approx(max(ratio, 1 / ratio), rel=0.05)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.9, 1.3, 2.0])
@@ -220,9 +222,9 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
     now = replace(small_camera(2000.0 * ratio), px=101.5, py=88.25, skew=-0.01)
     bright = np.zeros((192, 192), np.float32)
     bright[20:170, 20:170] = 200.0
-    shot = ScanFrame(bright, small_camera(2000.0), None)
-    key = keyframe_of(shot, NOWHERE, bright, (20, 20, 170, 170), 0.0)
-    other = carried(key, ScanFrame(bright, now, None))
+    frame = ScanFrame(bright, small_camera(2000.0), None)
+    key = make_keyframe(frame, NOWHERE, bright, (20, 20, 170, 170), 0.0)
+    other = resample_keyframe(key, ScanFrame(bright, now, None))
     left, top, right, bottom = other.region
     # The cubic interpolation and the blur before it reach over the edge by less than 1 %.
     np.testing.assert_allclose(other.mean[top:bottom, left:right], 200.0, rtol=0.01)
@@ -236,27 +238,27 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
 
 
 def test_a_keyframe_is_carried_only_between_cameras() -> None:
-    plain = keyframe(frame((0.0, 0.0), 3.0, 0))
-    shot = ScanFrame(plain.shot.image, small_camera(2000.0), None)
-    assert carried(plain, shot) is plain
-    assert carried(plain, plain.shot) is plain
-    assert scale_ratio(plain.shot, shot) == float("inf")
-    assert scale_ratio(shot, plain.shot) == float("inf")
-    assert scale_ratio(plain.shot, plain.shot) == 1.0
+    plain = keyframe(make_picture((0.0, 0.0), 3.0, 0))
+    frame = ScanFrame(plain.frame.image, small_camera(2000.0), None)
+    assert resample_keyframe(plain, frame) is plain
+    assert resample_keyframe(plain, plain.frame) is plain
+    assert scale_ratio(plain.frame, frame) == float("inf")
+    assert scale_ratio(frame, plain.frame) == float("inf")
+    assert scale_ratio(plain.frame, plain.frame) == 1.0
     # Pixels of pictures of another size cannot be compared without a camera.
-    assert scale_ratio(plain.shot, ScanFrame(np.zeros((50, 60)), None, None)) == float("inf")
+    assert scale_ratio(plain.frame, ScanFrame(np.zeros((50, 60)), None, None)) == float("inf")
     # The ratio is that of the direction in which it is largest, and the same both ways.
-    wide = ScanFrame(shot.image, replace(small_camera(2000.0), aspect=1.1), None)
-    assert scale_ratio(shot, wide) > 1.09
-    assert scale_ratio(shot, wide) == pytest.approx(scale_ratio(wide, shot))
+    wide = ScanFrame(frame.image, replace(small_camera(2000.0), aspect=1.1), None)
+    assert scale_ratio(frame, wide) > 1.09
+    assert scale_ratio(frame, wide) == pytest.approx(scale_ratio(wide, frame))
 
 
 # -- the store ----------------------------------------------------------------------------------
 
 
 def plain_store(**limits: int) -> KeyframeStore:
-    at_most, at_most_bytes = limits.get("at_most", 48), limits.get("at_most_bytes", 1 << 28)
-    return KeyframeStore(RegistrationSettings(), at_most_bytes, at_most)
+    max_count, max_bytes = limits.get("max_count", 48), limits.get("max_bytes", 1 << 28)
+    return KeyframeStore(RegistrationSettings(), max_bytes, max_count)
 
 
 def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float]) -> DriftState:
@@ -268,16 +270,16 @@ def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float
 
 def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None:
     store = plain_store()
-    picture = frame((0.0, 0.0), 3.0, 0)
+    picture = make_picture((0.0, 0.0), 3.0, 0)
     for _ in range(3):
         store.add(keyframe(picture))
     assert store.current == 2
     places = {0: (0.0, 0.0), 1: (80.0, 0.0), 2: (40.0, 0.0)}
-    shot = ScanFrame(picture, None, None)
+    frame = ScanFrame(picture, None, None)
 
     def order(drift: float) -> list[int]:
         state = state_with(places, (drift, 0.0))
-        return [c.key for c in store.candidates(state, shot, 0.6, 2.5)]
+        return [c.key for c in store.candidates(state, frame, 0.6, 2.5)]
 
     # Exactly over keyframe 0, but 75 % of the one in use are seen, too.
     assert order(0.0) == [2, 0, 1]
@@ -285,7 +287,7 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
     assert order(-30.0) == [0, 2, 1]
     # On the other side it is keyframe 1.
     assert order(110.0) == [1, 2, 0]
-    found = store.candidates(state_with(places, (-30.0, 16.0)), shot, 0.6, 2.5)
+    found = store.candidates(state_with(places, (-30.0, 16.0)), frame, 0.6, 2.5)
     # Parts of the width and of the height.
     assert found[0].overlap == pytest.approx((1.0 - 30.0 / SIZE) * (1.0 - 16.0 / SIZE))
     assert not any(c.rescaled for c in found)
@@ -293,9 +295,9 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
     assert order(40.0)[0] == 0
     # A keyframe that the drift does not know is none.
     few = state_with({1: (80.0, 0.0)}, (0.0, 0.0))
-    assert [c.key for c in store.candidates(few, shot, 0.6, 2.5)] == [1]
+    assert [c.key for c in store.candidates(few, frame, 0.6, 2.5)] == [1]
     # Nothing in common is still a candidate, and the last.
-    far = store.candidates(state_with(places, (500.0, 0.0)), shot, 0.6, 2.5)
+    far = store.candidates(state_with(places, (500.0, 0.0)), frame, 0.6, 2.5)
     assert all(c.overlap == 0.0 for c in far)
 
 
@@ -304,15 +306,15 @@ def test_keyframes_of_another_scale_come_last() -> None:
     cameras = [small_camera(2000.0), small_camera(3000.0), small_camera(2000.0)]
     image = np.zeros((192, 192), np.uint8)
     for camera in cameras:
-        shot = ScanFrame(image, camera, None)
-        store.add(keyframe_of(shot, NOWHERE, image, (0, 0, 192, 192), 0.0))
+        frame = ScanFrame(image, camera, None)
+        store.add(make_keyframe(frame, NOWHERE, image, (0, 0, 192, 192), 0.0))
     # At 3000x everything is in m; 1 um is 12 px.
     places = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (2e-6, 0.0)}
     state = state_with(places, (0.0, 0.0))
 
     def order(magnification: float, max_ratio: float = 2.5) -> list[int]:
-        shot = ScanFrame(image, small_camera(magnification), None)
-        return [c.key for c in store.candidates(state, shot, 0.6, max_ratio)]
+        frame = ScanFrame(image, small_camera(magnification), None)
+        return [c.key for c in store.candidates(state, frame, 0.6, max_ratio)]
 
     # The one in use, then the one that overlaps more, then the one at 3000x.
     assert order(2000.0) == [2, 0, 1]
@@ -320,16 +322,16 @@ def test_keyframes_of_another_scale_come_last() -> None:
     assert order(3000.0)[0] == 1
     assert order(3000.0, 1.2) == [1]
     assert order(4000.0, 1.2) == []
-    shot = ScanFrame(image, small_camera(4000.0), None)
-    assert store.least_ratio(shot) == pytest.approx(4.0 / 3.0)
-    found = store.candidates(state, shot, 0.6, 2.5)
+    frame = ScanFrame(image, small_camera(4000.0), None)
+    assert store.smallest_scale_ratio(frame) == pytest.approx(4.0 / 3.0)
+    found = store.candidates(state, frame, 0.6, 2.5)
     assert all(c.rescaled for c in found)
     assert found[1].ratio in (pytest.approx(2.0), pytest.approx(4.0 / 3.0))
 
 
 def test_the_oldest_use_is_forgotten_but_never_the_first_or_the_one_in_use() -> None:
-    store = plain_store(at_most=3)
-    picture = frame((0.0, 0.0), 3.0, 0)
+    store = plain_store(max_count=3)
+    picture = make_picture((0.0, 0.0), 3.0, 0)
     gone: list[int] = []
     for number in range(3):
         assert store.add(keyframe(picture)) == (number, [])
@@ -349,18 +351,18 @@ def test_the_oldest_use_is_forgotten_but_never_the_first_or_the_one_in_use() -> 
 
 
 def test_memory_is_bounded_by_bytes() -> None:
-    picture = frame((0.0, 0.0), 3.0, 0)
+    picture = make_picture((0.0, 0.0), 3.0, 0)
     one = keyframe(picture).nbytes
     # The picture as it came, and its mean: 4 bytes per pixel each.
     assert one == 2 * 4 * SIZE * SIZE
-    store = plain_store(at_most_bytes=int(4.5 * one))
+    store = plain_store(max_bytes=int(4.5 * one))
     for _ in range(12):
         store.add(keyframe(picture))
         assert len(store) <= 4
     assert len(store) == 4
     assert store[0].nbytes == one
     # However little memory there is, the first one and the one in use stay.
-    tight = plain_store(at_most_bytes=1)
+    tight = plain_store(max_bytes=1)
     for _ in range(5):
         tight.add(keyframe(picture))
     assert len(tight) == 2
@@ -369,7 +371,7 @@ def test_memory_is_bounded_by_bytes() -> None:
 
 def test_a_reference_is_prepared_anew_when_its_mean_has_become_much_better() -> None:
     store = plain_store()
-    picture = frame((0.0, 0.0), 3.0, 0)
+    picture = make_picture((0.0, 0.0), 3.0, 0)
     key, _ = store.add(keyframe(picture))
     first = store.reference(key)
     assert store.reference(key) is first
@@ -377,7 +379,9 @@ def test_a_reference_is_prepared_anew_when_its_mean_has_become_much_better() -> 
     same = known((0.0, 0.0))
     prepared = []
     for k in range(1, 8):
-        store.replace(key, store[key].with_frame(frame((0.0, 0.0), 3.0, k), EVERYTHING, same))
+        store.replace(
+            key, store[key].with_frame(make_picture((0.0, 0.0), 3.0, k), EVERYTHING, same)
+        )
         store.reference(key)
         prepared.append(store.averaged(key))
     assert prepared == [2, 2, 4, 4, 4, 4, 8]
@@ -387,10 +391,10 @@ def test_a_reference_is_prepared_anew_when_its_mean_has_become_much_better() -> 
     store.replace(key, replace(store[key], removed=np.zeros(4)))
     assert store.reference(key) is not before
     # Frames that show little of it, and those that would not matter, are not wanted.
-    assert store.wants(key, 0.8)
-    assert not store.wants(key, 0.7)
+    assert store.has_room(key, 0.8)
+    assert not store.has_room(key, 0.7)
     store.replace(key, replace(store[key], averaged=32))
-    assert not store.wants(key, 1.0)
+    assert not store.has_room(key, 1.0)
 
 
 # -- what the calibration leaves open -----------------------------------------------------------

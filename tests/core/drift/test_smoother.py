@@ -48,12 +48,12 @@ class Dense:
     (:meth:`ProcessNoise.over`) and of a frame (:meth:`ProcessNoise.within`) is used.
     """
 
-    def __init__(self, restlessness: ProcessNoise, centre: Array | None = None) -> None:
-        self.restlessness = restlessness
+    def __init__(self, process_noise: ProcessNoise, centre: Array | None = None) -> None:
+        self.process_noise = process_noise
         self.time_s = 0.0
         self.noises = 0
         # Rows are (constant, derivatives by the noises so far).
-        self.own = np.zeros((6, 1))
+        self.drift_covariance = np.zeros((6, 1))
         self.places: dict[int, Array] = {}
         self.seen: list[tuple[Array, Array, Array]] = []
         self.marked: list[Array] = []
@@ -81,18 +81,24 @@ class Dense:
         return np.asarray(values, dtype=np.float64)[:, None]
 
     def do(self, event: Event) -> None:
-        drift, pace, turn = self.own[:2], self.own[2:4], self.own[4:]
+        drift, pace, turn = (
+            self.drift_covariance[:2],
+            self.drift_covariance[2:4],
+            self.drift_covariance[4:],
+        )
         if isinstance(event, Predict):
-            move, noise = self.restlessness.over(event.time_s - self.time_s)
+            move, noise = self.process_noise.discretise(event.time_s - self.time_s)
             stirred = self.noise(np.kron(noise, np.eye(2)))
-            self.own = self.sum(np.kron(move, np.eye(2)) @ self.own, stirred)
+            self.drift_covariance = self.sum(
+                np.kron(move, np.eye(2)) @ self.drift_covariance, stirred
+            )
             self.time_s = event.time_s
         elif isinstance(event, Inflate):
-            self.own = self.sum(self.own, self.noise(event.covariance))
+            self.drift_covariance = self.sum(self.drift_covariance, self.noise(event.covariance))
         elif isinstance(event, AddKeyframe):
-            where = np.vstack([drift + event.bow * turn, pace])
-            gone = -np.append(event.bow * event.removed[2:], event.removed[:2])
-            own = self.noise(event.noise + self.restlessness.within(event.scan_s))
+            where = np.vstack([drift + event.acceleration_term_s2 * turn, pace])
+            gone = -np.append(event.acceleration_term_s2 * event.removed[2:], event.removed[:2])
+            own = self.noise(event.noise + self.process_noise.frame_covariance(event.scan_s))
             self.places[event.key] = self.sum(where, self.constant(gone), own)
         elif isinstance(event, CloneKeyframe):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
@@ -101,23 +107,23 @@ class Dense:
             own = self.noise(event.noise)
             self.places[event.key] = self.sum(copy, zoomed, self.constant(event.shift), own)
         elif isinstance(event, CorrectShear):
-            gone = -np.append(event.bow * event.removed[2:], event.removed[:2])
+            gone = -np.append(event.acceleration_term_s2 * event.removed[2:], event.removed[:2])
             self.places[event.key] = self.sum(self.places[event.key], self.constant(gone))
         elif isinstance(event, Marginalise):
             del self.places[event.key]
         elif isinstance(event, Measure):
             ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
-            where = np.vstack([drift + event.bow * turn, pace])
+            where = np.vstack([drift + event.acceleration_term_s2 * turn, pace])
             zoomed = np.vstack([-event.zoom, np.zeros((2, 2))]) @ self.centre
             expected = self.sum(where, zoomed, -ratio[:, None] * self.places[event.key])
             count = event.shift.size
-            frame = self.restlessness.within(event.scan_s)[:count, :count]
+            frame = self.process_noise.frame_covariance(event.scan_s)[:count, :count]
             self.seen.append((expected[:count], event.shift, event.covariance + frame))
         else:
             self.marked.append(self.state())
 
     def state(self) -> Array:
-        return self.stacked(self.own, self.centre, *self.places.values())
+        return self.stacked(self.drift_covariance, self.centre, *self.places.values())
 
     def given(self) -> list[tuple[Array, Array]]:
         """Mean and covariance of each marked state, given all that was seen."""
@@ -176,9 +182,11 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
         if what in ("shift", "both", "carry", "copy"):
             size = 2 if what == "shift" else 4
             shift, noise = unit * rng.standard_normal(size), covariance_of(rng, size, unit)
-            ratio, bow = rng.uniform(0.5, 2.0), 0.1 * rng.uniform()
+            ratio, acceleration_term_s2 = rng.uniform(0.5, 2.0), 0.1 * rng.uniform()
             zoom = unit * rng.standard_normal((2, 2)) * rng.choice([0.0, 0.3])
-            events.append(Measure(key, shift, noise, ratio, bow, rng.uniform(), zoom))
+            events.append(
+                Measure(key, shift, noise, ratio, acceleration_term_s2, rng.uniform(), zoom)
+            )
             if what in ("carry", "copy"):
                 # A copy without noise makes the covariance of the state singular.
                 own = covariance_of(rng, 4, unit) if what == "carry" else np.zeros((4, 4))
@@ -226,15 +234,15 @@ def test_smoothed_states_are_the_exact_conditional_ones(
     seed: int, memory: float, unit: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    restlessness = ProcessNoise(0.3 * unit**2, memory)
+    process_noise = ProcessNoise(0.3 * unit**2, memory)
     events = random_events(rng, 12, unit)
     # The error of the principal point is in px, whatever the unit of the drift.
     centre = np.array([[4.0, 1.2], [1.2, 2.25]])
-    dense = Dense(restlessness, centre)
+    dense = Dense(process_noise, centre)
     for event in events:
         dense.do(event)
     expected = dense.given()
-    states = smooth(initial_state(0.0, centre), events, restlessness)
+    states = smooth(initial_state(0.0, centre), events, process_noise)
     assert len(states) == len(expected) == sum(isinstance(e, Mark) for e in events)
     for state, (mean, covariance) in zip(states, expected, strict=True):
         # A part in 1e12 of a variance counts as nothing, and sums of 16 digits leave 1e-4 of it; of
@@ -243,8 +251,8 @@ def test_smoothed_states_are_the_exact_conditional_ones(
 
 
 def test_marks_may_repeat_and_nothing_measured_leaves_the_prediction() -> None:
-    restlessness = ProcessNoise(0.3, 2.0)
-    assert smooth(initial_state(0.0), [], restlessness) == []
+    process_noise = ProcessNoise(0.3, 2.0)
+    assert smooth(initial_state(0.0), [], process_noise) == []
     events: list[Event] = [
         Mark(),
         Predict(1.5),
@@ -254,26 +262,26 @@ def test_marks_may_repeat_and_nothing_measured_leaves_the_prediction() -> None:
         Predict(2.0),
         Mark(),
     ]
-    states = smooth(initial_state(0.0), events, restlessness)
+    states = smooth(initial_state(0.0), events, process_noise)
     assert [s.time_s for s in states] == [0.0, 1.5, 1.5, 2.0]
-    plain = Predict(1.5)(initial_state(0.0), restlessness)
+    plain = Predict(1.5)(initial_state(0.0), process_noise)
     for state in states[1:3]:
         np.testing.assert_allclose(state.covariance, plain.covariance, atol=1e-12)
-    wide = Predict(2.0)(Inflate(np.eye(6))(plain, restlessness), restlessness)
+    wide = Predict(2.0)(Inflate(np.eye(6))(plain, process_noise), process_noise)
     np.testing.assert_allclose(states[3].covariance, wide.covariance)
 
 
 def test_the_last_state_of_hindsight_is_that_of_the_filter() -> None:
-    restlessness = ProcessNoise(0.3, 2.0)
+    process_noise = ProcessNoise(0.3, 2.0)
     events = random_events(np.random.default_rng(12), 20, 1.0)
-    last = smooth(initial_state(0.0), events, restlessness)[-1]
-    state = replay(initial_state(0.0), events, restlessness)
+    last = smooth(initial_state(0.0), events, process_noise)[-1]
+    state = replay(initial_state(0.0), events, process_noise)
     np.testing.assert_array_equal(last.mean, state.mean)
     np.testing.assert_array_equal(last.covariance, state.covariance)
 
 
 def test_replayed_is_one_thing_after_the_other() -> None:
-    restlessness = ProcessNoise(0.3, 2.0)
+    process_noise = ProcessNoise(0.3, 2.0)
     for seed in range(8):
         events = random_events(np.random.default_rng(seed), 12, 1.0)
         # With and without operations after the last measurement, and with nothing but operations.
@@ -281,10 +289,10 @@ def test_replayed_is_one_thing_after_the_other() -> None:
             state = initial_state(0.0)
             for event in part:
                 if isinstance(event, Operation):
-                    state = event(state, restlessness)
+                    state = event(state, process_noise)
                 elif isinstance(event, Measure):
-                    state = event(state, restlessness).state
-            again = replay(initial_state(0.0), part, restlessness)
+                    state = event(state, process_noise).state
+            again = replay(initial_state(0.0), part, process_noise)
             np.testing.assert_array_equal(again.mean, state.mean)
             np.testing.assert_array_equal(again.covariance, state.covariance)
             assert (again.time_s, again.keys) == (state.time_s, state.keys)
@@ -296,12 +304,12 @@ START_PACE = 3.0
 
 
 def simulated(
-    rng: np.random.Generator, times: Array, restlessness: ProcessNoise, sigma: float
+    rng: np.random.Generator, times: Array, process_noise: ProcessNoise, sigma: float
 ) -> tuple[list[Event], Array]:
-    """A path with the exact statistics of the restlessness, seen from one keyframe that has as much
+    """A path with the exact statistics of the process_noise, seen from one keyframe that has as much
     noise as every frame, and its truth (n, 4).
     """
-    turn = np.sqrt(restlessness.acceleration_variance)
+    turn = np.sqrt(process_noise.acceleration_variance)
     state = rng.standard_normal((3, 2)) * np.array([0.0, START_PACE, turn])[:, None]
     noise = np.diag(np.repeat([sigma**2, 0.0], 2))
     widths = np.repeat([0.0, START_PACE, turn], 2)
@@ -314,7 +322,7 @@ def simulated(
     for before, now in itertools.pairwise(times):
         step = round(float(now - before), 9)
         if step not in roots:
-            move, spread = restlessness.over(step)
+            move, spread = process_noise.discretise(step)
             roots[step] = move, root_of(spread)
         move, root = roots[step]
         state = move @ state + root @ rng.standard_normal((3, 2))
@@ -326,19 +334,19 @@ def simulated(
 
 @pytest.mark.parametrize("memory", [0.0, 2.0])
 def test_intervals_cover_the_truth_as_often_as_they_say(memory: float) -> None:
-    restlessness = ProcessNoise(0.05, memory)
+    process_noise = ProcessNoise(0.05, memory)
     runs, times = 60, np.arange(12.0)
     away, chi2 = [], []
     for seed in range(runs):
-        events, truth = simulated(np.random.default_rng(seed), times, restlessness, 0.3)
-        states = smooth(initial_state(0.0), events, restlessness)
+        events, truth = simulated(np.random.default_rng(seed), times, process_noise, 0.3)
+        states = smooth(initial_state(0.0), events, process_noise)
         # One time of each path, so that all are independent, and not that which is known exactly.
         k = 1 + seed % 11
         error = states[k].mean[:4] - truth[k]
-        away.append(error / np.sqrt(np.diag(states[k].own)))
-        chi2.append(float(error @ np.linalg.solve(states[k].own, error)))
+        away.append(error / np.sqrt(np.diag(states[k].drift_covariance)))
+        chi2.append(float(error @ np.linalg.solve(states[k].drift_covariance, error)))
         assert np.all(states[0].position == 0.0)
-        assert np.all(states[0].own[:2, :2] == 0.0)
+        assert np.all(states[0].drift_covariance[:2, :2] == 0.0)
     # 120 positions and as many velocities: four binomial deviations.
     for values in (np.array(away)[:, :2], np.array(away)[:, 2:]):
         inside = np.abs(values)
@@ -349,20 +357,20 @@ def test_intervals_cover_the_truth_as_often_as_they_say(memory: float) -> None:
 
 
 def test_hindsight_is_better_than_the_filter_and_says_so() -> None:
-    restlessness = ProcessNoise(0.05, 2.0)
+    process_noise = ProcessNoise(0.05, 2.0)
     live_error, error, live_sigma, sigma = [], [], [], []
     for seed in range(10):
-        events, truth = simulated(np.random.default_rng(seed), np.arange(30.0), restlessness, 0.3)
-        states = smooth(initial_state(0.0), events, restlessness)
+        events, truth = simulated(np.random.default_rng(seed), np.arange(30.0), process_noise, 0.3)
+        states = smooth(initial_state(0.0), events, process_noise)
         for k in (10, 20):
-            state = replay(initial_state(0.0), events[: 3 + 3 * k], restlessness)
+            state = replay(initial_state(0.0), events[: 3 + 3 * k], process_noise)
             assert state.time_s == states[k].time_s
             # Positions share the noise of the keyframe with everything; velocities do not.
             live_error.append(state.velocity - truth[k, 2:])
             error.append(states[k].velocity - truth[k, 2:])
-            live_sigma.append(np.sqrt(state.own[2, 2]))
-            sigma.append(np.sqrt(states[k].own[2, 2]))
-            assert state.own[0, 0] > states[k].own[0, 0]
+            live_sigma.append(np.sqrt(state.drift_covariance[2, 2]))
+            sigma.append(np.sqrt(states[k].drift_covariance[2, 2]))
+            assert state.drift_covariance[0, 0] > states[k].drift_covariance[0, 0]
     assert np.mean(sigma) < 0.7 * np.mean(live_sigma)
     assert np.sqrt(np.mean(np.square(error))) < 0.8 * np.sqrt(np.mean(np.square(live_error)))
 
@@ -387,28 +395,32 @@ def test_a_stiff_path_is_the_straight_line_fit_through_the_beginning() -> None:
         np.testing.assert_allclose(state.position, slope * time, atol=0.01 * sigma * time)
         np.testing.assert_allclose(state.velocity, slope, atol=0.01 * sigma)
     for time, state in zip(times[9:], states[9:], strict=True):
-        np.testing.assert_allclose(np.diag(state.own)[:2], (sigma * time) ** 2, rtol=1e-2)
+        np.testing.assert_allclose(
+            np.diag(state.drift_covariance)[:2], (sigma * time) ** 2, rtol=1e-2
+        )
 
 
 def test_a_gap_is_bridged_and_becomes_uncertain() -> None:
-    restlessness = ProcessNoise(0.01)
-    events, truth = simulated(np.random.default_rng(3), np.arange(50.0), restlessness, 0.3)
+    process_noise = ProcessNoise(0.01)
+    events, truth = simulated(np.random.default_rng(3), np.arange(50.0), process_noise, 0.3)
     gap = range(22, 29)
     # Three events before the second frame, then three for each.
     without = [e for k, e in enumerate(events) if not (k % 3 == 1 and k // 3 in gap)]
     assert len(without) == len(events) - len(gap)
-    full, bridged = (smooth(initial_state(0.0), e, restlessness) for e in (events, without))
-    sigma = [float(np.sqrt(s.own[0, 0])) for s in bridged]
+    full, bridged = (smooth(initial_state(0.0), e, process_noise) for e in (events, without))
+    sigma = [float(np.sqrt(s.drift_covariance[0, 0])) for s in bridged]
     # Half of what is stated anyhow is the noise of the keyframe.
-    assert sigma[25] > 1.3 * np.sqrt(full[25].own[0, 0])
+    assert sigma[25] > 1.3 * np.sqrt(full[25].drift_covariance[0, 0])
     assert sigma[25] > sigma[23] > sigma[21]
     assert sigma[25] > sigma[27] > sigma[29]
     for k in gap:
         error = bridged[k].mean[:4] - truth[k]
-        assert error @ np.linalg.solve(bridged[k].own, error) < stats.chi2.ppf(1.0 - 1e-4, 4)
+        assert error @ np.linalg.solve(bridged[k].drift_covariance, error) < stats.chi2.ppf(
+            1.0 - 1e-4, 4
+        )
 
 
-# -- restlessness -------------------------------------------------------------------------------
+# -- process_noise -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("psd", "guess"), [(0.04, 0.04), (0.04, 40.0), (4.0, 0.04)])
@@ -419,7 +431,7 @@ def test_the_density_of_a_path_is_found_from_a_guess_that_is_far_off(
     for seed in range(2):
         events, _ = simulated(np.random.default_rng(seed), np.arange(50.0), ProcessNoise(psd), 0.05)
         likely = estimate_process_noise(initial_state(0.0), events, ProcessNoise(guess), (0.0,))
-        assert likely.memory_s == 0.0
+        assert likely.time_constant_s == 0.0
         found.append(likely.psd)
     # Were every change of pace seen, the logarithm would be known to sqrt(2 / 98) = 0.14; the noise
     # makes 0.16 of it for the larger density, and 0.26 for the smaller. Four of the latter, and the
@@ -430,7 +442,7 @@ def test_the_density_of_a_path_is_found_from_a_guess_that_is_far_off(
 def test_units_do_not_change_what_is_likely() -> None:
     found = []
     for unit in (1.0, 1e-9):
-        restlessness = ProcessNoise(0.04 * unit**2)
+        process_noise = ProcessNoise(0.04 * unit**2)
         rng = np.random.default_rng(5)
         # The prior of the velocity stays, so that both see the same numbers.
         events, _ = simulated(rng, np.arange(20.0), ProcessNoise(0.04), 0.05)
@@ -443,7 +455,7 @@ def test_units_do_not_change_what_is_likely() -> None:
             elif isinstance(event, AddKeyframe):
                 event = AddKeyframe(event.key, event.removed, 0.0, event.noise * unit**2, 0.0)
             scaled.append(event)
-        likely = estimate_process_noise(initial_state(0.0), scaled, restlessness, (0.0,))
+        likely = estimate_process_noise(initial_state(0.0), scaled, process_noise, (0.0,))
         found.append(likely.psd / unit**2)
     # Equal but for rounding: the search takes the same steps.
     assert found[0] == pytest.approx(found[1], rel=1e-6)
@@ -457,8 +469,8 @@ def test_a_long_memory_is_told_from_a_white_acceleration() -> None:
         # Forty seconds hold five memories, and noise of 0.02 hides little of changes of pace of 1:
         # the likelihoods differ by far more than they scatter.
         assert (
-            estimate_process_noise(initial_state(0.0), events, near, (0.0, 8.0)).memory_s
-            == true.memory_s
+            estimate_process_noise(initial_state(0.0), events, near, (0.0, 8.0)).time_constant_s
+            == true.time_constant_s
         )
 
 
@@ -469,15 +481,15 @@ def test_few_measurements_leave_the_restlessness_as_it_was() -> None:
 
 
 def test_an_outlier_counts_for_no_more_than_its_bound() -> None:
-    restlessness = ProcessNoise(1e-3)
-    events, _ = simulated(np.random.default_rng(1), np.arange(50.0), restlessness, 0.1)
+    process_noise = ProcessNoise(1e-3)
+    events, _ = simulated(np.random.default_rng(1), np.arange(50.0), process_noise, 0.1)
     index = 3 * 30 + 1
     wild = events[index]
     assert isinstance(wild, Measure)
     found = []
     for away in (50.0, 5000.0):
         events[index] = Measure(0, wild.shift + away, wild.covariance)
-        found.append(estimate_process_noise(initial_state(0.0), events, restlessness, (0.0,)).psd)
+        found.append(estimate_process_noise(initial_state(0.0), events, process_noise, (0.0,)).psd)
     # A hundred times as far away would make a path that had to follow ten thousand times as
     # restless.
     assert found[1] < 100.0 * found[0]
