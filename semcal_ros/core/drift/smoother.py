@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.drift.operations import Measure, Operation
@@ -37,8 +38,9 @@ _MAX_FOR_LIKELIHOOD = 600
 # Fewest measurements from which process noise can be estimated.
 _MIN_FOR_LIKELIHOOD = 4
 # Logarithm of the density relative to the guess: a likelihood is flat beyond. A grid finds the
-# highest maximum, and the golden section refines it by a tenth, far less than what the data can tell.
+# highest maximum, and Brent's method refines it; a tenth is far less than what the data can tell.
 _LOG_RANGE, _GRID = (-14.0, 5.0), 9
+_LOG_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -183,17 +185,8 @@ def _maximise_likelihood(
 
     grid = np.linspace(*_LOG_RANGE, _GRID)
     best = int(np.argmin([cost(float(v)) for v in grid]))
-    low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _GRID - 1)])
-    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
-    a, b = high - ratio * (high - low), low + ratio * (high - low)
-    cost_a, cost_b = cost(a), cost(b)
-    for _ in range(7):
-        if cost_a < cost_b:
-            high, b, cost_b = b, a, cost_a
-            a = high - ratio * (high - low)
-            cost_a = cost(a)
-        else:
-            low, a, cost_a = a, b, cost_b
-            b = low + ratio * (high - low)
-            cost_b = cost(b)
-    return min(cost_a, cost_b), with_density(0.5 * (low + high))
+    bounds = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _GRID - 1)])
+    found = minimize_scalar(
+        cost, bounds=bounds, method="bounded", options={"xatol": _LOG_TOLERANCE}
+    )
+    return float(found.fun), with_density(float(found.x))
