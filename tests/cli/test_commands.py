@@ -35,6 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return base
 
 
+@pytest.mark.slow
 def test_the_display_width_is_that_of_the_calibration(folder, tmp_path, capsys):
     """A configuration of another display width, whose topic says to which width its numbers refer."""
     config = tmp_path / "wide.yaml"
@@ -75,6 +76,7 @@ def test_at_flags_extrapolation(folder, capsys):
     assert "outside of the calibrated range" in captured.err
 
 
+@pytest.mark.slow
 def test_evaluate_on_views_that_were_not_used(folder, capsys):
     other = folder / "other"
     assert run("simulate", other, "--views", 2, "--seed", 7, "--magnification", 1000) == 0
@@ -135,6 +137,7 @@ def test_info_counts(folder, capsys):
     assert "4 magnifications, 500 to 2000" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["discrete", "pda"])
 def test_the_papers_methods_run(folder, method, tmp_path):
     more = [x for g in (300, 800, 2000, 5000) for x in ("--magnification", g)]
@@ -157,6 +160,7 @@ def test_help_lists_every_command(capsys):
     assert all(f"  {c} " in out for c in COMMANDS)
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     cal, out = folder / "cal.yaml", tmp_path / "out"
     empty = tmp_path / "empty"

@@ -574,6 +574,7 @@ def test_bad_input(arguments: tuple[str, str], capsys: pytest.CaptureFixture[str
     assert arguments[1] in line
 
 
+@pytest.mark.slow
 def test_a_middleware_that_cannot_be_loaded_does_not_end_the_command(tmp_path: Path) -> None:
     """Loading it ends a process at once, so a process of its own tries it."""
     done = subprocess.run(

@@ -68,6 +68,7 @@ def blanked(gold: Path) -> Path:
     )
 
 
+@pytest.mark.slow
 def test_plot_and_table_of_the_same_drift(blanked, tmp_path, capsys):
     table, plot = tmp_path / "d.csv", tmp_path / "d.png"
     command = ("drift", blanked, "--config", "virtual_sem", "-o", table)
@@ -388,6 +389,7 @@ def rms_nm(table: Path) -> float:
     return 1e9 * float(np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)))
 
 
+@pytest.mark.slow
 def test_the_time_of_a_pass_is_seen_and_the_shear_removed(swaying, tmp_path, capsys):
     tables = [tmp_path / f"{name}.csv" for name in ("seen", "given", "live")]
     assert run("drift", swaying, "-o", tables[0]) == 0
@@ -406,6 +408,7 @@ def test_the_time_of_a_pass_is_seen_and_the_shear_removed(swaying, tmp_path, cap
     assert "--frame-time" in more
 
 
+@pytest.mark.slow
 def test_the_average_is_made_with_the_time_that_was_seen(swaying, tmp_path, capsys):
     out, command = tmp_path / "seen.tif", ("stack", swaying, "-o")
     assert run(*command, out) == 0
@@ -423,6 +426,7 @@ def test_the_average_is_made_with_the_time_that_was_seen(swaying, tmp_path, caps
     assert np.std(seen - true) < 0.25 * np.std(instants - true)
 
 
+@pytest.mark.slow
 def test_rectify_tells_the_time_for_another_run(swaying, tmp_path, capsys):
     make_calibration().save(tmp_path / "cal.yaml")
     command = ("rectify", swaying, "--calibration", tmp_path / "cal.yaml")

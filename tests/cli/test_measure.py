@@ -81,6 +81,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_deflections_with_all_outputs(bag, calibration, tmp_path, capsys):
     table, plot, strip, video = (tmp_path / n for n in ("d.csv", "d.png", "s.png", "v.avi"))
     command = ("measure", "cantilever", bag, "--calibration", calibration, *LENGTH)

@@ -44,6 +44,7 @@ def folder(tmp_path_factory):
     return base
 
 
+@pytest.mark.slow
 def test_the_ball_comes_out(folder, capsys):
     capsys.readouterr()
     files = ("-o", folder / "ball.ply", "--cloud", folder / "c.ply", "--figure", folder / "b.png")

@@ -14,6 +14,8 @@ from semcal_ros.cli import main
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.reader import open_bag
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def calibration(reference_data, tmp_path_factory):

@@ -13,6 +13,8 @@ import pytest
 
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 
+pytestmark = pytest.mark.slow
+
 # They make their recordings and calibrations themselves.
 pytestmark = pytest.mark.timeout(400)
 

@@ -28,6 +28,7 @@ def calibration(request):
     return Calibration.from_model(result.model)
 
 
+@pytest.mark.slow
 def test_loading_gives_back_every_bit(calibration, tmp_path):
     path = tmp_path / "cal.yaml"
     calibration.save(path)

@@ -16,6 +16,8 @@ import pytest
 import semcal_ros
 from tests.helpers.project import NODES, PYPROJECT, ROOT
 
+pytestmark = pytest.mark.slow
+
 PARTS = (
     *("pyproject.toml", "setup.py", "setup.cfg", "package.xml", "README.md", "LICENSE"),
     *("resource", "launch", "msg_configs", "dds", "security", "semcal_ros"),

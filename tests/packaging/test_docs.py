@@ -73,9 +73,11 @@ def test_named_files_and_modules_exist() -> None:
     missing = []
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         text = page.read_text(encoding="utf-8")
-        for path in re.findall(r"`((?:[\w.]+/)+[\w.]*)`", text):
-            if path.partition("/")[0] in FOLDERS and not any((r / path).exists() for r in ROOTS):
-                missing.append(f"{page.name}: {path}")
+        missing += [
+            f"{page.name}: {path}"
+            for path in re.findall(r"`((?:[\w.]+/)+[\w.]*)`", text)
+            if path.partition("/")[0] in FOLDERS and not any((r / path).exists() for r in ROOTS)
+        ]
         for module in re.findall(r"python -m ((?:benchmarks|examples|semcal_ros)[\w.]*)", text):
             base = ROOT / module.replace(".", "/")
             if not base.with_suffix(".py").exists() and not (base / "__main__.py").exists():

@@ -18,6 +18,8 @@ from rclpy.node import Node
 
 from tests.helpers.project import NODES
 
+pytestmark = pytest.mark.slow
+
 # A process must import numpy, cv2 and rclpy and be discovered: 2 s alone, more on a busy machine.
 START_S = 60.0
 STOP_S = 20.0

@@ -75,6 +75,7 @@ def test_the_target_is_found_where_it_is_at_every_magnification(g: float) -> Non
     assert 0.001 < sigma_px < 0.05
 
 
+@pytest.mark.slow
 def test_the_error_is_what_the_uncertainty_says() -> None:
     """Over places and angles; of 24 numbers the RMS has a sigma of 14 %."""
     rng = np.random.default_rng(4)

@@ -31,6 +31,7 @@ def frames():
     return [*made[:5], ("blank", blank, 1000.0), *made[5:]]
 
 
+@pytest.mark.slow
 def test_sharing_the_work_changes_nothing(frames):
     counted = []
     alone, refused_alone = find_views(frames, processes=1)
@@ -59,6 +60,7 @@ def test_calibrate_takes_images_in_memory(frames):
     assert calibration.at(1600.0).pixel_size_m == pytest.approx(truth.pixel_size_m, rel=0.01)
 
 
+@pytest.mark.slow
 def test_colour_images_are_read_by_their_luma(frames):
     grey = [(image, g) for name, image, g in frames if name != "blank"]
     colour = [(np.dstack([image] * 3), g) for image, g in grey]
@@ -83,6 +85,7 @@ def _collected(found, magnification_of=lambda v: v.magnification, squares_m=SQUA
     return calibrate_found(views, found[1], display_width_m=0.12, squares_m=squares_m)
 
 
+@pytest.mark.slow
 def test_a_view_at_a_wrong_magnification_is_named(found):
     wrong = found[0][6]
     done = _collected(found, lambda v: 1.3 * v.magnification if v is wrong else v.magnification)
@@ -92,6 +95,7 @@ def test_a_view_at_a_wrong_magnification_is_named(found):
     assert len(done.collected.views) == len(done.collected.found) == len(found[0]) - 1
 
 
+@pytest.mark.slow
 def test_a_slightly_wrong_magnification_is_named_after_the_adjustment(found):
     wrong = found[0][6]
     # One view among four of the same magnification whose scale is 5 % off: 1 mm of height.

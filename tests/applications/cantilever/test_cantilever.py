@@ -186,6 +186,7 @@ def test_pictures_without_a_cantilever_are_refused():
 # -- the whole ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_end_in_view():
     plan = cantilever_plan(
         scope(256),
@@ -213,6 +214,7 @@ def test_the_end_in_view():
     assert np.hypot(*(found.frames[2].tip_px - tip - moved)) < 2.0
 
 
+@pytest.mark.slow
 def test_both_ends_in_view_give_two_scales():
     plan = cantilever_plan(
         scope(384, 0.4),
@@ -247,6 +249,7 @@ def test_a_beam_seen_edge_on():
     assert frame.sigma_m < 8e-9
 
 
+@pytest.mark.slow
 def test_a_blurred_and_noisy_recording_knows_less():
     plan = cantilever_plan(
         scope(256), pushes=(0.0, 1.0), magnifications=(7760.0,), view="end", seed=4
@@ -277,6 +280,7 @@ def test_frames_are_cut_into_poses():
         frames_of_poses(7, 3)
 
 
+@pytest.mark.slow
 def test_the_spread_is_that_of_the_poses():
     plan = cantilever_plan(
         scope(256),

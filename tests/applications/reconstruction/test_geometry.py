@@ -65,6 +65,7 @@ def test_noisy_tracks_with_gaps_reach_what_their_noise_allows():
     assert error < 0.25 * PIXEL_M
 
 
+@pytest.mark.slow
 def test_the_uncertainty_of_the_diameter_is_the_scatter_over_recordings():
     pulls = []
     for seed in range(10):

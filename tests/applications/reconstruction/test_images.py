@@ -52,6 +52,7 @@ def structure(plan):
     return reconstruct(keyframes, plan.microscope.timing)
 
 
+@pytest.mark.slow
 def test_points_lie_on_the_true_surface(plan, structure):
     ball = measure_ball(structure)
     assert np.count_nonzero(ball.sphere.inliers) > 60

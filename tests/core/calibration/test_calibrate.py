@@ -42,6 +42,7 @@ def joint():
     return _calibrate("jsm820")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["jsm820", "no_distortion", "strong_perspective", "parallel", "off_centre"]
 )
@@ -53,6 +54,7 @@ def test_joint_predicts_magnifications_that_it_never_saw(name):
     assert result.model.statistics["fit"]["converged"]
 
 
+@pytest.mark.slow
 def test_joint_scale_is_within_its_own_uncertainty(joint):
     truth = preset("jsm820")
     deviations = []
@@ -81,6 +83,7 @@ def test_held_out_errors_cover_every_magnification(joint):
     assert [r["held_out_extrapolated"] for r in rows] == [True, *[False] * 5, True]
 
 
+@pytest.mark.slow
 def test_discrete_is_good_where_it_was_calibrated_and_worse_between(joint):
     result = _calibrate("jsm820", "discrete")
     assert _model_error(result, "jsm820", CALIBRATED) < 0.05
@@ -92,6 +95,7 @@ def test_discrete_is_good_where_it_was_calibrated_and_worse_between(joint):
     assert separate[0]["distortion"] is True
 
 
+@pytest.mark.slow
 def test_discrete_finds_no_distortion_where_there_is_none():
     result = _calibrate("no_distortion", "discrete")
     separate = result.model.statistics["fit"]["separate"]
@@ -101,6 +105,7 @@ def test_discrete_finds_no_distortion_where_there_is_none():
         assert result.model.at(g).xi_r == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)]
 )

@@ -14,6 +14,8 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
+pytestmark = pytest.mark.slow
+
 CALIBRATED = [100.0, 300.0, 700.0, 1500.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0]
 JUMP = 0.01
 MICROSCOPE = preset("jsm820")

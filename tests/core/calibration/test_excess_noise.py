@@ -35,6 +35,7 @@ def test_excess_is_added_to_every_corner():
     np.testing.assert_allclose(wider.covariance_px2, view.covariance_px2 + 0.09 * np.eye(2))
 
 
+@pytest.mark.slow
 def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
     microscope = preset("jsm820")
     rng = np.random.default_rng(2)

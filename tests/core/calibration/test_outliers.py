@@ -12,6 +12,8 @@ from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
+pytestmark = pytest.mark.slow
+
 MAGNIFICATIONS = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
 OPTIONS = {
     "image_size": (512, 512),

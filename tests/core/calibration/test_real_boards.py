@@ -11,6 +11,8 @@ from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import views_from_detections
 from tests.helpers.corner_boards import detected
 
+pytestmark = pytest.mark.slow
+
 SIZE = (640, 480)
 
 

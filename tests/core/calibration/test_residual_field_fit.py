@@ -15,6 +15,8 @@ from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.laws import Exponential
 from semcal_ros.synthetic.microscope import Residual
 
+pytestmark = pytest.mark.slow
+
 CALIBRATED = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
 BETWEEN = [170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0]
 NOISE = 0.05

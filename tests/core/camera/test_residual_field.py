@@ -88,6 +88,7 @@ def test_beyond_the_range_the_field_of_the_nearer_end_holds():
         np.testing.assert_array_equal(field.at(outside).coefficients, field.at(edge).coefficients)
 
 
+@pytest.mark.slow
 def test_overlaps_are_the_integrals_that_they_say():
     field = _field(3)
     rows = field.overlaps() @ field.at(1000.0).coefficients.ravel()

@@ -71,6 +71,7 @@ BOARDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS.keys())
 def test_every_visible_corner_is_found_with_a_true_sigma(board: Board) -> None:
     detection = detect(board)
@@ -141,6 +142,7 @@ BOUND_BOARDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", BOUND_BOARDS.values(), ids=BOUND_BOARDS.keys())
 def test_error_is_near_the_cramer_rao_bound(board: Board) -> None:
     detection = detect(board, np.float64)

@@ -15,6 +15,8 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from tests.helpers.corner_boards import detected
 
+pytestmark = pytest.mark.slow
+
 
 def true_corners(frame: dict[str, Any], truth: dict[str, Any]) -> Array:
     """(n, 2) pixels of all grid corners in and around one frame."""

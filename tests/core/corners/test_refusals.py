@@ -67,6 +67,7 @@ def test_saturated_board_is_refused() -> None:
     assert "saturated" in rejection.reason
 
 
+@pytest.mark.slow
 def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:512, 0:512]
@@ -99,6 +100,7 @@ def test_two_boards_that_join_are_refused(turn: float, offset: tuple[float, floa
     assert "two boards" in rejection.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("square", "turn"), [(15.0, 35.0), (24.0, 40.0)])
 def test_two_boards_never_give_a_mixed_lattice(square: float, turn: float) -> None:
     boards = Board(15.0, turn_deg=10.0), Board(square, turn_deg=turn, offset=(0.1, 0.6))

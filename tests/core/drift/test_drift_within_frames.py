@@ -58,6 +58,7 @@ def left_px(
     return np.asarray(np.hypot(*(belongs(raw) - output).T))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timing", [ScanTiming(2.0, 1, 0.1), ScanTiming(0.25, 8, 0.1)])
 def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: ScanTiming) -> None:
     drift = Drift(
@@ -90,6 +91,7 @@ def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: Sca
     assert float(np.sqrt(np.mean(live**2))) < 0.05
 
 
+@pytest.mark.slow
 def test_drift_is_continuous_through_a_zoom() -> None:
     timing = ScanTiming(0.4, 1, 0.1)
     drift = Drift(velocity_m_s=(20e-9, -12e-9), settling_m=(-200e-9, 300e-9), settling_time_s=15.0)
@@ -116,6 +118,7 @@ def test_drift_is_continuous_through_a_zoom() -> None:
     assert float(np.max(sigma[3:])) < 5e-9
 
 
+@pytest.mark.slow
 def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
     texture, frames, far = Texture(3, 360), 160, 200.0
     tracker = DriftTracker()

@@ -210,6 +210,7 @@ def tracked(law_px: Law, timing: ScanTiming, frames: int, seed: int) -> FrameTim
     return estimate_frame_time(history.smooth(), shear_of_shift=SHEAR_OF_SHIFT_RECTIFIED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("time_s", "px"), [(0.95, 0.5), (0.4, 1.0)])
 def test_pictures_with_a_true_raster(time_s: float, px: float) -> None:
     found = tracked(wandering(11, px), ScanTiming(time_s, 1, 0.1), 24, 2)

@@ -223,6 +223,7 @@ def assert_same(state: DriftState, mean: Array, covariance: Array, atol: float) 
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),

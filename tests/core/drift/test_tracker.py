@@ -93,6 +93,7 @@ def test_drift_within_the_frame_does_not_bias_a_large_shift() -> None:
     assert float(np.max(np.abs(error))) < 0.12
 
 
+@pytest.mark.slow
 def test_rekeys_before_the_overlap_is_lost_and_chains_the_uncertainty() -> None:
     run = Run((1.2e-6, 0.4e-6))
     updates = [run.step(k) for k in range(26)]
@@ -301,6 +302,7 @@ def _gold_frames(folder: Path) -> list[tuple[float, np.ndarray]]:
     return frames
 
 
+@pytest.mark.slow
 def test_reference_recording_of_gold_on_carbon() -> None:
     folder = _gold()
     truth = json.loads((folder / "truth.json").read_text())

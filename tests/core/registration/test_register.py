@@ -73,6 +73,7 @@ def test_any_shift(dx: float, dy: float, seed: int) -> None:
     np.testing.assert_allclose(result.shift_px, [dx, dy], atol=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "shift"), [(4.0, (0.37, -1.21)), (22.5, (5.6, 9.3))])
 def test_reaches_the_cramer_rao_bound_with_honest_covariance(
     sigma: float, shift: tuple[float, float]

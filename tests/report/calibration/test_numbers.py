@@ -45,6 +45,7 @@ from semcal_ros.report.html.text import (
 from tests.helpers.report_samples import SIZE, camera_at, unused
 
 
+@pytest.mark.slow
 def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResult) -> None:
     rows = tabulate_magnifications(result)
     assert [r.magnification for r in rows] == ["100×", "400×", "1500×", "5000×"]
@@ -196,6 +197,7 @@ def test_fitted_error_beside_the_held_out_one_is_of_the_same_images(
     )
 
 
+@pytest.mark.slow
 def test_focal_length_and_its_interval() -> None:
     covariance = np.zeros((10, 10))
     covariance[0, 0], covariance[5, 5] = 9.0, 0.25
@@ -281,6 +283,7 @@ def test_residual_field_is_shown_where_there_is_one() -> None:
     assert plot_residual_field(SimpleNamespace(residual=None), [camera]) == []  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_predictions_need_a_covariance(result: CalibrationResult) -> None:
     pictures = plot_predicted_errors(result.model)
     lattice = make_field_lattice(SIZE, SIZE, 17)

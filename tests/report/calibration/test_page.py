@@ -47,6 +47,8 @@ from tests.helpers.report_samples import (
     unused,
 )
 
+pytestmark = pytest.mark.slow
+
 SECTIONS = [
     "warnings",
     "errors",
