@@ -92,5 +92,5 @@ def reference_data() -> Path:
     if not value:
         pytest.skip("SEMCAL_REFERENCE_DATA is not set: no reference recordings")
     path = Path(value)
-    assert path.is_dir(), f"SEMCAL_REFERENCE_DATA is {value!r}, which is no folder"
+    assert path.is_dir(), f"SEMCAL_REFERENCE_DATA is {value!r}, which is not a folder"
     return path

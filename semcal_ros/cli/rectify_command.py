@@ -21,7 +21,8 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.files.bags.reader import BagWriter, blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame, open_recording
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,

@@ -12,7 +12,7 @@ from pathlib import Path
 __all__ = ["atomic_write_bytes", "atomic_write_text"]
 
 _NEW_FILE_MODE = 0o666
-# A temporary name longer than what file systems take would refuse names that are themselves short enough.
+# File systems take names of 255 bytes, and the temporary one is longer than the name itself.
 _NAME_PART = 100
 
 
@@ -36,13 +36,13 @@ def atomic_write_bytes(path: Path, data: bytes) -> None:
     """Write ``data`` to ``path``: afterwards the file is either complete or what it was before.
 
     The bytes go to a temporary file in the same folder, are flushed to the disk and then moved
-    over ``path`` in one step. Of a symbolic link the target is replaced, not the link.
+    over ``path`` in one step. If ``path`` is a symbolic link, its target is replaced.
 
     Raises
     ------
     OSError
-        The folder is missing or not writable, the disk is full, or ``path`` is a folder, a device or a pipe; what
-        exists is untouched.
+        The folder is missing or not writable, the disk is full, or ``path`` is a folder, a device
+        or a pipe. An existing file is untouched.
     """
     target = Path(os.path.realpath(path))
     mode = _mode_for(target)

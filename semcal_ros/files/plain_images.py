@@ -1,4 +1,4 @@
-"""Ordinary image files of one magnification, which the files themselves do not tell."""
+"""Ordinary image files of one magnification, which the files do not contain."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_plain_image(path: Path) -> NDArray[Any]:
     Raises
     ------
     BagError
-        If it cannot be read.
+        The file cannot be read or decoded, or has another depth.
     """
     try:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -41,5 +41,5 @@ def read_plain_image(path: Path) -> NDArray[Any]:
     except cv2.error:
         image = None  # it refuses absurd sizes by raising
     if image is None or image.dtype.name not in ("uint8", "uint16"):
-        raise BagError(f"{path}: no readable image", expected="an intact 8 or 16 bit image file")
+        raise BagError(f"{path}: not a readable image", expected="an intact 8 or 16 bit image file")
     return image

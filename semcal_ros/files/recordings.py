@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.fields import require_fields
 from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.camera.calibration_model import checked_magnification
-from semcal_ros.core.errors import BagError, MessageError, SemcalError
+from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.files.bags.errors import reading
 from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
 from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
-from semcal_ros.files.tiff import is_tiff
 from semcal_ros.files.tiff.folder import TiffFolder, scan_tiff_folder
+from semcal_ros.files.tiff.read import is_tiff
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -33,7 +34,7 @@ __all__ = ["RecordedFrame", "Recording", "RejectedFrame", "open_recording"]
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One usable image of a recording.
+    """One usable image of a recording, with its time and magnification.
 
     Parameters
     ----------
@@ -45,9 +46,9 @@ class RecordedFrame:
     log_time_ns
         When the recorder received the image.
     magnification
-        Of this frame, on the configuration's display width.
+        Of this frame, on the display width of the configuration.
     frame_id
-        Header's frame.
+        Coordinate frame that the header names.
     encoding
         ROS name of the pixel format, such as ``mono8``.
     """
@@ -62,7 +63,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class RejectedFrame:
-    """A message or file that was left out, and why."""
+    """A message or file that was left out, and the reason."""
 
     log_time_ns: int
     reason: str
@@ -141,22 +142,13 @@ class Recording(ABC):
             )
         if count == 0:
             raise BagError(
-                f"none of {self.frame_count} images in {self.path} is usable: "
+                f"no image of {self.frame_count} in {self.path} is usable: "
                 + (" / ".join(self._pass_notes) or "there are no images"),
                 expected="at least one image of a known encoding with a valid magnification",
             )
 
     @abstractmethod
     def _frames(self) -> Iterator[RecordedFrame]: ...
-
-    def _cut(self, image: NDArray[Any], rows: int) -> NDArray[Any]:
-        if not 0 <= rows < image.shape[0]:
-            raise MessageError(
-                f"{rows} rows of databar in an image of {image.shape[0]} rows",
-                expected="fewer",
-                do="correct databar_rows in the msg_configs file",
-            )
-        return image[: image.shape[0] - rows]
 
 
 class _BagRecording(Recording):
@@ -245,7 +237,7 @@ class _BagRecording(Recording):
         """The frame of a message (``None`` without magnification); whether it has a stamp."""
         message = self._reader.decode(raw)
         pixels, encoding = decoded_image(message)
-        image = self._cut(pixels, self.config.image.databar_rows)
+        image = without_databar(pixels, self.config.image.databar_rows)
         stamp_ns = stamp_ns_from_msg(message)
         require_fields(message.header, ("frame_id",), "std_msgs/msg/Header")
         magnification = self._track.at(stamp_ns or raw.log_time_ns, raw.log_time_ns, image.shape[1])
@@ -265,7 +257,7 @@ class _BagRecording(Recording):
 
 
 class _TiffRecording(Recording):
-    """Images of a folder of SEM TIFFs, with magnifications on one common display width."""
+    """Images of a folder of SEM TIFFs, with magnifications that refer to one display width."""
 
     def __init__(self, path: Path, config: MicroscopeConfig, folder: TiffFolder) -> None:
         super().__init__(path, config)
@@ -308,10 +300,10 @@ class _PlainRecording(Recording):
 
     def _frames(self) -> Iterator[RecordedFrame]:
         for index, path in enumerate(self._paths):
-            # The files tell no time; a second apart is as good as any.
+            # The files have no times: any spacing would do.
             stamp_ns = (index + 1) * 1_000_000_000
             try:
-                image = self._cut(read_plain_image(path), self.config.image.databar_rows)
+                image = without_databar(read_plain_image(path), self.config.image.databar_rows)
             except SemcalError as error:
                 self._rejected.append(RejectedFrame(stamp_ns, str(error)))
                 continue
@@ -339,15 +331,15 @@ def open_recording(
         TIFFs, its display width is what magnifications refer to, and its databar rows, if not
         0, are used in place of what the files say.
     magnification
-        Of all images of a folder of ordinary image files, which do not tell it. Other recordings do: for them it is
-        refused.
+        Of all images of a folder of ordinary image files, which do not contain it. It is refused for
+        recordings and SEM TIFFs, which do.
 
     Raises
     ------
     BagError
-        Missing, damaged, of another kind, or without images or magnification.
+        The recording is missing, damaged, of another kind, or without images or magnification.
     TiffError
-        A folder of TIFFs of which none is usable.
+        No TIFF of a folder is usable.
     """
     path = Path(path)
     used = load_config("generic") if config is None else config
@@ -366,7 +358,7 @@ def open_recording(
 
 
 def _kind_of(path: Path, magnification: float | None) -> str:
-    """``tiff``, ``plain`` or ``bag``, which the reader of recordings then looks at closer."""
+    """``tiff``, ``plain`` or ``bag``; the reader of bags then says what is wrong with anything else."""
     kind = "bag"
     if path.exists() and not is_bag(path):
         names = list(path.iterdir()) if path.is_dir() else [path]
@@ -376,7 +368,7 @@ def _kind_of(path: Path, magnification: float | None) -> str:
         elif images and magnification is None:
             raise BagError(
                 f"{path} has {len(images)} plain images such as {images[0].name}",
-                expected="a rosbag2 folder, or SEM TIFFs whose metadata tell the pixel size",
+                expected="a rosbag2 folder, or SEM TIFFs, whose metadata have the pixel size",
                 do="use the microscope's original TIFF files, or state the magnification of all images",
             )
         elif images:
@@ -384,6 +376,6 @@ def _kind_of(path: Path, magnification: float | None) -> str:
     if magnification is not None and kind != "plain":
         raise BagError(
             f"a magnification stated for {path}",
-            expected="a folder of ordinary images, since recordings and SEM TIFFs tell theirs",
+            expected="a folder of ordinary images: recordings and SEM TIFFs contain theirs",
         )
     return kind

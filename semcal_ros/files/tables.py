@@ -26,7 +26,7 @@ DRIFT_COLUMNS = (
 
 
 def _cell(value: object) -> str:
-    """Text that reads back as the same value; a missing number is ``nan``."""
+    """Text that reads back as the same value; None is written as ``nan``."""
     if value is None:
         return "nan"
     return repr(float(value)) if isinstance(value, float) else str(value)

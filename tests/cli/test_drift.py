@@ -20,7 +20,9 @@ from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath
-from semcal_ros.files.bags.reader import BagWriter, blank_message, open_bag
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.reader import open_bag
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from tests.helpers.drift_scenes import make_drift_update

@@ -13,8 +13,10 @@ import pytest
 
 from semcal_ros.config.config import ImageConfig, MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
-from semcal_ros.files.bags.reader import BagTopic, BagWriter, blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.reader import BagTopic
 from semcal_ros.files.bags.topics import find_topic, topic_matches
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 FLOAT = "std_msgs/msg/Float64"
@@ -303,7 +305,7 @@ def test_a_magnification_is_stated_only_where_it_is_missing(tmp_path: Path) -> N
         ("/sem/image_raw", T0 + 1, image(T0 + 1)),
     ]
     bag = write(tmp_path / "bag", messages)
-    with pytest.raises(BagError, match="tell theirs"):
+    with pytest.raises(BagError, match="contain theirs"):
         open_recording(bag, CONFIG, magnification=100.0)
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((10, 10), np.uint8))
     with pytest.raises(InvalidValueError, match="greater than 0"):

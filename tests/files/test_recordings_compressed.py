@@ -21,7 +21,8 @@ from semcal_ros.config.config import (
     MicroscopeConfig,
 )
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bags.reader import BagWriter, blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame, open_recording
 
 T0 = 1_700_000_000 * 10**9
@@ -149,7 +150,7 @@ def test_several_candidates_are_refused(tmp_path: Path) -> None:
         ("/a/picture/compressed", flat(1, "png")),
         ("/b/picture/compressed", flat(2, "png")),
     )
-    with pytest.raises(BagError, match="more than one topic could be the image"):
+    with pytest.raises(BagError, match="several topics could be the image"):
         frames_and_notes(path, RAW)
 
 

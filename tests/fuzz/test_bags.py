@@ -23,8 +23,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.core.errors import BagError, SemcalError
-from semcal_ros.files.bags.messages import jazzy_types, serialize_message
-from semcal_ros.files.bags.reader import BagReader, RawMessage, blank_message, open_bag
+from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
+from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
 from semcal_ros.files.recordings import open_recording
 from tests.helpers.fuzz_inputs import (
     YAML_PIECES,

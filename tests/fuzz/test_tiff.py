@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.plain_images import read_plain_image
-from semcal_ros.files.tiff import SemImage, read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.read import read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.sem_image import SemImage
 from semcal_ros.files.tiff.to_bag import METADATA_TOPIC, import_folder
 from semcal_ros.files.tiff.values import PIXEL_SIZE_RANGE_M, plain_number, quantity
 from tests.helpers.fuzz_inputs import changed, damaged, edited_text

@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.reader import BagWriter
+from semcal_ros.files.bags.writer import BagWriter
 
 SIZE = 96
 RANGE = (500.0, 8000.0)

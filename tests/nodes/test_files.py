@@ -83,5 +83,5 @@ def test_without_a_folder_no_file_can_be_named(peer: Peer, tmp_path: Path) -> No
 def test_a_directory_that_is_none_ends_the_node_with_one_line(tmp_path: Path) -> None:
     status, output = ended("parameter_server", {"directory": tmp_path / "missing"})
     assert status == 2
-    assert "which is no folder" in output
+    assert "which is not a folder" in output
     assert len(output.strip().splitlines()) == 1

@@ -1,4 +1,4 @@
-"""What the bag library and its backends raise on damaged or foreign files, as one error."""
+"""The errors that the bag library and its backends raise on damaged or foreign files, as one."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ else:
 
 __all__ = ["LIBRARY_ERRORS", "check_types", "one_line", "reading", "unreadable"]
 
-# Damaged bytes surface from the parsers as many kinds of errors: lengths that overflow, unknown
-# keys, failed internal checks. The lz4 backend has no error class but RuntimeError. These are only
-# ever caught around calls of the library.
+# Damaged bytes surface from the parsers as errors of many kinds: lengths that overflow, unknown
+# keys, failed internal checks. The lz4 backend raises plain RuntimeError. These errors are only ever
+# caught around calls of the library.
 LIBRARY_ERRORS: tuple[type[Exception], ...] = (
     ReaderError,
     WriterError,
@@ -47,29 +47,29 @@ LIBRARY_ERRORS: tuple[type[Exception], ...] = (
     AssertionError,
 )
 
-_MAX_REASON = 200
+_MAX_REASON = 200  # characters: an error is one line
 _MAX_NAME = 255  # of DDS
 
 
 def one_line(error: BaseException) -> str:
-    """Short description of a library's error without line breaks, never empty."""
+    """Short description of a library's error, without line breaks and never empty."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
 
 
 def check_types(reader: Reader) -> None:
-    """Raise where an open reader has values that the library does not look at.
+    """Check values of an open reader that the library takes as they are.
 
-    Columns of sqlite3 and values of YAML have any type and length.
+    Columns of sqlite3 and values of YAML can have any type and length.
 
     Raises
     ------
     TypeError, ValueError
-        A name is no text or too long, or the list of files is none.
+        A name is not text or too long, or the list of files is not a list.
     """
     files = getattr(reader.storage, "files", [])
     if not isinstance(files, list):
-        # Else the library could not close what it opened.
+        # Otherwise the library could not close what it opened.
         setattr(reader.storage, "files", [])  # noqa: B010
         raise TypeError(f"the list of files is a {type(files).__name__}")
     for connection in reader.connections:

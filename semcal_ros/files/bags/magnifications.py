@@ -1,4 +1,4 @@
-"""The magnification that held at each image of a recording."""
+"""The magnification that was valid at each image of a recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class MagnificationTrack:
 
     Times are header stamps where every message has one, else the times of the recorder. A message
     with a bad value ends the validity of the one before it, so that no image gets a magnification
-    that the microscope may have left.
+    at which the microscope may no longer have been.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class MagnificationTrack:
     usable
         Number of messages with a usable value.
     by_stamp
-        Whether header stamps are compared, not the times of the recorder.
+        Whether header stamps are compared with those of the images, not the times of the recorder.
     """
 
     def __init__(self, reader: BagReader, topic: str, config: MicroscopeConfig) -> None:
@@ -57,7 +57,7 @@ class MagnificationTrack:
         return stamp_ns, raw.log_time_ns, reading
 
     def at(self, stamp_ns: int, log_time_ns: int, image_width_px: int) -> float | None:
-        """Magnification at an image, ``None`` before the first message and after a bad one.
+        """Magnification at an image, or None before the first message and after a bad one.
 
         Raises
         ------

@@ -112,12 +112,12 @@ def _normalise(message: Any, typename: str, store: Typestore) -> None:
 
 
 def serialize_message(message: Any) -> memoryview:
-    """CDR bytes of a message; array fields may be arrays, ``bytes``, ``array.array`` or lists.
+    """CDR bytes of a message, whose array fields may be arrays, ``bytes``, ``array.array`` or lists.
 
     Raises
     ------
     BagError
-        The object is no message, or its type is unknown.
+        The object is not a message, or its type is unknown.
     ValueError, struct.error, OverflowError
         A value does not fit its field.
     """

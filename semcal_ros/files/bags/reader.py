@@ -1,7 +1,11 @@
-"""Read and write ROS 2 recordings (rosbag2) without ROS.
+"""Read ROS 2 recordings (rosbag2) without ROS.
 
 Both storage formats (mcap, sqlite3), compressed or not, as a folder with ``metadata.yaml`` or as a
 single file.
+
+``AnyReader`` of rosbags would choose the types of messages too. It registers the definitions of all
+topics when it opens a recording, so that a damaged one on a topic that nobody reads would make the
+recording unreadable, and it writes code for arrays of any fixed length before they can be refused.
 """
 
 from __future__ import annotations
@@ -25,8 +29,7 @@ from rosbags.typesys.store import Typestore
 
 from semcal_ros.core.errors import BagError, CalibrationFileError
 from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
-from semcal_ros.files.bags.messages import blank_message, jazzy_types
-from semcal_ros.files.bags.writer import BagWriter
+from semcal_ros.files.bags.messages import jazzy_types
 from semcal_ros.files.plain_yaml import check_plain_yaml
 from semcal_ros.text_files import read_text_file
 
@@ -37,9 +40,7 @@ __all__ = [
     "BagMessage",
     "BagReader",
     "BagTopic",
-    "BagWriter",
     "RawMessage",
-    "blank_message",
     "is_bag",
     "open_bag",
 ]
@@ -48,6 +49,8 @@ STORAGE_SUFFIXES = (".mcap", ".db3")
 _ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"
 # One file with three topics takes 1.4 kB.
 _MAX_METADATA = 16 * 1024 * 1024
+# The library writes and compiles code for each element of such an array: this bounds the time and
+# the memory that a recording's definition can ask for.
 _MAX_UNROLLED = 1000
 _IDL_RULE = "=" * 80 + "\n"
 
@@ -103,13 +106,13 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _locate(path: Path) -> Path:
-    """What to hand to the library for ``path``."""
+    """The path that the library opens for ``path``."""
     if not path.exists():
         raise BagError(f"{path} does not exist", expected=_ACCEPTED, do="check the path")
     if not path.is_dir():
         if path.suffix not in STORAGE_SUFFIXES:
             raise BagError(
-                f"{path} is no ROS 2 recording by its name",
+                f"{path} does not have the name of a ROS 2 recording",
                 expected=_ACCEPTED,
                 do="convert a ROS 1 .bag with rosbags-convert; name the folder of a compressed one",
             )
@@ -135,7 +138,7 @@ def _locate(path: Path) -> Path:
 
 
 def _checked_name(path: Path, files: list[Path]) -> Path:
-    """``path``, unless the library would mistake it: it hands names of sqlite3 files on as URIs."""
+    """``path``, unless the library would misread it: it opens sqlite3 files by URI."""
     odd = [character for character in "?#%" if character in str(path)]
     if odd and any(file.suffix == ".db3" for file in files):
         raise BagError(
@@ -221,7 +224,7 @@ class BagReader:
         Raises
         ------
         BagError
-            The file is damaged, or declares messages of a topic and has none.
+            The file is damaged, or declares messages on a topic and holds none.
         """
         wanted = None if topics is None else set(topics)
         chosen = [c for c in self._connections if wanted is None or c.topic in wanted]
@@ -262,7 +265,7 @@ class BagReader:
                 raise BagError(
                     f"{self.path} declares {topic.count} messages on {topic.name} and holds none",
                     expected="metadata.yaml that describes the files beside it",
-                    do="make it anew with 'ros2 bag reindex'",
+                    do="make it again with 'ros2 bag reindex'",
                 )
 
     def messages(
@@ -280,12 +283,12 @@ class BagReader:
         return self.messages()
 
     def decode(self, raw: RawMessage) -> Any:
-        """Message with the fields of its ROS type as attributes; arrays are read-only NumPy arrays.
+        """The message, with the fields of its ROS type as attributes and arrays as read-only NumPy arrays.
 
         Raises
         ------
         BagError
-            The bytes do not fit the type, or it is neither known nor described in the recording.
+            The bytes do not fit the type, or the type is neither known nor described in the recording.
         """
         store = self._store_for(raw)
         try:
@@ -367,7 +370,7 @@ def _own_types(connection: Connection) -> dict[str, Any]:
 
 
 def _check_arrays(types: dict[str, Any], what: str) -> None:
-    """Refuse arrays of texts or messages of enormous fixed length: the library writes code for each element."""
+    """Refuse arrays of texts or messages of a large fixed length: the library writes code for each element."""
     for _, fields in types.values():
         for name, (kind, detail) in fields:
             if kind != Nodetype.ARRAY:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.files.bags.reader import BagWriter, blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter
 
 __all__ = ["SIMULATED_START_NS", "write_simulated"]
 

@@ -11,7 +11,7 @@ from semcal_ros.files.bags.reader import BagTopic
 
 __all__ = ["find_image_topic", "find_topic", "topic_matches"]
 
-_MAX_LISTED = 8
+_MAX_LISTED = 8  # topics in one line of an error
 
 
 def topic_matches(wanted: str, recorded: str) -> bool:
@@ -30,21 +30,21 @@ def _listed(topics: Sequence[BagTopic]) -> str:
 def find_topic(
     path: Path, topics: Sequence[BagTopic], *, what: str, wanted: str, type_name: str
 ) -> tuple[BagTopic, str]:
-    """The topic to read, and a note ("" if its name is the configured one).
+    """The topic to read, and a note, which is empty if the topic has the configured name.
 
     Parameters
     ----------
     topics
         All topics of the recording.
     what
-        What it carries, for messages to people.
+        What the topic carries, for messages to people.
     wanted, type_name
         Name and message type from the configuration.
 
     Raises
     ------
     BagError
-        There is none, there are several, or it has another type.
+        No topic fits, several do, or the topic has another type.
     """
     named = [t for t in topics if topic_matches(wanted, t.name)]
     fitting = [t for t in named if t.type == type_name]
@@ -58,11 +58,13 @@ def find_topic(
         )
     candidates = fitting or [t for t in topics if t.type == type_name and t.count > 0]
     if len(candidates) == 1:
-        return candidates[0], f"{what} is read from {candidates[0].name}, there is no {wanted}"
+        return candidates[
+            0
+        ], f"the {what} is read from {candidates[0].name}: there is no topic {wanted}"
     seen = _listed(candidates) if candidates else _listed(topics)
-    problem = "more than one topic could be" if candidates else "no topic is"
+    problem = "several topics could be" if candidates else "no topic is"
     raise BagError(
-        f"in {path} {problem} the {what}: it has {seen}",
+        f"in {path} {problem} the {what}; the topics are {seen}",
         expected=f"one topic {wanted} of type {type_name}",
         do="name the topic in a msg_configs file and pass it with --config",
     )

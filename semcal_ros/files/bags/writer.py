@@ -51,12 +51,12 @@ def _qos(latched: bool, depth: int) -> Qos:
 
 
 def check_replaceable(path: Path, overwrite: bool) -> None:
-    """Refuse to write to a path that exists, or that is no recording and must not be deleted.
+    """Refuse to write to a path that exists, or that is not a recording and must not be deleted.
 
     Raises
     ------
     BagError
-        ``path`` exists and ``overwrite`` is false, or it is something else than a recording.
+        ``path`` exists and ``overwrite`` is false, or it is something other than a recording.
     """
     if not os.path.lexists(path):
         return
@@ -70,7 +70,7 @@ def check_replaceable(path: Path, overwrite: bool) -> None:
         if not names or ((path / "metadata.yaml").exists() and not foreign):
             return
     raise BagError(
-        f"{path} is no recording and is not replaced",
+        f"{path} is not a recording, so it is not replaced",
         expected="a new path or an existing rosbag2 folder",
         do="choose another name or remove it yourself",
     )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from semcal_ros.core.errors import SemcalError, TiffError
 from semcal_ros.files.plain_images import PLAIN_IMAGES
-from semcal_ros.files.tiff import SemImage, is_tiff, read_sem_settings, read_sem_tiff
-from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.tiff.read import is_tiff, read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
 
 __all__ = [
     "MIN_SPACING_NS",
@@ -23,12 +23,12 @@ __all__ = [
 _SECOND_NS = 1_000_000_000
 _SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
 MIN_SPACING_NS = 1_000_000
-"""Least time between two images of a folder, whose files tell whole seconds."""
+"""Least time between two images of a folder, whose files have whole seconds: 1000 images fit into one."""
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """Something that could not be used, and why."""
+    """A file that could not be used, and the reason."""
 
     name: str
     reason: str
@@ -102,7 +102,7 @@ def _collect(files: list[Path]) -> tuple[list[_Found], list[Skipped]]:
     found, skipped = [], []
     for path in files:
         if not is_tiff(path):
-            skipped.append(Skipped(path.name, "no TIFF, so it has no SEM metadata"))
+            skipped.append(Skipped(path.name, "not a TIFF, so it has no SEM metadata"))
             continue
         try:
             found.append(_Found(path, *read_sem_settings(path)))
@@ -115,7 +115,7 @@ def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
     """Files in time order with strictly increasing stamps, and where these come from."""
     if any(item.settings.time is None for item in found):
         pairs = [(item, _SYNTHETIC_START_NS + k * _SECOND_NS) for k, item in enumerate(found)]
-        return pairs, "not all files tell their time: stamps are 1 s apart in the order of names"
+        return pairs, "not all files have a time: stamps are 1 s apart, in the order of names"
     timed = []
     for item in found:
         time = item.settings.time
@@ -124,7 +124,7 @@ def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
     timed.sort(key=lambda pair: pair[1])
     spread: list[tuple[_Found, int]] = []
     for item, stamp_ns in timed:
-        # Files tell whole seconds; images of the same second keep their order of names.
+        # Files have whole seconds; images of the same second stay in the order of their names.
         earliest = spread[-1][1] + MIN_SPACING_NS if spread else stamp_ns
         spread.append((item, max(stamp_ns, earliest)))
     return spread, "stamps are the files' local times taken as UTC"
@@ -133,16 +133,16 @@ def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
 def scan_tiff_folder(
     path: Path, *, display_width_m: float, databar_rows: int | None = None
 ) -> TiffFolder:
-    """Look at all images of a folder (or at a single file); only metadata are read.
+    """Collect the images of a folder, or a single one; only metadata are read.
 
     Parameters
     ----------
     path
         Folder with SEM TIFFs, not searched below, or one such file.
     display_width_m
-        Display width that all magnifications shall refer to.
+        Display width that all magnifications are to refer to.
     databar_rows
-        Rows to cut off at the bottom of every image, in place of what the metadata say.
+        Rows to cut off at the bottom of every image, instead of those that the metadata give.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def scan_tiff_folder(
     if not found:
         first = f", the first ({skipped[0].name}): {skipped[0].reason}" if skipped else ""
         raise TiffError(
-            f"{path} has {len(images)} image files and none is usable{first}",
+            f"{path} has {len(images)} image files, of which none is usable{first}",
             expected="original SEM TIFFs of Zeiss, Thermo Fisher, TESCAN or JEOL",
             do="name the folder with the microscope's own files",
         )

@@ -20,7 +20,7 @@ __all__ = ["USUAL_DISPLAY_WIDTH_M", "jeol_pairs", "jeol_settings"]
 USUAL_DISPLAY_WIDTH_M = 0.128
 """Width of the photograph (5 x 4 inch film) to which JEOL's magnification usually refers."""
 
-_MAX_SIDECAR_BYTES = 1_000_000
+_MAX_SIDECAR_BYTES = 1_000_000  # the text files have a few kB
 
 
 def _decode(data: bytes) -> str:
@@ -33,7 +33,7 @@ def _decode(data: bytes) -> str:
 
 
 def jeol_pairs(data: bytes) -> dict[str, str]:
-    """Settings by name without their dollar signs; empty if this is no JEOL text."""
+    """Settings by name, without their dollar signs; empty if this is not a text of JEOL."""
     pairs: dict[str, str] = {}
     for line in _decode(data[:_MAX_SIDECAR_BYTES]).splitlines():
         if line.startswith("$"):
@@ -80,7 +80,7 @@ def _pixel_size(
             raise TiffError(
                 f"{path.name}: $CM_MAG in its text file is {pairs.get('CM_MAG', 'missing')[:40]}",
                 expected="$CM_FIELD_OF_VIEW, $CM_MAG or a micron bar",
-                do="export the image anew with its text file",
+                do="export the image again with its text file",
             )
         return check_pixel_size(path, from_bar, "$$SM_MICRON_BAR", from_bar), False, ()
     assumed = USUAL_DISPLAY_WIDTH_M / shown / columns
@@ -92,7 +92,7 @@ def _pixel_size(
             return check_pixel_size(path, from_bar, "$$SM_MICRON_BAR", from_bar), False, (note,)
         note = f"display width {USUAL_DISPLAY_WIDTH_M} m assumed; the micron bar agrees with it"
         return check_pixel_size(path, assumed, "$CM_MAG", shown), False, (note,)
-    note = f"display width {USUAL_DISPLAY_WIDTH_M} m assumed: the file gives no length"
+    note = f"display width {USUAL_DISPLAY_WIDTH_M} m assumed: the file has no length"
     return check_pixel_size(path, assumed, "$CM_MAG", shown), True, (note,)
 
 

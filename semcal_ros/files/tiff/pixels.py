@@ -15,9 +15,10 @@ from semcal_ros.core.errors import TiffError
 
 __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
 
+# They bound the memory that a damaged header can ask for: 2^29 pixels of 16 bits are 1 GiB.
 MAX_SIDE_PX = 65_536
 MAX_PIXELS = 2**29
-_MAX_SAMPLES = 4
+_MAX_SAMPLES = 4  # red, green, blue, alpha
 # Above what Deflate (1032) and LZW reach: beyond, the pixels are not in the file.
 _MAX_PACKING = 4096
 # Tags of one number: sizes, compression, photometric, orientation, samples, rows per strip, planes, predictor, tiles.
@@ -28,7 +29,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 
 
 def check_counts(path: Path) -> None:
-    """Refuse a first directory with several numbers where there is one: the parser would multiply them.
+    """Refuse a first directory with several values in a tag of one: the parser would multiply them.
 
     Other damage is left to the parser, ``struct.error`` and ``OSError`` included.
     """

@@ -48,7 +48,7 @@ def is_tiff(path: Path) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the TIFF parsers from logging what is reported as an error here, and unknown tags."""
+    """Keep the TIFF parsers from logging unknown tags, and what is raised as an error here."""
     logger = logging.getLogger("tifffile")
     before, opencv = logger.disabled, cv2.utils.logging.getLogLevel()
     logger.disabled = True
@@ -67,7 +67,7 @@ def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
 
 
 def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> VendorSettings:
-    """Settings by whichever maker's metadata the file has."""
+    """Settings from the metadata of the maker that the file has."""
     tags = page.tags
     if zeiss.TAG in tags and isinstance(tags[zeiss.TAG].value, dict):
         return zeiss.zeiss_settings(path, tags[zeiss.TAG].value)
@@ -126,7 +126,7 @@ def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
 def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
     page = file.pages.first
     if not isinstance(page, tifffile.TiffPage):
-        raise TiffError(f"{path.name} holds no picture", expected="an SEM image")
+        raise TiffError(f"{path.name} has no image", expected="an SEM image")
     return page
 
 
@@ -140,19 +140,19 @@ def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]
 
 
 def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemImage:
-    """Read an SEM image and its settings; tags or the text file beside it tell the maker.
+    """Read an SEM image and its settings; its tags or the text file beside it say who made the microscope.
 
     Parameters
     ----------
     path
         A TIFF file of Zeiss, Thermo Fisher (FEI), TESCAN or JEOL.
     databar_rows
-        Rows to cut off at the bottom, in place of what the metadata say.
+        Rows to cut off at the bottom, instead of those that the metadata give.
 
     Raises
     ------
     TiffError
-        Missing, truncated or no TIFF; no known metadata; no usable pixel size; an absurd size.
+        The file is missing, truncated or not a TIFF, or has no known metadata, no usable pixel size, or an absurd size.
     """
     path = Path(path)
     with _opened(path) as file:

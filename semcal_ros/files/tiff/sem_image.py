@@ -16,7 +16,7 @@ __all__ = ["SemImage", "VendorSettings"]
 
 @dataclass(frozen=True)
 class VendorSettings:
-    """What a maker's metadata say, in SI units; ``None`` where they say nothing.
+    """Settings from a maker's metadata in SI units; None where a file does not have one.
 
     Parameters
     ----------
@@ -29,12 +29,12 @@ class VendorSettings:
     displayed_magnification
         The magnification that the microscope showed, which depends on its display width.
     databar_rows
-        Rows at the bottom of the file that are no part of the scan.
+        Rows at the bottom of the file that are not part of the scan.
     display_width_assumed
         Whether the pixel size rests on the maker's usual display width, not on a value in the
         file.
     notes
-        What a person should know about these values.
+        Remarks on these values, for people.
     """
 
     vendor: str
@@ -99,7 +99,7 @@ class SemImage:
 
     @property
     def displayed_magnification(self) -> float | None:
-        """Magnification that the microscope showed, if the file tells."""
+        """Magnification that the microscope showed, if the file has it."""
         return self.settings.displayed_magnification
 
     @property
@@ -141,7 +141,7 @@ class SemImage:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a person should know about these values."""
+        """Remarks on these values, for people."""
         return self.settings.notes
 
     def magnification(self, display_width_m: float) -> float:

@@ -38,7 +38,7 @@ def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
     Raises
     ------
     TiffError
-        There are none: the tag is damaged.
+        There are none, or the pixel size is missing: the tag is damaged.
     """
     texts = _text_records(data) or [data.decode("utf-8", errors="replace")]
     pairs: dict[str, str] = {}
@@ -50,7 +50,7 @@ def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
         raise TiffError(
             f"{path.name}: tag 50431 holds {len(pairs)} settings and no PixelSizeX",
             expected="the key=value lines of TESCAN",
-            do="export the image anew with its metadata",
+            do="export the image again with its metadata",
         )
     return pairs
 

@@ -13,6 +13,7 @@ from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_num
 __all__ = ["TAGS", "thermo_fisher_settings"]
 
 TAGS = (34682, 34680)
+# Above it a note says that pixels are not square; both sizes are used as they are in any case.
 _SQUARE_TOLERANCE = 1e-3
 
 
@@ -34,7 +35,7 @@ def _databar_rows(path: Path, image: Mapping[str, Any], size_px: tuple[int, int]
         return 0
     if int(columns) != width or not 0 < rows <= height:
         raise TiffError(
-            f"{path.name} is {width} x {height} pixels, its tag speaks of {columns:g} x {rows:g}",
+            f"{path.name} is {width} x {height} pixels, its tag says {columns:g} x {rows:g}",
             expected="the image as the microscope stored it",
             do="use the original file, not a resized or cropped copy",
         )

@@ -15,7 +15,6 @@ from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, load_config
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
-from semcal_ros.files.tiff import SemImage
 from semcal_ros.files.tiff.folder import (
     MIN_SPACING_NS,
     Skipped,
@@ -23,6 +22,7 @@ from semcal_ros.files.tiff.folder import (
     TiffFolder,
     scan_tiff_folder,
 )
+from semcal_ros.files.tiff.sem_image import SemImage
 
 __all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_folder"]
 
@@ -173,7 +173,7 @@ def import_folder(
         the recording with the same configuration: the field widths, and with them the pixel sizes,
         are then exactly those of the files.
     databar_rows
-        Rows to cut off at the bottom of every image, in place of what the files say; by default the
+        Rows to cut off at the bottom of every image, instead of those that the files give; by default the
         configuration's, if they are not 0.
     overwrite
         Replace an existing recording.

@@ -18,8 +18,10 @@ __all__ = [
     "quantity",
 ]
 
+# A tenth of a picometre lies far below the size of an atom, a millimetre above any field of an SEM
+# divided by its columns: what lies outside has lost its unit.
 PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)
-_YEARS = (1971, 2037)
+_YEARS = (1971, 2037)  # what the 32-bit seconds of a ROS stamp hold
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
@@ -35,7 +37,7 @@ def _split(text: object) -> tuple[float, str] | None:
 
 
 def _unit_scale(unit: str, base: str) -> float | None:
-    """Factor to SI of a unit such as ``nm``; a micro sign in a lost encoding is odd."""
+    """Factor to SI of a unit such as ``nm``; None if unknown. A micro sign may have lost its encoding."""
     if not unit.endswith(base):
         return None
     prefix = unit[: len(unit) - len(base)].strip()
@@ -46,7 +48,7 @@ def _unit_scale(unit: str, base: str) -> float | None:
 
 
 def quantity(text: object, base: str, *, default_unit: str = "") -> float | None:
-    """Value in SI of a text such as ``593.3 nm``; ``None`` if it has no number or another unit.
+    """Value in SI of a text such as ``593.3 nm``; None if it has no number or another unit.
 
     Parameters
     ----------
@@ -79,12 +81,12 @@ def positive(value: float | None) -> float | None:
 
 
 def check_pixel_size(path: Path, value: float | None, key: str, seen: object) -> float:
-    """The pixel size, if it is one that an SEM can have.
+    """The pixel size, if an SEM can have it.
 
     Raises
     ------
     TiffError
-        It is missing, no number, without a known unit, or absurd.
+        It is missing, not a number, without a known unit, or absurd.
     """
     low, high = PIXEL_SIZE_RANGE_M
     if value is None or not low <= value <= high:
@@ -92,13 +94,13 @@ def check_pixel_size(path: Path, value: float | None, key: str, seen: object) ->
         raise TiffError(
             f"{path.name}: {key} is {shown}",
             expected=f"a pixel size of {low * 1e9:g} nm to {high * 1e3:g} mm with its unit",
-            do="export the image anew with its metadata",
+            do="export the image again with its metadata",
         )
     return value
 
 
 def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
-    """First credible date that one of the (text, format) pairs gives; ``None`` if none does.
+    """First credible date that one of the (text, format) pairs gives, or None.
 
     Years that the 32-bit seconds of a ROS stamp cannot hold are not credible.
     """

@@ -22,7 +22,7 @@ TAG = 34118
 # The unnamed numbers at the head of the tag repeat some settings with more digits.
 _PIXEL_SIZE, _MAGNIFICATION, _WORKING_DISTANCE = 3, 4, 9
 _BAR_NOTE = (
-    "the file does not tell how many rows the databar covers; give databar_rows if it is burnt in"
+    "the file does not say how many rows the databar covers; give databar_rows if there is one"
 )
 
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bags.messages import jazzy_types, serialize_message
-from semcal_ros.files.bags.reader import BagTopic, BagWriter, blank_message, open_bag
+from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
+from semcal_ros.files.bags.reader import BagTopic, open_bag
+from semcal_ros.files.bags.writer import BagWriter
 
 FLOAT = "std_msgs/msg/Float64"
 IMAGE = "sensor_msgs/msg/Image"

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff import read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.read import read_sem_settings, read_sem_tiff
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 
