@@ -13,10 +13,8 @@ import pytest
 
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 
-pytestmark = pytest.mark.slow
-
 # They make their recordings and calibrations themselves.
-pytestmark = pytest.mark.timeout(400)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 ROOT = Path(__file__).resolve().parents[2]
 
