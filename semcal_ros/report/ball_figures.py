@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
@@ -10,6 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from semcal_ros.applications.reconstruction import Ball, Structure
 from semcal_ros.core.arrays import Array
+from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     INK,
@@ -21,7 +24,7 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = ["plot_ball", "render_ball"]
+__all__ = ["plot_ball", "render_ball", "write_ball_figure"]
 
 
 _NM = 1e9
@@ -31,6 +34,11 @@ _DPI = 110.0
 def render_ball(structure: Structure, ball: Ball) -> bytes:
     """Draw :func:`plot_ball` as a PNG file."""
     return encode_png(plot_ball(structure, ball), _DPI)
+
+
+def write_ball_figure(structure: Structure, ball: Ball, file: Path) -> None:
+    """Write :func:`render_ball` completely or not at all; OSError if that fails."""
+    atomic_write_bytes(file, render_ball(structure, ball))
 
 
 def plot_ball(structure: Structure, ball: Ball) -> Figure:

@@ -14,8 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from semcal_ros.applications.cantilever import Deflection, Repeatability, Series
+from semcal_ros.applications.cantilever import (
+    Deflection,
+    Repeatability,
+    Series,
+    frames_of_poses,
+)
+from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.files.video import film_of
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -33,6 +40,7 @@ __all__ = [
     "draw_deflection",
     "plot_poses",
     "plot_strip",
+    "write_bending_video",
     "write_poses_figure",
     "write_strip_figure",
 ]
@@ -43,6 +51,9 @@ _MARKS = "osD^vX"
 _SHOWN_POSES = 3
 # Frames are shown smaller than they are: noise averages out, and the file is smaller.
 _SHOWN_PX = 128
+# Quantiles of the grey levels that a video shows as black and white: one pixel in a thousand may be
+# clipped at either end.
+_BLACK_WHITE = (0.001, 0.999)
 
 
 def write_poses_figure(agreed: Repeatability, file: Path) -> None:
@@ -58,6 +69,55 @@ def write_strip_figure(
 ) -> None:
     """Write :func:`plot_strip` completely or not at all; OSError if that fails."""
     _write(plot_strip(images, series, firsts), file)
+
+
+def write_bending_video(
+    images: Sequence[Sequence[NDArray[Any]]],
+    series: Sequence[Series],
+    poses: int | None,
+    fps: float,
+    file: Path,
+) -> None:
+    """Write all frames with the line of the beam and its deflection, one series after the other.
+
+    Parameters
+    ----------
+    images
+        (h, w) grey pictures of the frames of each series.
+    series
+        What was measured in them.
+    poses
+        As for :func:`~semcal_ros.applications.cantilever.repeatability.frames_of_poses`.
+    fps
+        Frames per second.
+    file
+        ``.mp4`` or ``.avi``.
+
+    Raises
+    ------
+    BagError
+        The pictures have different sizes, or the video did not come out with all of its frames.
+    InvalidValueError
+        OpenCV has no encoder for it.
+    """
+    shapes = {pictures[0].shape for pictures in images}
+    if len(shapes) > 1:
+        raise BagError(f"{file} of frames of sizes {sorted(shapes)}", expected="one size")
+    height, width = next(iter(shapes))
+    some = np.concatenate([pictures[0][::4, ::4].ravel() for pictures in images])
+    low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
+    count = sum(len(pictures) for pictures in images)
+    with film_of(file, (width, height), count, fps, (low, high)) as film:
+        assert film is not None
+        for pictures, one in zip(images, series, strict=True):
+            groups = enumerate(frames_of_poses(len(pictures), poses), 1)
+            pose_of = {k: number for number, group in groups for k in group}
+            for k, frame in enumerate(one.frames):
+                nm, sigma = 1e9 * frame.deflection_m, 1e9 * frame.sigma_m
+                film.write(
+                    draw_deflection(pictures[k], frame, (low, high)),
+                    f"{one.magnification:g}x  pose {pose_of[k]}  {nm:.1f} +- {sigma:.1f} nm",
+                )
 
 
 def _write(figure: Figure, file: Path) -> None:
