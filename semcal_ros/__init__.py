@@ -10,8 +10,24 @@ if TYPE_CHECKING:
     from semcal_ros.core.camera.scan_camera import ScanCamera
     from semcal_ros.core.errors import SemcalError
     from semcal_ros.workflows.calibrate import calibrate
+    from semcal_ros.workflows.measure_cantilever import measure_cantilever
+    from semcal_ros.workflows.reconstruct import reconstruct
+    from semcal_ros.workflows.rectify import rectify
+    from semcal_ros.workflows.stack import stack
+    from semcal_ros.workflows.track_drift import track_drift
 
-__all__ = ["Calibration", "ScanCamera", "SemcalError", "__version__", "calibrate"]
+__all__ = [
+    "Calibration",
+    "ScanCamera",
+    "SemcalError",
+    "__version__",
+    "calibrate",
+    "measure_cantilever",
+    "reconstruct",
+    "rectify",
+    "stack",
+    "track_drift",
+]
 
 __version__ = "0.1.0"
 
@@ -20,6 +36,11 @@ _HOMES = {
     "ScanCamera": "semcal_ros.core.camera.scan_camera",
     "SemcalError": "semcal_ros.core.errors",
     "calibrate": "semcal_ros.workflows.calibrate",
+    "measure_cantilever": "semcal_ros.workflows.measure_cantilever",
+    "reconstruct": "semcal_ros.workflows.reconstruct",
+    "rectify": "semcal_ros.workflows.rectify",
+    "stack": "semcal_ros.workflows.stack",
+    "track_drift": "semcal_ros.workflows.track_drift",
 }
 
 

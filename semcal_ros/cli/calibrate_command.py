@@ -6,41 +6,38 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import (
+from semcal_ros.cli.options import (
+    PATH,
+    check_outputs,
     config_option,
-    configured,
-    echo_table,
     magnification_option,
-    progress,
-    require_folder,
+    output_option,
+    recording_argument,
 )
+from semcal_ros.cli.output import echo_notes, echo_table, show_progress
 from semcal_ros.core.calibration.calibrate import (
     METHODS,
     RESIDUAL_MODES,
     CalibrationOptions,
     MethodOptions,
 )
-from semcal_ros.files.recordings import open_recording
-from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_found
-from semcal_ros.workflows.find_grid import find_views, named_frames
+from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
 
 __all__ = ["command"]
 
 
-def _magnifications(
+def _parse_magnifications(
     context: click.Context, parameter: click.Parameter, text: str | None
 ) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(",")) if text else ()
     except ValueError:
-        raise click.BadParameter(f"{text!r} is no list such as 1000,5000") from None
+        raise click.BadParameter(f"{text!r} is not a list such as 1000,5000") from None
 
 
 @click.command("calibrate")
-@click.argument("recording", type=click.Path(path_type=Path))
-@click.option(
-    "-o", "--output", required=True, type=click.Path(path_type=Path), help="Calibration file."
-)
+@recording_argument
+@output_option("Calibration file.")
 @config_option
 @magnification_option
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
@@ -50,7 +47,7 @@ def _magnifications(
 )
 @click.option(
     "--breakpoints",
-    callback=_magnifications,
+    callback=_parse_magnifications,
     metavar="G,G,...",
     help="joint: where the microscope switches its scan range, so that the scale jumps.",
 )
@@ -62,7 +59,7 @@ def _magnifications(
     help="joint: a field for what the distortion parameters cannot describe.",
 )
 @click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
-@click.option("--report", type=click.Path(path_type=Path), help="Also write an HTML report.")
+@click.option("--report", type=PATH, help="Also write an HTML report.")
 def command(
     recording: Path,
     output: Path,
@@ -82,33 +79,26 @@ def command(
     Example:
       semcal calibrate recordings/grid -o cal.yaml --report report.html
     """
-    for target in (output, report):
-        if target is not None:
-            require_folder(target)
-    microscope = configured(config)
-    with open_recording(recording, microscope, magnification=magnification) as opened:
-        with progress(opened.frame_count, "finding corners") as bar:
-            found, rejected = find_views(named_frames(opened), on_progress=bar.update)
-        notes = opened.notes
-    with progress(None, "adjusting"):
-        done = calibrate_found(
-            found,
-            rejected,
-            display_width_m=microscope.display_width_m,
-            squares_m=microscope.squares_m,
+    check_outputs([("-o", output, ()), ("--report", report, ())])
+    with show_progress() as on_progress:
+        done = calibrate_recording(
+            recording,
+            config=config,
+            magnification=magnification,
             options=CalibrationOptions(
                 method, MethodOptions(pda_order, legendre, tau), breakpoints, residual
             ),
+            on_progress=on_progress,
         )
     done.calibration.save(output)
-    _tell(done, notes)
+    _echo_result(done)
     click.echo(f"calibration: {output}")
     if report is not None:
         _write_report(done, report, f"Calibration from {recording.absolute().name}")
         click.echo(f"report: {report}")
 
 
-def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
+def _echo_result(done: RecordingCalibration) -> None:
     statistics = done.calibration.statistics
     rejected = done.collected.rejected
     total = statistics["views"] + len(rejected)
@@ -143,8 +133,7 @@ def _tell(done: RecordingCalibration, notes: tuple[str, ...]) -> None:
         click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
     if len(rejected) > 10:
         click.echo(f"rejected: {len(rejected) - 10} more, see the report", err=True)
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
+    echo_notes(done.notes)
     for warning in done.result.warnings:
         click.echo(f"warning: {warning}", err=True)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import config_option, echo_json
+from semcal_ros.cli.options import config_option
+from semcal_ros.cli.output import echo_json
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import Finding, Severity

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import config_option, configured, overwrite_option, progress
+from semcal_ros.cli.options import PATH, config_option, overwrite_option
+from semcal_ros.cli.output import show_progress
+from semcal_ros.files.tiff.to_bag import import_folder
+from semcal_ros.workflows.inputs import count_frames, resolve_config
 
 __all__ = ["command"]
 
 
 @click.command("import")
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.argument("output", type=click.Path(path_type=Path))
+@click.argument("folder", type=PATH)
+@click.argument("output", type=PATH)
 @click.option(
     "--databar-rows",
     type=click.IntRange(0),
@@ -33,16 +36,14 @@ def command(
     Example:
       semcal import tiffs/ recordings/from_tiff
     """
-    from semcal_ros.files.tiff.to_bag import import_folder
-
-    with progress(None, "importing") as bar:
+    with show_progress() as on_progress:
         done = import_folder(
             folder,
             output,
-            config=configured(config),
+            config=resolve_config(config),
             databar_rows=databar_rows,
             overwrite=overwrite,
-            on_progress=lambda n: bar.update(n) and None,
+            on_progress=count_frames(on_progress, "importing", None),
         )
     for line in done.lines():
         click.echo(line)

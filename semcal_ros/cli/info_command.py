@@ -6,14 +6,16 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import config_option, configured, echo_table, progress
-from semcal_ros.files.recordings import RecordedFrame, open_recording
+from semcal_ros.cli.options import config_option, recording_argument
+from semcal_ros.cli.output import echo_notes, echo_table, show_progress
+from semcal_ros.files.recordings import RecordedFrame
+from semcal_ros.workflows.inputs import count_frames, open_source, resolve_config
 
 __all__ = ["command"]
 
 
 @click.command("info")
-@click.argument("recording", type=click.Path(path_type=Path))
+@recording_argument
 @config_option
 def command(recording: Path, config: str) -> None:
     """What RECORDING contains: topics, frames, sizes, magnifications.
@@ -22,12 +24,13 @@ def command(recording: Path, config: str) -> None:
     Example:
       semcal info recordings/grid
     """
-    with open_recording(recording, configured(config)) as opened:
+    with open_source(recording, resolve_config(config)) as opened:
         frames: list[tuple[float, int, str]] = []
-        with progress(opened.frame_count, "reading") as bar:
+        with show_progress() as on_progress:
+            advance = count_frames(on_progress, "reading", opened.frame_count)
             for frame in opened.frames():
                 frames.append((frame.magnification, frame.stamp_ns, _format(frame)))
-                bar.update(1)
+                advance(1)
         if opened.topics:
             echo_table(
                 ["topic", "type", "messages"],
@@ -42,8 +45,7 @@ def command(recording: Path, config: str) -> None:
     click.echo(
         f"{len(magnifications)} magnifications, {magnifications[0]:g} to {magnifications[-1]:g}"
     )
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
+    echo_notes(notes)
 
 
 def _format(frame: RecordedFrame) -> str:

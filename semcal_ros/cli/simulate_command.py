@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from semcal_ros.cli.common import overwrite_option, progress
+from semcal_ros.cli.options import PATH, overwrite_option
+from semcal_ros.cli.output import show_progress
+from semcal_ros.core.arrays import AnyImage
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
@@ -26,12 +29,13 @@ from semcal_ros.synthetic import (
     truth_of,
     zoom_plan,
 )
+from semcal_ros.workflows.inputs import count_frames
 
 __all__ = ["command"]
 
 
 @click.command("simulate")
-@click.argument("output", type=click.Path(path_type=Path))
+@click.argument("output", type=PATH)
 @click.option(
     "--plan",
     type=click.Choice(["grid", "drift", "steps", "zoom"]),
@@ -103,13 +107,25 @@ def command(
         detector = replace(detector, electrons=electrons)
     if blur is not None:
         detector = replace(detector, blur_px=blur)
-    recording = _planned(
+    recording = _make_plan(
         plan, microscope, detector, specimen, drift_name, magnifications, views, frames, seed
     )
-    with progress(len(recording), "simulating") as bar:
-        bar.iterable = map(recording.render, range(len(recording)))
-        write_simulated(output, recording.frames, bar, truth_of(recording), overwrite=overwrite)
+    with show_progress() as on_progress:
+        advance = count_frames(on_progress, "simulating", len(recording))
+        write_simulated(
+            output,
+            recording.frames,
+            _render(recording, advance),
+            truth_of(recording),
+            overwrite=overwrite,
+        )
     click.echo(f"{len(recording)} frames: {output}")
+
+
+def _render(recording: RecordingPlan, advance: Callable[[int], object]) -> Iterator[AnyImage]:
+    for index in range(len(recording)):
+        yield recording.render(index)
+        advance(1)
 
 
 def _check_magnifications(plan: str, values: tuple[float, ...]) -> None:
@@ -122,7 +138,7 @@ def _check_magnifications(plan: str, values: tuple[float, ...]) -> None:
         )
 
 
-def _planned(
+def _make_plan(
     plan: str,
     microscope: VirtualMicroscope,
     detector: Detector,

@@ -22,7 +22,7 @@ from semcal_ros.applications.cantilever import (
 )
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.video import film_of
+from semcal_ros.files.video import open_video
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -107,7 +107,7 @@ def write_bending_video(
     some = np.concatenate([pictures[0][::4, ::4].ravel() for pictures in images])
     low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
     count = sum(len(pictures) for pictures in images)
-    with film_of(file, (width, height), count, fps, (low, high)) as film:
+    with open_video(file, (width, height), count, fps, (low, high)) as film:
         assert film is not None
         for pictures, one in zip(images, series, strict=True):
             groups = enumerate(frames_of_poses(len(pictures), poses), 1)

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
     CalibrationResult,
@@ -21,15 +15,21 @@ from semcal_ros.core.calibration.calibrate import (
     calibrate_views,
 )
 from semcal_ros.core.calibration.views import FoundView, RejectedView
-from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import CalibrationError
-from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
-    Progress,
     collect_views,
     find_views,
     named_frames,
+)
+from semcal_ros.workflows.inputs import (
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_config,
 )
 
 __all__ = ["RecordingCalibration", "calibrate", "calibrate_found", "calibrate_recording"]
@@ -42,11 +42,22 @@ _TWICE = 0.12
 
 @dataclass(frozen=True)
 class RecordingCalibration:
-    """A calibration with everything that a report shows."""
+    """A calibration with everything that a report shows.
+
+    Attributes
+    ----------
+    calibration, result
+        The calibration, and the adjustment it comes from.
+    collected
+        Views that were used, and those that were not.
+    notes
+        What a person should know of the recording.
+    """
 
     calibration: Calibration
     result: CalibrationResult
     collected: CollectedViews
+    notes: tuple[str, ...] = ()
 
 
 def _check_factor(factor: float, display_width_m: float) -> None:
@@ -119,13 +130,70 @@ def calibrate_found(
 
 
 def calibrate_recording(
-    path: Path,
-    config: MicroscopeConfig,
+    source: Source,
     *,
+    config: ConfigSource | None = None,
+    display_width_m: float | None = None,
+    squares_m: Sequence[float] | None = None,
+    magnification: float | None = None,
     options: CalibrationOptions | None = None,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress = ignore_progress,
 ) -> RecordingCalibration:
-    """Calibrate from a recording: a bag, or a folder of SEM TIFF files.
+    """Calibrate, and keep the views and residuals that a report shows.
+
+    Parameters and errors are those of :func:`calibrate`.
+    """
+    chosen = resolve_config(config)
+    if display_width_m is not None:
+        chosen = replace(chosen, display_width_m=float(display_width_m))
+    if squares_m is not None:
+        chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
+    with open_source(source, chosen, magnification=magnification) as recording:
+        advance = count_frames(on_progress, "finding corners", recording.frame_count)
+        found, rejected = find_views(named_frames(recording), on_progress=advance)
+        notes = recording.notes
+    on_progress("adjusting", 0, None)
+    done = calibrate_found(
+        found,
+        rejected,
+        display_width_m=chosen.display_width_m,
+        squares_m=chosen.squares_m,
+        options=options,
+    )
+    return replace(done, notes=notes)
+
+
+def calibrate(
+    source: Source,
+    *,
+    config: ConfigSource | None = None,
+    display_width_m: float | None = None,
+    squares_m: Sequence[float] | None = None,
+    magnification: float | None = None,
+    method: str = "joint",
+    options: MethodOptions | None = None,
+    breakpoints: Sequence[float] = (),
+    residual: str = "auto",
+    on_progress: OnProgress = ignore_progress,
+) -> Calibration:
+    """Calibrate a microscope from a recording or from images in memory.
+
+    Parameters
+    ----------
+    source
+        A bag, a folder of images of the chess grid, or an iterable of (image, magnification)
+        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3).
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    display_width_m, squares_m
+        Replace the values of ``config``.
+    magnification
+        Of a folder of ordinary images, which do not tell it.
+    method, options, breakpoints, residual
+        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
+        is ``method_options``.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
 
     Raises
     ------
@@ -133,43 +201,6 @@ def calibrate_recording(
         If the recording cannot be read.
     CalibrationError
         If its images do not allow a calibration.
-    """
-    with open_recording(path, config) as recording:
-        found, rejected = find_views(named_frames(recording), on_progress=on_progress)
-    return calibrate_found(
-        found,
-        rejected,
-        display_width_m=config.display_width_m,
-        squares_m=config.squares_m,
-        options=options,
-    )
-
-
-def calibrate(
-    source: str | os.PathLike[str] | Iterable[tuple[NDArray[Any], float]],
-    *,
-    config: MicroscopeConfig | str | os.PathLike[str] | None = None,
-    display_width_m: float | None = None,
-    squares_m: Sequence[float] | None = None,
-    method: str = "joint",
-    options: MethodOptions | None = None,
-    breakpoints: Sequence[float] = (),
-    residual: str = "auto",
-) -> Calibration:
-    """Calibrate a microscope from a recording or from images in memory.
-
-    Parameters
-    ----------
-    source
-        A bag, a folder of SEM TIFF files, or an iterable of (image, magnification) pairs; images
-        are (h, w) or, in the channel order of OpenCV, (h, w, 3).
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    display_width_m, squares_m
-        Replace the values of ``config``.
-    method, options, breakpoints, residual
-        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
-        is ``method_options``.
 
     Examples
     --------
@@ -179,33 +210,14 @@ def calibrate(
         cal = calibrate("recordings/grid", config="jsm820")
         cal.save("jsm820.yaml")
     """
-    if isinstance(config, MicroscopeConfig):
-        chosen = config
-    else:
-        chosen = load_config("generic" if config is None else os.fspath(config))
-    if display_width_m is not None:
-        chosen = replace(chosen, display_width_m=float(display_width_m))
-    if squares_m is not None:
-        chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
-    chosen_options = CalibrationOptions(
-        method, options or MethodOptions(), tuple(breakpoints), residual
-    )
-    if isinstance(source, (str, os.PathLike)):
-        done = calibrate_recording(
-            Path(source),
-            chosen,
-            options=chosen_options,
-        )
-        return done.calibration
-    frames = (
-        (f"image {i}", to_gray(np.asarray(image)), checked_magnification(g))
-        for i, (image, g) in enumerate(source)
-    )
-    found, rejected = find_views(frames)
-    return calibrate_found(
-        found,
-        rejected,
-        display_width_m=chosen.display_width_m,
-        squares_m=chosen.squares_m,
-        options=chosen_options,
+    return calibrate_recording(
+        source,
+        config=config,
+        display_width_m=display_width_m,
+        squares_m=squares_m,
+        magnification=magnification,
+        options=CalibrationOptions(
+            method, options or MethodOptions(), tuple(breakpoints), residual
+        ),
+        on_progress=on_progress,
     ).calibration

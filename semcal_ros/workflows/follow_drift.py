@@ -24,22 +24,22 @@ from semcal_ros.files.recordings import RecordedFrame
 
 __all__ = [
     "GIVE_FRAME_TIME",
-    "Follower",
-    "camera_of",
+    "DriftFollower",
+    "camera_for",
+    "estimate_timing",
     "start_time_s",
-    "timing_seen",
-    "with_frame_time",
 ]
 
 #: What a user can do about a timing that is not configured.
 GIVE_FRAME_TIME = "give the time of one pass as --frame-time or in a configuration"
 
 
-# Drift from frame to frame from which on its shear within them could matter, px.
+# Drift from frame to frame, px, beyond which its shear within them is worth a note: where a pass takes
+# the whole interval, the rows of a frame are then displaced by 0.5 / sqrt(12) = 0.14 px RMS.
 _FAST_PX = 0.5
 
 
-def camera_of(
+def camera_for(
     frame: RecordedFrame, model: Calibration | None, config: MicroscopeConfig
 ) -> ScanCamera:
     """The calibrated camera of a frame, or the nominal one of the display width."""
@@ -54,28 +54,13 @@ def start_time_s(frame: RecordedFrame, first_stamp_ns: int, config: MicroscopeCo
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
 
 
-def with_frame_time(config: MicroscopeConfig, frame_time_s: float | None) -> MicroscopeConfig:
-    """The configuration with the time of one pass that ``--frame-time`` gives, if any.
-
-    Raises
-    ------
-    InvalidValueError
-        If it is no finite positive number.
-    """
-    if frame_time_s is None:
-        return config
-    if config.scan is None:
-        return replace(config, scan=ScanTiming(frame_time_s))
-    return replace(config, scan=replace(config.scan, frame_time_s=frame_time_s))
-
-
-class Follower:
-    """Tracks the drift of a recording and looks at it once more with hindsight.
+class DriftFollower:
+    """Tracks the drift of a recording, and smooths it once all frames are known.
 
     Parameters
     ----------
     hindsight
-        Whether to keep what that takes; without it there is only the drift of now.
+        Whether to keep what smoothing takes; without it only the drift of now is known.
     """
 
     def __init__(self, *, hindsight: bool = True) -> None:
@@ -99,7 +84,7 @@ class Follower:
         Parameters
         ----------
         live
-            What was known at each frame when it came, without hindsight.
+            Whether to return what was known at each frame when it came, without hindsight.
         """
         if live or self.history is None:
             return DriftPath(tuple(self.updates))
@@ -108,35 +93,37 @@ class Follower:
         return self._smoothed
 
 
-def timing_seen(
-    config: MicroscopeConfig, follower: Follower, model: Calibration | None
+def estimate_timing(
+    config: MicroscopeConfig, follower: DriftFollower, model: Calibration | None
 ) -> tuple[MicroscopeConfig, str]:
-    """What drift tells of a raster whose timing is not configured.
+    """Estimate the time of a pass from the drift where it is not configured.
 
     Parameters
     ----------
     config
         The configuration.
     follower
-        Has tracked the recording with it.
+        It has tracked the recording with that configuration.
     model
         Calibration, or None where distortion was left in.
 
     Returns
     -------
     tuple
-        The configuration, with ``scan`` where that could be seen; a note for the user, empty where
-        there is nothing to tell.
+        The configuration, with ``scan`` where that could be estimated, and a note for the user,
+        which may be empty.
     """
     if config.scan is not None or len(follower.updates) < 2:
         return config, ""
     path = follower.path(live=False)
     shear_of_shift = SHEAR_OF_SHIFT_DISTORTED if model is None else SHEAR_OF_SHIFT_RECTIFIED
-    found = estimate_frame_time(path, shear_of_shift=shear_of_shift)
-    if found.observable:
-        seen = _with_sigma(found.frame_time_s, found.sigma_s)
-        note = f"the configuration has no scan; the frames are sheared as if one pass took {seen} s"
-        return replace(config, scan=ScanTiming(found.frame_time_s)), note
+    estimate = estimate_frame_time(path, shear_of_shift=shear_of_shift)
+    if estimate.observable:
+        time_s = _with_sigma(estimate.frame_time_s, estimate.sigma_s)
+        note = (
+            f"the configuration has no scan; the frames are sheared as if one pass took {time_s} s"
+        )
+        return replace(config, scan=ScanTiming(estimate.frame_time_s)), note
     step_px = _largest_step_px(follower.updates)
     if not step_px > _FAST_PX:
         return config, ""
@@ -147,13 +134,13 @@ def timing_seen(
 
 
 def _with_sigma(value: float, sigma: float) -> str:
-    """With as many decimals as one digit of the uncertainty has."""
+    """A value with as many decimals as the first digit of its uncertainty."""
     digits = int(np.clip(-np.floor(np.log10(sigma)), 0, 9)) if sigma > 0.0 else 3
     return f"{value:.{digits}f} +- {sigma:.{digits}f}"
 
 
 def _largest_step_px(updates: Sequence[DriftUpdate]) -> float:
-    """Drift from one frame to the next in px of it, but for a tenth of the frames."""
+    """Drift from one frame to the next, px, which a tenth of the frames exceed."""
     pairs = [
         (before, now)
         for before, now in itertools.pairwise(updates)

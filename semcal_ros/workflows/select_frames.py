@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -16,114 +15,102 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.workflows.follow_drift import Follower, camera_of, start_time_s, timing_seen
+from semcal_ros.workflows.follow_drift import (
+    DriftFollower,
+    camera_for,
+    estimate_timing,
+    start_time_s,
+)
 
-__all__ = ["Job", "Survey", "surveyed"]
+__all__ = ["FrameSelection", "select_frames"]
 
+# Magnifications that an error lists: as many as fit two lines of a terminal.
 _LISTED = 12
-# Grey levels of more than 8 bits are shown with these quantiles as black and white.
+# Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a
+# thousand may be clipped at either end.
 _BLACK_WHITE = (0.001, 0.999)
+# Every so many pixels of a row and rows of a picture are enough for its quantiles.
+_SPARSE = 4
 
 
-@dataclass(frozen=True)
-class Job:
-    """How the frames of a recording are to be read.
-
-    Attributes
-    ----------
-    model
-        Calibration, or None for nominal cameras.
-    microscope
-        Configuration.
-    at
-        The magnification to choose; None where there must be one only.
-    follower
-        Tracks the chosen frames; None for no drift.
-    """
-
-    model: Calibration | None
-    microscope: MicroscopeConfig
-    at: float | None = None
-    follower: Follower | None = None
-
-    def camera(self, frame: RecordedFrame) -> ScanCamera:
-        """Of a frame."""
-        return camera_of(frame, self.model, self.microscope)
-
-
-@dataclass
-class Survey:
-    """The frames of one magnification, size and encoding in a recording, and their drift.
+@dataclass(frozen=True, eq=False)
+class FrameSelection:
+    """The n frames of one magnification, size and encoding in a recording, and their drift.
 
     Attributes
     ----------
-    job
-        How the frames were read.
+    config
+        The configuration that was used; its ``scan`` may have been estimated from the drift.
     camera
-        Of the first frame.
+        Camera of the first frame.
     dtype, size
         Type of the grey levels; (width, height) in px.
-    first_stamp_ns
-        Stamp of the first frame.
-    chosen
-        Numbers of the frames as the recording gives them.
+    indices
+        n numbers of the frames as the recording gives them.
+    stamps_ns
+        n header stamps, ns since 1970.
     times_s
-        Starts of their acquisitions, s after the first stamp.
+        n starts of their acquisitions, s after the first stamp.
     levels
-        Grey levels of each that are shown as black and white, where asked for.
+        n pairs of grey levels that are shown as black and white; empty where not asked for.
     other_kind
-        How many frames of the magnification have another size or encoding.
+        Number of frames of the magnification that have another size or encoding.
+    path
+        Drift of the frames; None where it is not wanted.
+    states
+        How many frames had which kind of drift when they came, the commonest first.
     timing_note
-        What there is to tell of a scan timing that is not configured.
+        What there is to tell of a scan timing that is not configured; may be empty.
     """
 
-    job: Job
+    config: MicroscopeConfig
     camera: ScanCamera
     dtype: np.dtype[Any]
     size: tuple[int, int]
-    first_stamp_ns: int
-    chosen: list[int] = field(default_factory=list)
-    times_s: list[float] = field(default_factory=list)
-    levels: list[tuple[float, float]] = field(default_factory=list)
-    other_kind: int = 0
+    indices: tuple[int, ...]
+    stamps_ns: tuple[int, ...]
+    times_s: tuple[float, ...]
+    levels: tuple[tuple[float, float], ...]
+    other_kind: int
+    path: DriftPath | None
+    states: dict[str, int]
     timing_note: str = ""
 
-    @property
-    def follower(self) -> Follower | None:
-        """The drift of the frames; None where it is not wanted."""
-        return self.job.follower
 
-    @cached_property
-    def path(self) -> DriftPath | None:
-        """Drift of the chosen frames; None where it is not wanted. For a finished survey."""
-        return None if self.follower is None else self.follower.path(live=False)
-
-
-def surveyed(
+def select_frames(
     opened: Recording,
-    job: Job,
+    config: MicroscopeConfig,
+    calibration: Calibration | None,
     *,
-    on_first: Callable[[RecordedFrame], None],
-    levels: bool,
-    on_frame: Callable[[], object] = lambda: None,
-) -> Survey:
+    at: float | None = None,
+    drift: bool = True,
+    levels: bool = False,
+    on_first: Callable[[RecordedFrame], object] = lambda _frame: None,
+    on_frame: Callable[[int], object] = lambda _frames: None,
+) -> FrameSelection:
     """Read a recording for the first time: choose its frames and track their drift.
 
-    Where the configuration has no scan timing and the drift tells it, they are tracked once more
-    with it; the survey's job has it, then.
+    Where the configuration has no scan timing and the drift shows it, the frames are tracked once
+    more with it.
 
     Parameters
     ----------
     opened
         The recording.
-    job
-        What to choose.
-    on_first
-        Called with the first chosen frame, to refuse it before any work is done.
+    config
+        How it is to be read.
+    calibration
+        None for nominal cameras.
+    at
+        The magnification to choose; None where the recording must have only one.
+    drift
+        Whether to track the frames.
     levels
         Whether black and white are wanted.
+    on_first
+        Called with the first chosen frame, to refuse it before any work is done.
     on_frame
-        Called after each frame that was read, to show progress.
+        Called with 1 after each frame that was read, to show progress.
 
     Raises
     ------
@@ -131,46 +118,113 @@ def surveyed(
         There are several magnifications and none is chosen, the chosen one is not there, or time
         runs backwards.
     """
-    survey = _surveyed_once(opened, job, on_first, levels, on_frame)
-    if job.follower is None:
-        return survey
-    microscope, note = timing_seen(job.microscope, job.follower, job.model)
-    if microscope is not job.microscope:
-        again = replace(job, microscope=microscope, follower=Follower())
-        survey = _surveyed_once(opened, again, on_first, levels, on_frame)
-    survey.timing_note = note
-    return survey
+    reading = _Reading(opened, config, calibration, at, drift, levels)
+    taken, selection = reading.run(on_first, on_frame)
+    if taken.follower is None:
+        return selection
+    timed, note = estimate_timing(config, taken.follower, calibration)
+    if timed is not config:
+        _, selection = replace(reading, config=timed).run(on_first, on_frame)
+    return replace(selection, timing_note=note)
 
 
-def _surveyed_once(
-    opened: Recording,
-    job: Job,
-    on_first: Callable[[RecordedFrame], None],
-    levels: bool,
-    on_frame: Callable[[], object],
-) -> Survey:
-    counts: Counter[str] = Counter()
-    wanted = None if job.at is None else _label(job.at)
-    survey: Survey | None = None
-    kind: tuple[object, ...] = ()
-    for index, frame in enumerate(opened.frames()):
-        on_frame()
-        label = _label(frame.magnification)
-        counts[label] += 1
-        if label != (wanted or label) or (wanted is None and len(counts) > 1):
-            continue  # to be refused, or of no interest: only the magnification matters
-        if survey is None:
-            on_first(frame)
-            survey, kind = _begun(frame, job), _kind(frame)
-        if _kind(frame) != kind:
-            survey.other_kind += 1
-            continue
-        _add(survey, index, frame, job)
-        if levels:
-            survey.levels.append(_black_white(frame))
-    if survey is None or (wanted is None and len(counts) > 1):
-        _refuse_magnifications(opened, job, counts)
-    return survey
+@dataclass
+class _Taken:
+    """Frames that were taken so far."""
+
+    follower: DriftFollower | None
+    frames: list[tuple[int, int, float]] = field(default_factory=list)  # index, stamp, start
+    levels: list[tuple[float, float]] = field(default_factory=list)
+    other_kind: int = 0
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """One reading of a recording."""
+
+    opened: Recording
+    config: MicroscopeConfig
+    calibration: Calibration | None
+    at: float | None
+    drift: bool
+    levels: bool
+
+    def run(
+        self,
+        on_first: Callable[[RecordedFrame], object],
+        on_frame: Callable[[int], object],
+    ) -> tuple[_Taken, FrameSelection]:
+        counts: Counter[str] = Counter()
+        wanted = None if self.at is None else _label(self.at)
+        taken = _Taken(DriftFollower() if self.drift else None)
+        first: RecordedFrame | None = None
+        for index, frame in enumerate(self.opened.frames()):
+            on_frame(1)
+            label = _label(frame.magnification)
+            counts[label] += 1
+            if label != (wanted or label) or (wanted is None and len(counts) > 1):
+                continue  # to be refused, or of no interest: only the magnification matters
+            if first is None:
+                on_first(frame)
+                first = frame
+            if _kind(frame) != _kind(first):
+                taken.other_kind += 1
+                continue
+            self._take(taken, index, frame, first)
+        if first is None or (wanted is None and len(counts) > 1):
+            self._refuse_magnifications(counts)
+        return taken, self._select(taken, first)
+
+    def _take(self, taken: _Taken, index: int, frame: RecordedFrame, first: RecordedFrame) -> None:
+        time_s = start_time_s(frame, first.stamp_ns, self.config)
+        if taken.frames and time_s < taken.frames[-1][2]:
+            raise BagError(
+                f"image {index + 1} was taken {taken.frames[-1][2] - time_s:g} s before the one "
+                "before it",
+                expected="images in the order of time",
+                do="record each pass of a replay to a recording of its own",
+            )
+        taken.frames.append((index, frame.stamp_ns, time_s))
+        if taken.follower is not None:
+            camera = camera_for(frame, self.calibration, self.config)
+            taken.follower.update(frame, time_s, camera, self.config.scan)
+        if self.levels:
+            taken.levels.append(_black_white(frame))
+
+    def _select(self, taken: _Taken, first: RecordedFrame) -> FrameSelection:
+        height, width = first.image.shape[:2]
+        follower = taken.follower
+        indices, stamps_ns, times_s = zip(*taken.frames, strict=True)
+        kinds = Counter(update.kind for update in follower.updates) if follower else Counter()
+        return FrameSelection(
+            config=self.config,
+            camera=camera_for(first, self.calibration, self.config),
+            dtype=first.image.dtype,
+            size=(width, height),
+            indices=indices,
+            stamps_ns=stamps_ns,
+            times_s=times_s,
+            levels=tuple(taken.levels),
+            other_kind=taken.other_kind,
+            path=None if follower is None else follower.path(live=False),
+            states=dict(kinds.most_common()),
+        )
+
+    def _refuse_magnifications(self, counts: Counter[str]) -> NoReturn:
+        labels = sorted(counts, key=float)
+        listed = ", ".join(labels[:_LISTED])
+        listed += f", ... {labels[-1]}" if len(labels) > _LISTED else ""
+        if self.at is None:
+            raise BagError(
+                f"{self.opened.path} has frames at {len(labels)} magnifications: {listed}",
+                expected="frames of one magnification",
+                do="choose one with --at G",
+            )
+        raise BagError(
+            f"--at {self.at:g}: {self.opened.path} has no such frames",
+            expected=f"one of {listed}",
+            do="choose one of these magnifications",
+        )
 
 
 def _label(magnification: float) -> str:
@@ -183,44 +237,8 @@ def _kind(frame: RecordedFrame) -> tuple[object, ...]:
 
 
 def _black_white(frame: RecordedFrame) -> tuple[float, float]:
-    values = frame.image[::4, ::4]
+    values = frame.image[::_SPARSE, ::_SPARSE]
     if values.dtype.kind == "f":
         values = values[np.isfinite(values)]
     low, high = np.quantile(values, _BLACK_WHITE) if values.size else (0.0, 1.0)
     return float(low), float(high)
-
-
-def _begun(frame: RecordedFrame, job: Job) -> Survey:
-    height, width = frame.image.shape[:2]
-    size = width, height
-    return Survey(job, job.camera(frame), frame.image.dtype, size, frame.stamp_ns)
-
-
-def _add(survey: Survey, index: int, frame: RecordedFrame, job: Job) -> None:
-    time_s = start_time_s(frame, survey.first_stamp_ns, job.microscope)
-    if survey.times_s and time_s < survey.times_s[-1]:
-        raise BagError(
-            f"image {index + 1} was taken {survey.times_s[-1] - time_s:g} s before the one before",
-            expected="images in the order of time",
-            do="record each pass of a replay to a recording of its own",
-        )
-    survey.chosen.append(index)
-    survey.times_s.append(time_s)
-    if job.follower is not None:
-        job.follower.update(frame, time_s, job.camera(frame), job.microscope.scan)
-
-
-def _refuse_magnifications(opened: Recording, job: Job, counts: Counter[str]) -> NoReturn:
-    labels = sorted(counts, key=float)
-    listed = ", ".join(labels[:_LISTED]) + (f", ... {labels[-1]}" if len(labels) > _LISTED else "")
-    if job.at is None:
-        raise BagError(
-            f"{opened.path} has frames at {len(labels)} magnifications: {listed}",
-            expected="frames of one magnification",
-            do="choose one with --at G",
-        )
-    raise BagError(
-        f"--at {job.at:g}: {opened.path} has no such frames",
-        expected=f"one of {listed}",
-        do="choose one of these magnifications",
-    )

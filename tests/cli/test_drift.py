@@ -17,7 +17,6 @@ import tifffile
 
 from semcal_ros.bridge.headers import fill_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import fill_image, image_from_message
-from semcal_ros.cli.drift_common import rate_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.files.bags.messages import blank_message
@@ -25,6 +24,7 @@ from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
+from semcal_ros.workflows.track_drift import describe_rate
 from tests.helpers.drift_scenes import make_drift_update
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
@@ -133,7 +133,7 @@ def test_the_rate_is_given_with_two_digits_of_its_uncertainty():
             ),
         ]
     )
-    assert rate_text(path) == "final drift rate: x 1.23 +- 0.12, y -20.00 +- 4.56 nm/s"
+    assert describe_rate(path) == "final drift rate: x 1.23 +- 0.12, y -20.00 +- 4.56 nm/s"
 
 
 def test_plots_are_refused_before_any_work(gold, tmp_path, capsys):
@@ -144,7 +144,7 @@ def test_plots_are_refused_before_any_work(gold, tmp_path, capsys):
     assert "folder" in refused(
         capsys, "drift", gold, "-o", table, "--plot", tmp_path / "no" / "d.png"
     )
-    assert "two files" in refused(capsys, "drift", gold, "-o", "d.png", "--plot", "d.png")
+    assert "another output" in refused(capsys, "drift", gold, "-o", "d.png", "--plot", "d.png")
     assert not list(tmp_path.iterdir())
 
 

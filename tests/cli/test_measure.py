@@ -134,13 +134,13 @@ def test_what_is_refused(bag, calibration, tmp_path, capsys):
     command = ("measure", "cantilever", bag, "--calibration", calibration, *LENGTH)
     output = ("-o", tmp_path / "d.csv")
     assert "for 3 poses" in refused(capsys, *command, *output, "--poses", 3)
-    assert "no pair of pixel" in refused(capsys, *command, *output, "--base", "12")
+    assert "not a pair of pixel" in refused(capsys, *command, *output, "--base", "12")
     assert "give neither" in refused(capsys, *command, *output, "--base", "12,30")
     assert "ends in .csv" in refused(capsys, *command, "-o", tmp_path / "d.txt")
     twice = refused(
         capsys, *command, *output, "--plot", tmp_path / "p.png", "--strip", tmp_path / "p.png"
     )
-    assert "two outputs" in twice
+    assert "another output" in twice
     assert "--length" in refused(capsys, *command[:-2], *output)
     assert not (tmp_path / "d.csv").exists()
 

@@ -13,7 +13,8 @@ from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
-from semcal_ros.files.bags.reader import BagWriter, blank_message
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame
 
 __all__ = ["CorrectedBagWriter"]

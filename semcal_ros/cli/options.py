@@ -1,0 +1,145 @@
+"""Options that several commands share, each described once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "FIGURE_SUFFIXES",
+    "calibration_option",
+    "check_outputs",
+    "config_option",
+    "frame_time_option",
+    "interpolation_option",
+    "json_option",
+    "magnification_option",
+    "no_drift_option",
+    "output_option",
+    "overwrite_option",
+    "recording_argument",
+    "recording_options",
+    "require_folder",
+]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+Output = tuple[str, Path | None, Sequence[str]]
+
+PATH = click.Path(path_type=Path)
+#: What matplotlib writes by the suffix of a name.
+FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
+
+recording_argument = click.argument("recording", type=PATH)
+config_option = click.option(
+    "--config",
+    default="generic",
+    show_default=True,
+    metavar="NAME_OR_FILE",
+    help="msg_configs of the microscope: topics, units, display width, scan timing.",
+)
+frame_time_option = click.option(
+    "--frame-time",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="S",
+    help="Seconds of one pass over a frame, instead of what the configuration says.",
+)
+magnification_option = click.option(
+    "--magnification",
+    type=float,
+    help="Of all images: only for a folder of ordinary ones (png, jpg), which do not tell it.",
+)
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."
+)
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Machine-readable output, SI units."
+)
+
+
+def recording_options(command: Command) -> Command:
+    """How a recording is to be read: ``--config`` and ``--frame-time``."""
+    return config_option(frame_time_option(command))
+
+
+def output_option(text: str) -> Callable[[Command], Command]:
+    """The required ``-o`` with its help text."""
+    return click.option("-o", "--output", required=True, type=PATH, help=text)
+
+
+def calibration_option(
+    text: str | None = None, *, required: bool = False
+) -> Callable[[Command], Command]:
+    """``--calibration`` with its help text."""
+    return click.option("--calibration", type=PATH, required=required, help=text)
+
+
+def no_drift_option(text: str) -> Callable[[Command], Command]:
+    """``--no-drift`` with its help text."""
+    return click.option("--no-drift", is_flag=True, help=text)
+
+
+def interpolation_option(default: str) -> Callable[[Command], Command]:
+    """``--interpolation`` with its default."""
+    return click.option(
+        "--interpolation",
+        type=click.Choice(["linear", "cubic", "lanczos4"]),
+        default=default,
+        show_default=True,
+    )
+
+
+def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -> None:
+    """Refuse outputs that cannot be written, before any work is done for them.
+
+    Parameters
+    ----------
+    outputs
+        (option, path or None, suffixes that its kind of file may have; none for any).
+    recording
+        What must not be written into.
+
+    Raises
+    ------
+    InvalidValueError
+        A suffix is another one, a folder does not exist, two outputs are one file, or an output
+        belongs to the recording.
+    """
+    taken: set[Path] = set()
+    source = None if recording is None else recording.resolve()
+    for option, path, suffixes in outputs:
+        if path is None:
+            continue
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise InvalidValueError(
+                f"{option} {path}",
+                expected="a name that ends in " + ", ".join(suffixes),
+                do="choose one of these suffixes",
+            )
+        require_folder(path)
+        target = path.resolve()
+        if target in taken:
+            raise InvalidValueError(
+                f"{option} {path} is another output, too", expected="a file of its own"
+            )
+        if source is not None and (target == source or source in target.parents):
+            raise InvalidValueError(
+                f"{option} {path} belongs to the recording", expected="a file outside of it"
+            )
+        taken.add(target)
+
+
+def require_folder(path: Path) -> None:
+    """Refuse an output whose folder does not exist, before any work is done for it."""
+    if not path.absolute().parent.is_dir():
+        raise InvalidValueError(
+            f"{path}: there is no folder {path.absolute().parent}",
+            expected="an existing folder",
+            do="make it first",
+        )
+    if path.is_dir():
+        raise InvalidValueError(f"{path} is a folder", expected="the name of a file")

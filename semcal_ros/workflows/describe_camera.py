@@ -1,0 +1,52 @@
+"""The camera at a magnification as plain numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.bridge.parameters import value_of
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.scan_camera import ScanCamera
+
+__all__ = ["describe_camera", "parameter_sigma"]
+
+
+def parameter_sigma(camera: ScanCamera) -> dict[str, float]:
+    """1-sigma of each parameter of a calibrated camera."""
+    assert camera.covariance is not None
+    # Of an exactly known parameter, rounding may leave a variance of less than nothing.
+    sigma = np.sqrt(np.maximum(np.diag(camera.covariance), 0.0))
+    return dict(zip(PARAMETER_NAMES, sigma.tolist(), strict=True))
+
+
+def describe_camera(calibration: Calibration, magnification: float) -> dict[str, Any]:
+    """K, P, distortion, pixel size and their uncertainty in SI units, as ``semcal at --json`` prints them.
+
+    Raises
+    ------
+    InvalidValueError
+        As :meth:`~semcal_ros.calibration.Calibration.at`.
+    """
+    camera = calibration.at(magnification)
+    perspective = camera.rho > 0.0
+    return {
+        "magnification": camera.magnification,
+        "in_range": camera.in_range,
+        "magnification_range": list(calibration.magnification_range),
+        "image_width_px": camera.width,
+        "image_height_px": camera.height,
+        "pixel_size_m": list(camera.pixel_size_m),
+        "pixel_size_sigma_m": list(camera.pixel_size_sigma_m),
+        "mean_pixel_size_m": 1.0 / camera.m,
+        "K": camera.K.tolist() if perspective else None,
+        "P": camera.P.tolist() if perspective else None,
+        "P_affine": camera.P_affine.tolist(),
+        "distortion": {"xi_r": camera.xi_r, "xi_t": camera.xi_t, "norm_px": camera.norm_px},
+        "distortion_centre_px": [camera.ex, camera.ey],
+        "parameters": dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True)),
+        "parameter_sigma": parameter_sigma(camera),
+        "projection_sigma_px": value_of("sigma", camera),
+    }

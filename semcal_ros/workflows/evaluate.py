@@ -1,0 +1,130 @@
+"""How well a calibration predicts the views of another recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
+from semcal_ros.workflows.inputs import (
+    CalibrationSource,
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_calibration,
+    resolve_config,
+)
+
+__all__ = ["Evaluation", "MagnificationError", "evaluate"]
+
+# Spread of the heights on a stage, where the calibration does not say it.
+_HEIGHT_SIGMA_M = 1e-4
+
+
+@dataclass(frozen=True)
+class MagnificationError:
+    """Reprojection error at one magnification.
+
+    Attributes
+    ----------
+    magnification, views
+        The magnification, and the number of its views.
+    rms_px
+        Root of the mean square distance of the corners, px.
+    in_range
+        Whether the calibration covers the magnification.
+    """
+
+    magnification: float
+    views: int
+    rms_px: float
+    in_range: bool
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Reprojection error of a calibration on a recording.
+
+    Attributes
+    ----------
+    rms_px
+        Of all corners, px.
+    views, rejected
+        Numbers of images that were used, and that were not.
+    by_magnification
+        The same for each magnification, ascending.
+    """
+
+    rms_px: float
+    views: int
+    rejected: int
+    by_magnification: tuple[MagnificationError, ...]
+
+
+def evaluate(
+    calibration: CalibrationSource,
+    source: Source,
+    *,
+    config: ConfigSource | None = None,
+    magnification: float | None = None,
+    on_progress: OnProgress = ignore_progress,
+) -> Evaluation:
+    """Fit a pose to each view of the grid, not the camera, and compare.
+
+    Parameters
+    ----------
+    calibration
+        A calibration or its file.
+    source
+        A recording that it was not made from, or (image, magnification) tuples in memory.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    magnification
+        Of a folder of ordinary images, which do not tell it.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
+
+    Raises
+    ------
+    SemcalError
+        If calibration, configuration or recording cannot be read, or no view can be used.
+    """
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model)
+    with open_source(source, microscope, magnification=magnification) as opened:
+        advance = count_frames(on_progress, "finding corners", opened.frame_count)
+        found, rejected = find_views(named_frames(opened), on_progress=advance)
+    collected = collect_views(
+        found,
+        rejected,
+        display_width_m=microscope.display_width_m,
+        squares_m=microscope.squares_m,
+    )
+    fit = fit_poses(
+        collected.views,
+        lambda g: model.at(g).resized(*collected.image_size),
+        height_sigma_m=_height_sigma_m(model.statistics),
+    )
+    low, high = model.magnification_range
+    errors = (
+        MagnificationError(g, int((fit.magnifications == g).sum()), rms, low <= g <= high)
+        for g, rms in rms_by_magnification(fit).items()
+    )
+    return Evaluation(fit.rms_px(), len(collected.views), len(collected.rejected), tuple(errors))
+
+
+def _height_sigma_m(statistics: Mapping[str, Any]) -> float:
+    """The prior of the heights in the calibration; its statistics are notes, and may have been
+    edited.
+    """
+    priors = statistics.get("priors")
+    height = priors.get("height_sigma_m") if isinstance(priors, Mapping) else None
+    if isinstance(height, (int, float)) and 0.0 < height < math.inf:
+        return float(height)
+    return _HEIGHT_SIGMA_M

@@ -1,0 +1,198 @@
+"""What every workflow takes: a recording, a calibration, a configuration; and how it tells its progress."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig, load_config
+from semcal_ros.core.camera.calibration_model import checked_magnification
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
+
+__all__ = [
+    "CalibrationSource",
+    "ConfigSource",
+    "OnProgress",
+    "Source",
+    "count_frames",
+    "ignore_progress",
+    "open_source",
+    "resolve_calibration",
+    "resolve_config",
+]
+
+#: A bag, a folder of images, or images in memory: (image, magnification) or (image, magnification,
+#: time in s of its stamp), in the order of time.
+Source = str | os.PathLike[str] | Iterable[tuple[Any, ...]]
+#: A calibration, or its file.
+CalibrationSource = Calibration | str | os.PathLike[str]
+#: A configuration, or the name or file of one.
+ConfigSource = MicroscopeConfig | str | os.PathLike[str]
+#: Called with what is being done, how many frames are done, and of how many; None where that is
+#: not known.
+OnProgress = Callable[[str, int, int | None], object]
+
+# Type and, where there is one, number of channels -> ROS name of the pixel format.
+_ENCODINGS: dict[tuple[Any, ...], str] = {
+    ("uint8",): "mono8",
+    ("uint16",): "mono16",
+    ("float32",): "32FC1",
+    ("uint8", 3): "bgr8",
+}
+_GREY_TYPES = ("uint8", "uint16", "float32")
+
+
+def ignore_progress(_stage: str, _done: int, _total: int | None) -> None:
+    """Tell nobody."""
+
+
+def count_frames(on_progress: OnProgress, stage: str, total: int | None) -> Callable[[int], None]:
+    """Begin a stage; call what is returned with the number of frames done since the last call."""
+    done = 0
+
+    def advance(frames: int = 1) -> None:
+        nonlocal done
+        done += frames
+        on_progress(stage, done, total)
+
+    advance(0)
+    return advance
+
+
+@overload
+def resolve_calibration(calibration: CalibrationSource) -> Calibration: ...
+
+
+@overload
+def resolve_calibration(calibration: CalibrationSource | None) -> Calibration | None: ...
+
+
+def resolve_calibration(calibration: CalibrationSource | None) -> Calibration | None:
+    """The calibration itself, read if it is a file.
+
+    Raises
+    ------
+    CalibrationFileError
+        If it cannot be read.
+    """
+    if calibration is None or isinstance(calibration, Calibration):
+        return calibration
+    return Calibration.load(calibration)
+
+
+def resolve_config(
+    config: ConfigSource | None,
+    calibration: Calibration | None = None,
+    frame_time_s: float | None = None,
+) -> MicroscopeConfig:
+    """The configuration that a workflow works with.
+
+    Parameters
+    ----------
+    config
+        ``generic`` where there is none.
+    calibration
+        Its display width is what magnifications refer to.
+    frame_time_s
+        Seconds of one pass over a frame, in place of what the configuration says.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read.
+    InvalidValueError
+        If the time is not finite and positive.
+    """
+    if isinstance(config, MicroscopeConfig):
+        chosen = config
+    else:
+        chosen = load_config("generic" if config is None else os.fspath(config))
+    if calibration is not None:
+        chosen = replace(chosen, display_width_m=calibration.display_width_m)
+    if frame_time_s is None:
+        return chosen
+    if chosen.scan is None:
+        return replace(chosen, scan=ScanTiming(frame_time_s))
+    return replace(chosen, scan=replace(chosen.scan, frame_time_s=frame_time_s))
+
+
+def open_source(
+    source: Source, config: MicroscopeConfig, *, magnification: float | None = None
+) -> Recording:
+    """Open a recording, or images in memory as if they were one.
+
+    Parameters
+    ----------
+    source
+        See :data:`Source`. Images are (h, w) grey levels without a databar, of which uint8, uint16
+        and float32 are kept as they are, or (h, w, 3) of uint8 in the channel order of OpenCV.
+        Where they have no times, they are taken to be a second apart.
+    config
+        How to read it.
+    magnification
+        As for :func:`~semcal_ros.files.recordings.open_recording`.
+
+    Raises
+    ------
+    BagError, TiffError
+        If the recording cannot be read.
+    InvalidValueError
+        If an image in memory cannot be used.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        return open_recording(Path(source), config, magnification=magnification)
+    if magnification is not None:
+        raise InvalidValueError(
+            "a magnification stated for images in memory", expected="one beside each image"
+        )
+    return _ImagesInMemory(source, config)
+
+
+class _ImagesInMemory(Recording):
+    """Images and their magnifications, which can be read as often as those of a file."""
+
+    def __init__(self, source: Iterable[tuple[Any, ...]], config: MicroscopeConfig) -> None:
+        super().__init__(Path("memory"), config)
+        self._recorded = [
+            _recorded_frame(index, entry, config) for index, entry in enumerate(source)
+        ]
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._recorded)
+
+    def _frames(self) -> Iterator[RecordedFrame]:
+        yield from self._recorded
+
+
+def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig) -> RecordedFrame:
+    if not isinstance(entry, tuple | list) or len(entry) not in (2, 3):
+        raise InvalidValueError(
+            f"image {index} without a magnification",
+            expected="(image, magnification) or (image, magnification, time_s)",
+        )
+    image: NDArray[Any] = np.asarray(entry[0])
+    if image.ndim == 2 and image.dtype.kind in "iuf" and image.dtype.name not in _GREY_TYPES:
+        image = image.astype(np.float32)
+    encoding = _ENCODINGS.get((image.dtype.name, *image.shape[2:]))
+    if encoding is None or image.ndim not in (2, 3) or image.size == 0:
+        raise InvalidValueError(
+            f"image {index} of shape {image.shape} and type {image.dtype}",
+            expected="(h, w) grey levels, or (h, w, 3) of uint8",
+        )
+    # Files that tell no time are read as if they were a second apart, too.
+    time_s = float(entry[2]) if len(entry) == 3 else index + 1.0
+    if not np.isfinite(time_s):
+        raise InvalidValueError(f"image {index} at {time_s} s", expected="a finite time")
+    stamp_ns = round(1e9 * time_s)
+    magnification = checked_magnification(entry[1])
+    return RecordedFrame(image, stamp_ns, stamp_ns, magnification, config.frame_id, encoding)

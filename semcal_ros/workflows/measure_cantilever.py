@@ -1,0 +1,321 @@
+"""Bending of a cantilever in one or more recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.applications.cantilever import (
+    Repeatability,
+    Series,
+    SeriesSettings,
+    frames_of_poses,
+    measure_series,
+    repeatability,
+)
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.files.recordings import RecordedFrame
+from semcal_ros.files.tables import write_csv
+from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
+from semcal_ros.workflows.inputs import (
+    CalibrationSource,
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_calibration,
+    resolve_config,
+)
+
+__all__ = ["CANTILEVER_COLUMNS", "CantileverMeasurement", "CantileverSeries", "measure_cantilever"]
+
+#: Columns of the table of ``semcal measure cantilever``.
+CANTILEVER_COLUMNS = (
+    "recording",
+    "stamp_ns",
+    "magnification",
+    "pose",
+    "deflection_m",
+    "sigma_m",
+    "deflection_by_length_m",
+    "sigma_by_length_m",
+    "tip_x_px",
+    "tip_y_px",
+    "rms_m",
+    "edges_used",
+    "drift_status",
+)
+
+Pixel = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class CantileverSeries:
+    """The n frames of one magnification in one recording, and what was measured in them.
+
+    Attributes
+    ----------
+    recording
+        Name of the recording.
+    images
+        n grey pictures, (h, w).
+    stamps_ns
+        n header stamps, ns since 1970.
+    poses
+        n numbers of the poses, from 1.
+    camera
+        Camera of the magnification.
+    measured
+        Deflections, reference, shape and drift.
+    """
+
+    recording: str
+    images: tuple[NDArray[Any], ...]
+    stamps_ns: tuple[int, ...]
+    poses: tuple[int, ...]
+    camera: ScanCamera
+    measured: Series
+
+
+@dataclass(frozen=True, eq=False)
+class CantileverMeasurement:
+    """Deflections of a cantilever at one or more magnifications.
+
+    Attributes
+    ----------
+    series
+        One for each magnification and recording, in the order in which these first appear.
+    repeatability
+        Means by magnification and pose, and how well the magnifications agree.
+    poses
+        Number of poses; None where each frame is one.
+    notes
+        What a person should know.
+    """
+
+    series: tuple[CantileverSeries, ...]
+    repeatability: Repeatability
+    poses: int | None
+    notes: tuple[str, ...]
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the table of ``semcal measure cantilever``, one row for each frame.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is untouched.
+        """
+        rows = (
+            (
+                one.recording,
+                one.stamps_ns[k],
+                float(one.measured.magnification),
+                one.poses[k],
+                float(frame.deflection_m),
+                float(frame.sigma_m),
+                float(frame.by_length_m),
+                float(frame.by_length_sigma_m),
+                *(float(v) for v in frame.tip_px),
+                float(frame.bending.rms_m),
+                int(np.count_nonzero(frame.bending.used)),
+                one.measured.drift[k].status_text,
+            )
+            for one in self.series
+            for k, frame in enumerate(one.measured.frames)
+        )
+        write_csv(Path(path), CANTILEVER_COLUMNS, rows)
+
+
+def measure_cantilever(
+    source: Source | Sequence[str | os.PathLike[str]],
+    *,
+    calibration: CalibrationSource,
+    length_m: float,
+    poses: int | None = None,
+    shape: str = "free",
+    bases: Sequence[Pixel] = (),
+    tips: Sequence[Pixel] = (),
+    config: ConfigSource | None = None,
+    frame_time_s: float | None = None,
+    magnification: float | None = None,
+    on_progress: OnProgress = ignore_progress,
+) -> CantileverMeasurement:
+    """Measure the deflection of the free end of a cantilever in each frame.
+
+    The first pose is the reference: there, nothing touches the cantilever. All magnifications may
+    be in one recording or each in its own; their k-th poses are compared. Deflections are positive
+    to the right as seen from the base.
+
+    Parameters
+    ----------
+    source
+        A recording, several of them, or (image, magnification[, time_s]) tuples in memory.
+    calibration
+        A calibration or its file.
+    length_m
+        Length of the cantilever, from its maker.
+    poses
+        Each magnification has so many poses with equally many frames, one after the other; None
+        makes each frame a pose.
+    shape
+        ``"free"``, ``"beam"`` or another of
+        :data:`~semcal_ros.applications.cantilever.bending.SHAPES`.
+    bases, tips
+        (x, y) pixels of both ends of the cantilever in the first frame where they are not found by
+        themselves: none, one for all magnifications, or one for each.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    frame_time_s
+        Seconds of one pass over a frame, in place of what the configuration says.
+    magnification
+        Of a folder of ordinary images, which do not tell it.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames; each counts
+        twice.
+
+    Raises
+    ------
+    SemcalError
+        If calibration, configuration or recording cannot be read, no cantilever is found, or the
+        frames cannot be cut into poses.
+
+    Examples
+    --------
+    ::
+
+        from semcal_ros import measure_cantilever
+        bending = measure_cantilever("bending", calibration="jsm820.yaml", length_m=35e-6)
+        bending.repeatability.deflection_m          # (magnifications, poses)
+        bending.save_csv("bending.csv")
+    """
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model, frame_time_s)
+    runs, notes = _read(_sources(source), model, microscope, magnification)
+    ends = _ends(bases, tips, len(runs))
+    total = 2 * sum(len(run.images) for run in runs)
+    advance = count_frames(on_progress, "bending", total)
+    series = []
+    for run, (base, tip) in zip(runs, ends, strict=True):
+        settings = SeriesSettings(length_m, shape, base, tip)
+        groups = frames_of_poses(len(run.images), poses)
+        measured = measure_series(
+            run.images,
+            run.times_s,
+            run.camera,
+            microscope.scan,
+            settings,
+            reference=groups[0],
+            on_frame=lambda: advance(1),
+        )
+        numbers = tuple(number for number, group in enumerate(groups, 1) for _ in group)
+        series.append(
+            CantileverSeries(
+                run.recording,
+                tuple(run.images),
+                tuple(run.stamps_ns),
+                numbers,
+                run.camera,
+                measured,
+            )
+        )
+    if microscope.scan is None:
+        notes.append(f"the configuration has no scan: frames are instants; {GIVE_FRAME_TIME}")
+    if not all(one.camera.in_range for one in series):
+        notes.append("frames outside of the calibrated range")
+    agreement = repeatability([one.measured for one in series], poses)
+    return CantileverMeasurement(tuple(series), agreement, poses, tuple(notes))
+
+
+@dataclass
+class _Run:
+    """Frames of one magnification in one recording, as they are read."""
+
+    recording: str
+    camera: ScanCamera
+    images: list[NDArray[Any]] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+
+    def add(self, frame: RecordedFrame, microscope: MicroscopeConfig) -> None:
+        first_ns = self.stamps_ns[0] if self.stamps_ns else frame.stamp_ns
+        self.images.append(np.array(to_gray(frame.image, frame.encoding)))
+        self.stamps_ns.append(frame.stamp_ns)
+        self.times_s.append(start_time_s(frame, first_ns, microscope))
+
+
+def _sources(source: Source | Sequence[str | os.PathLike[str]]) -> list[Source]:
+    """Recordings, each on its own; images in memory are one."""
+    if isinstance(source, (str, os.PathLike)):
+        return [source]
+    entries = list(source)
+    paths = [entry for entry in entries if isinstance(entry, (str, os.PathLike))]
+    if paths and len(paths) == len(entries):
+        return list(paths)
+    if paths:
+        raise InvalidValueError(
+            "recordings and images in memory in one call", expected="one or the other"
+        )
+    return [[entry for entry in entries if isinstance(entry, tuple)]]
+
+
+def _read(
+    sources: Iterable[Source],
+    model: Calibration,
+    microscope: MicroscopeConfig,
+    magnification: float | None,
+) -> tuple[list[_Run], list[str]]:
+    """Frames by recording and magnification, in the order in which these first appear."""
+    found: dict[tuple[Path, str], _Run] = {}
+    notes: list[str] = []
+    for source in sources:
+        with open_source(source, microscope, magnification=magnification) as opened:
+            path = opened.path
+            for frame in opened.frames():
+                label = f"{frame.magnification:.6g}"
+                if (path, label) not in found:
+                    camera = camera_for(frame, model, microscope)
+                    found[path, label] = _Run(path.name, camera)
+                run = found[path, label]
+                if run.images and run.images[0].shape != frame.image.shape[:2]:
+                    raise BagError(
+                        f"{path}: frames of {run.images[0].shape} and {frame.image.shape} px "
+                        f"at {label}x",
+                        expected="one size for each magnification",
+                    )
+                run.add(frame, microscope)
+                if len(run.times_s) > 1 and run.times_s[-1] < run.times_s[-2]:
+                    raise BagError(
+                        f"{path}: time runs backwards at {label}x",
+                        expected="frames in the order of time",
+                    )
+            notes += [f"{path}: {note}" for note in opened.notes]
+    return list(found.values()), notes
+
+
+def _ends(
+    bases: Sequence[Pixel], tips: Sequence[Pixel], count: int
+) -> list[tuple[Pixel | None, Pixel | None]]:
+    """Base and tip for each of ``count`` magnifications."""
+    if len(bases) != len(tips) or len(bases) not in (0, 1, count):
+        raise InvalidValueError(
+            f"{len(bases)} bases and {len(tips)} tips for {count} magnifications",
+            expected="neither, one of each, or one of each for every magnification",
+            do=f"give neither --base nor --tip, both once, or both {count} times",
+        )
+    if not bases:
+        return [(None, None)] * count
+    pairs = list(zip(bases, tips, strict=True))
+    return [*pairs] * (count if len(pairs) == 1 else 1)

@@ -1,0 +1,243 @@
+"""Shape of a ball that turns in a recording: points, mesh, diameter."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.applications.reconstruction import (
+    Ball,
+    SequenceTracker,
+    Structure,
+    TrackerSettings,
+    TrackKeyframe,
+    measure_ball,
+)
+from semcal_ros.applications.reconstruction import reconstruct as reconstruct_structure
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.files.meshes import UNITS_PER_M, save_cloud, save_mesh
+from semcal_ros.files.recordings import Recording
+from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
+from semcal_ros.workflows.inputs import (
+    CalibrationSource,
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_calibration,
+    resolve_config,
+)
+
+__all__ = ["Reconstruction", "reconstruct"]
+
+# A surface that is seen from outside bulges towards the gun nearly everywhere; its mirror image
+# nearly nowhere. Below this share the choice between the two is worth a warning.
+_CLEAR_CONVEXITY = 0.8
+# Sigmas by which the perspective may prefer the mirror image by chance.
+_MIRROR_DOUBT = 4.0
+# Relative 1-sigma of the depth from which on more views are worth their time.
+_LARGE_RELIEF_SIGMA = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """A structure, and the ball in it.
+
+    Attributes
+    ----------
+    structure
+        Points, poses, and their uncertainty.
+    ball
+        Sphere, mesh and diameter.
+    frame_count
+        Number of frames that were read.
+    notes
+        What a person should know, doubts about the result among it.
+    """
+
+    structure: Structure
+    ball: Ball
+    frame_count: int
+    notes: tuple[str, ...]
+
+    def save_mesh(self, path: str | os.PathLike[str], *, unit: str = "nm") -> None:
+        """Write the mesh of the ball, ``.ply`` or ``.stl``.
+
+        Raises
+        ------
+        InvalidValueError
+            If the suffix or the unit is another one.
+        OSError
+            If the file cannot be written; an existing one is untouched.
+        """
+        save_mesh(Path(path), self.ball.mesh, unit=unit)
+
+    def save_cloud(self, path: str | os.PathLike[str], *, unit: str = "nm") -> None:
+        """Write all points with normals and 1-sigma to a ``.ply``; raises as :meth:`save_mesh`."""
+        normals = self.structure.normals
+        columns = {
+            "nx": normals[:, 0],
+            "ny": normals[:, 1],
+            "nz": normals[:, 2],
+            "sigma": self.structure.normal_sigma_m * UNITS_PER_M.get(unit, 1.0),
+            "on_ball": self.ball.sphere.inliers.astype(float),
+        }
+        save_cloud(Path(path), self.structure.points_m, columns, unit=unit)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain numbers, as ``semcal reconstruct --json`` prints them."""
+        structure, ball = self.structure, self.ball
+        counts = np.bincount(structure.observations.point, minlength=len(structure.points_m))
+        return {
+            "frames": self.frame_count,
+            "views": len(structure.cameras),
+            "points": len(structure.points_m),
+            "points_on_ball": int(np.count_nonzero(ball.sphere.inliers)),
+            "passes": structure.passes,
+            "median_views_per_point": float(np.median(counts)),
+            "residual_rms_px": structure.adjustment.rms_px,
+            "vertices": len(ball.mesh.vertices_m),
+            "faces": len(ball.mesh.faces),
+            "watertight": ball.mesh.watertight,
+            "coverage": ball.coverage,
+            "diameter_m": ball.diameter_m,
+            "diameter_sigma_m": ball.sigma_m,
+            "diameter_interval_m": list(ball.interval_m),
+            "sigma_parts_m": {
+                "noise": ball.noise_sigma_m,
+                "shape": ball.shape_sigma_m,
+                "scale": ball.scale_sigma_m,
+            },
+            "sphere_rms_m": ball.sphere.rms_m,
+            "relief_sigma": structure.relief_sigma,
+            "relief_condition": structure.relief_condition,
+            "convexity": structure.convexity,
+            "mirror_sigma": structure.mirror_sigma,
+        }
+
+
+def reconstruct(
+    source: Source,
+    *,
+    calibration: CalibrationSource,
+    config: ConfigSource | None = None,
+    frame_time_s: float | None = None,
+    spacing_px: float = 5.0,
+    keyframes: int = 150,
+    height_sigma_m: float = 40e-6,
+    on_progress: OnProgress = ignore_progress,
+) -> Reconstruction:
+    """Reconstruct a ball that turns: follow features, adjust points and poses, fit and mesh.
+
+    Parameters
+    ----------
+    source
+        A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
+    calibration
+        A calibration or its file.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    frame_time_s
+        Seconds of one pass over a frame, in place of what the configuration says.
+    spacing_px
+        Least distance of features, px.
+    keyframes
+        The most that are used; they are spread evenly.
+    height_sigma_m
+        1-sigma of the height above or below the plane of the calibration, m.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
+
+    Raises
+    ------
+    SemcalError
+        If calibration, configuration or recording cannot be read, the views cannot be linked, or
+        they show no depth.
+
+    Examples
+    --------
+    ::
+
+        from semcal_ros import reconstruct
+        found = reconstruct("recordings/ball", calibration="jsm820.yaml")
+        found.ball.diameter_m, found.ball.interval_m
+        found.save_mesh("ball.ply")
+    """
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model, frame_time_s)
+    tracker = SequenceTracker(TrackerSettings(spacing_px=spacing_px))
+    with open_source(source, microscope) as opened:
+        outside = _track(opened, model, tracker, on_progress)
+        notes = list(opened.notes)
+    structure = reconstruct_structure(
+        _spread_evenly(tracker.finish(), keyframes),
+        microscope.scan,
+        on_step=lambda step: on_progress(step, 0, None),
+    )
+    on_progress("measuring the ball", 0, None)
+    ball = measure_ball(structure, height_sigma_m=height_sigma_m)
+    if outside:
+        notes.append(f"{outside} frames are outside of the calibrated range")
+    notes += _doubts(structure, microscope.scan is not None)
+    return Reconstruction(structure, ball, tracker.frames, tuple(notes))
+
+
+def _track(
+    opened: Recording, model: Calibration, tracker: SequenceTracker, on_progress: OnProgress
+) -> int:
+    """Track all frames; returns how many were outside of the calibrated range."""
+    first_ns, outside = None, 0
+    advance = count_frames(on_progress, "tracking", opened.frame_count)
+    for frame in opened.frames():
+        first_ns = frame.stamp_ns if first_ns is None else first_ns
+        camera = camera_for(frame, model, opened.config)
+        outside += not camera.in_range
+        grey = to_gray(frame.image, frame.encoding)
+        tracker.add(grey, camera, start_time_s(frame, first_ns, opened.config))
+        advance(1)
+    return outside
+
+
+def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyframe]:
+    """At most ``most`` keyframes, the first and the last among them."""
+    if len(keyframes) <= most:
+        return keyframes
+    chosen = np.unique(np.linspace(0, len(keyframes) - 1, most).round().astype(int))
+    return [keyframes[int(k)] for k in chosen]
+
+
+def _doubts(structure: Structure, timed: bool) -> list[str]:
+    notes = []
+    if structure.unplaced:
+        notes.append(f"{structure.unplaced} keyframes could not be linked to the others")
+    if structure.convexity < _CLEAR_CONVEXITY:
+        notes.append(
+            f"only {structure.convexity:.0%} of the surface bulges towards the gun: it could be "
+            "its mirror image"
+        )
+    if structure.mirror_sigma < -_MIRROR_DOUBT:
+        notes.append("the perspective of the camera prefers the mirror image")
+    if structure.relief_sigma > _LARGE_RELIEF_SIGMA:
+        notes.append(
+            f"depth is uncertain by {structure.relief_sigma:.1%} (1-sigma): turn the specimen more"
+        )
+    if not timed:
+        notes.append(
+            "the scan timing is not configured: movement within frames is left in; "
+            f"{GIVE_FRAME_TIME}"
+        )
+    if not structure.adjustment.converged:
+        notes.append("the adjustment did not converge")
+    if not structure.settled:
+        notes.append(
+            f"measuring did not settle in {structure.passes} passes: points still moved by more "
+            "than half of their 1-sigma"
+        )
+    return notes

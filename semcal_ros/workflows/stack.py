@@ -1,0 +1,277 @@
+"""The drift-corrected average of a recording, and its stabilised video."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.arrays import Mask
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.estimates import DriftPath
+from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.core.rectification.stack import Stack, StackedImage
+from semcal_ros.files.grey_images import TIFF_SUFFIXES, write_grey_image
+from semcal_ros.files.recordings import RecordedFrame, Recording
+from semcal_ros.files.video import VideoWriter, open_video
+from semcal_ros.workflows.follow_drift import camera_for
+from semcal_ros.workflows.inputs import (
+    CalibrationSource,
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_calibration,
+    resolve_config,
+)
+from semcal_ros.workflows.select_frames import FrameSelection, select_frames
+
+__all__ = ["StackResult", "stack"]
+
+
+@dataclass(frozen=True, eq=False)
+class StackResult:
+    """Average of the frames of one magnification.
+
+    Attributes
+    ----------
+    image
+        Mean, standard error, and number of frames in each pixel.
+    camera
+        Camera of the first frame, whose coordinates the average has; nominal without a calibration.
+    dtype
+        Type of the grey levels of the recording.
+    stamps_ns
+        n header stamps of the frames of that magnification, size and encoding.
+    used
+        (n,) bool: whether the frame is in the average.
+    path
+        Drift of the n frames; None where it was left in.
+    states
+        How many frames had which kind of drift when they came, the commonest first.
+    other_kind
+        Number of frames of another size or encoding, which are left out.
+    config
+        The configuration that was used; its ``scan`` may have been estimated from the drift.
+    notes
+        What a person should know.
+    """
+
+    image: StackedImage
+    camera: ScanCamera
+    dtype: np.dtype[Any]
+    stamps_ns: tuple[int, ...]
+    used: Mask
+    path: DriftPath | None
+    states: Mapping[str, int]
+    other_kind: int
+    config: MicroscopeConfig
+    notes: tuple[str, ...]
+
+    @property
+    def lost(self) -> int:
+        """Number of frames left out because tracking had been lost before them."""
+        return 0 if self.path is None else int((self.path.accepted & ~self.used).sum())
+
+    @property
+    def typical_error(self) -> float | None:
+        """Median of the standard error over the pixels, grey levels; None where there is none."""
+        error = self.image.standard_error
+        known = np.isfinite(error)
+        return float(np.median(error[known])) if known.any() else None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the mean: ``.tif`` (32-bit, with the pixel size) or ``.png`` (as deep as the
+        recording).
+
+        Raises
+        ------
+        InvalidValueError
+            If the suffix is another one, or a PNG cannot hold the grey levels.
+        OSError
+            If the file cannot be written; an existing one is untouched.
+        """
+        write_grey_image(Path(path), self.image.mean, self.camera.pixel_size_m, self.dtype)
+
+    def save_sigma(self, path: str | os.PathLike[str]) -> None:
+        """Write the standard error of the mean to a ``.tif``; raises as :meth:`save`."""
+        write_grey_image(Path(path), self.image.standard_error, self.camera.pixel_size_m)
+
+
+def stack(
+    source: Source,
+    *,
+    calibration: CalibrationSource | None = None,
+    config: ConfigSource | None = None,
+    frame_time_s: float | None = None,
+    magnification: float | None = None,
+    at: float | None = None,
+    drift: bool = True,
+    interpolation: str = "cubic",
+    video: str | os.PathLike[str] | None = None,
+    fps: float = 10.0,
+    output: str | os.PathLike[str] | None = None,
+    sigma: str | os.PathLike[str] | None = None,
+    on_progress: OnProgress = ignore_progress,
+) -> StackResult:
+    """Average frames, each moved to where the specimen was in the first one.
+
+    Frames whose drift is not known are left out.
+
+    Parameters
+    ----------
+    source
+        A bag, a folder of images, or (image, magnification[, time_s]) tuples in memory.
+    calibration
+        A calibration or its file, to undo distortion too.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    frame_time_s
+        Seconds of one pass over a frame, in place of what the configuration says.
+    magnification
+        Of a folder of ordinary images, which do not tell it.
+    at
+        The magnification whose frames are taken; None where there is only one.
+    drift
+        False averages the frames where they are.
+    interpolation
+        ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
+    video, fps
+        File of a stabilised video (``.mp4`` or ``.avi``), and its frames per second.
+    output, sigma
+        Files of the average and of its standard error, as :meth:`StackResult.save` and
+        :meth:`StackResult.save_sigma` write them.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
+
+    Raises
+    ------
+    SemcalError
+        If calibration, configuration or recording cannot be read; there are several magnifications
+        and none is chosen; the drift of no frame is known; or an output cannot hold the result.
+    OSError
+        If an output cannot be written.
+
+    Examples
+    --------
+    ::
+
+        from semcal_ros import stack
+        average = stack("recordings/gold", calibration="jsm820.yaml")
+        average.image.mean, average.image.standard_error      # (h, w) each
+        average.save("gold.tif")
+    """
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model, frame_time_s)
+    film_path = None if video is None else Path(video)
+    with open_source(source, microscope, magnification=magnification) as opened:
+        selection = select_frames(
+            opened,
+            microscope,
+            model,
+            at=at,
+            drift=drift,
+            levels=film_path is not None,
+            on_first=lambda frame: _check_output(output, frame),
+            on_frame=count_frames(on_progress, "drift" if drift else "reading", opened.frame_count),
+        )
+        used = _usable(selection)
+        summed = Stack(selection.size, interpolation)
+        grey = _video_levels(selection)
+        with open_video(film_path, selection.size, len(selection.indices), fps, grey) as film:
+            _add_frames(opened, model, selection, used, summed, film, on_progress)
+        notes = opened.notes
+    if selection.timing_note:
+        notes = (*notes, selection.timing_note)
+    result = StackResult(
+        summed.result(),
+        selection.camera,
+        selection.dtype,
+        selection.stamps_ns,
+        used,
+        selection.path,
+        selection.states,
+        selection.other_kind,
+        selection.config,
+        notes,
+    )
+    if sigma is not None:
+        result.save_sigma(sigma)
+    if output is not None:
+        result.save(output)
+    return result
+
+
+def _check_output(output: str | os.PathLike[str] | None, frame: RecordedFrame) -> None:
+    """Refuse what :meth:`StackResult.save` could not write, before any work is done for it."""
+    if output is None or Path(output).suffix.lower() in TIFF_SUFFIXES:
+        return
+    if frame.image.dtype.kind != "u":
+        raise InvalidValueError(
+            f"{os.fspath(output)} for {frame.encoding} frames",
+            expected="a .tif, which holds grey levels of 32 bits",
+        )
+
+
+def _usable(selection: FrameSelection) -> Mask:
+    """Which of the chosen frames go into the average, (n,) bool."""
+    if selection.path is None:
+        return np.ones(len(selection.indices), dtype=bool)
+    usable = selection.path.trusted
+    if not usable.any():
+        raise BagError(
+            f"{len(usable)} frames and none with a known drift, the first: "
+            f"{selection.path[0].status_text}",
+            expected="a specimen with structure",
+            do="look at `semcal drift`, or average the frames where they are with --no-drift",
+        )
+    return usable
+
+
+def _add_frames(
+    opened: Recording,
+    model: Calibration | None,
+    selection: FrameSelection,
+    used: Mask,
+    summed: Stack,
+    film: VideoWriter | None,
+    on_progress: OnProgress,
+) -> None:
+    number_of = {index: number for number, index in enumerate(selection.indices)}
+    advance = count_frames(on_progress, "averaging", opened.frame_count)
+    for index, frame in enumerate(opened.frames()):
+        advance(1)
+        number = number_of.get(index)
+        if number is None or (film is None and not used[number]):
+            continue
+        drift = None if selection.path is None else selection.path[number].raster
+        grey = to_gray(frame.image, frame.encoding)
+        camera = camera_for(frame, model, selection.config)
+        picture, valid = summed.rectified(grey, camera, drift, selection.config.scan)
+        if used[number]:
+            summed.add(picture, valid)
+        if film is not None:
+            film.write(picture, _caption(selection.times_s, number, bool(used[number])))
+
+
+def _video_levels(selection: FrameSelection) -> tuple[float, float]:
+    """Grey levels that are shown as black and white."""
+    if selection.dtype == np.uint8 or not selection.levels:
+        return 0.0, 255.0
+    low, high = np.median(selection.levels, axis=0)
+    return float(low), float(high)
+
+
+def _caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
+    """Number and time of a frame."""
+    text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
+    return text if used else f"{text}  not tracked"

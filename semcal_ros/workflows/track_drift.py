@@ -1,0 +1,201 @@
+"""The drift of a recording as a table, a path, and a forecast."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.estimates import DriftEstimate, DriftPath, DriftPredictor
+from semcal_ros.files.recordings import Recording
+from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
+from semcal_ros.workflows.follow_drift import (
+    GIVE_FRAME_TIME,
+    DriftFollower,
+    camera_for,
+    estimate_timing,
+    start_time_s,
+)
+from semcal_ros.workflows.inputs import (
+    CalibrationSource,
+    ConfigSource,
+    OnProgress,
+    Source,
+    count_frames,
+    ignore_progress,
+    open_source,
+    resolve_calibration,
+    resolve_config,
+)
+
+__all__ = ["DriftTrack", "describe_forecast", "describe_rate", "track_drift"]
+
+
+@dataclass(frozen=True, eq=False)
+class DriftTrack:
+    """Drift of the specimen at the n frames of a recording.
+
+    Attributes
+    ----------
+    stamps_ns
+        n header stamps, ns since 1970.
+    path
+        Drift, rate and covariance at each frame. In raw pixels of a nominal size where no
+        calibration was given.
+    states
+        How many frames had which kind of drift when they came, the commonest first.
+    predictor
+        What a forecast beyond the last frame needs.
+    config
+        The configuration that was used; its ``scan`` may have been estimated from the drift.
+    notes
+        What a person should know.
+    """
+
+    stamps_ns: tuple[int, ...]
+    path: DriftPath
+    states: Mapping[str, int]
+    predictor: DriftPredictor
+    config: MicroscopeConfig
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def forecast(self, after_s: float) -> DriftEstimate:
+        """Drift ``after_s`` seconds after the last frame.
+
+        Raises
+        ------
+        InvalidValueError
+            If that is negative or not finite.
+        """
+        return self.predictor.at(float(self.path.time_s[-1]) + after_s)
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the table of ``semcal drift``.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is untouched.
+        """
+        drift = self.path
+        sigma_m = drift.sigma_m
+        rows = (
+            (stamp_ns, *drift.drift_m[k], *sigma_m[k], *drift.drift_px[k], drift[k].status_text)
+            for k, stamp_ns in enumerate(self.stamps_ns)
+        )
+        write_csv(Path(path), DRIFT_COLUMNS, rows)
+
+
+def track_drift(
+    source: Source,
+    *,
+    calibration: CalibrationSource | None = None,
+    config: ConfigSource | None = None,
+    frame_time_s: float | None = None,
+    live: bool = False,
+    on_progress: OnProgress = ignore_progress,
+) -> DriftTrack:
+    """Measure the drift of the specimen at the centre of each frame, relative to the first one.
+
+    What lay at X in the sem frame is seen at X + drift. Where the configuration has no scan timing
+    and the drift shows it, the recording is tracked once more with it.
+
+    Parameters
+    ----------
+    source
+        A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
+    calibration
+        A calibration or its file; without it, drift is in raw pixels of the nominal size.
+    config
+        A ``msg_configs`` name or file; the default is ``generic``.
+    frame_time_s
+        Seconds of one pass over a frame, in place of what the configuration says.
+    live
+        Whether to return what was known live, without hindsight of later frames.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
+
+    Raises
+    ------
+    SemcalError
+        If calibration, configuration or recording cannot be read, or time runs backwards in it.
+
+    Examples
+    --------
+    ::
+
+        from semcal_ros import track_drift
+        track = track_drift("recordings/gold", calibration="jsm820.yaml")
+        track.path.drift_m, track.path.sigma_m      # (n, 2), m
+        track.save_csv("drift.csv")
+    """
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model, frame_time_s)
+    with open_source(source, microscope) as opened:
+        stamps_ns, follower = _follow(opened, model, microscope, on_progress)
+        timed, note = estimate_timing(microscope, follower, model)
+        if timed is not microscope and live:
+            note += f"; {GIVE_FRAME_TIME}"  # live, nobody could have known
+        elif timed is not microscope:
+            microscope = timed
+            stamps_ns, follower = _follow(opened, model, microscope, on_progress)
+        notes = [*opened.notes, *([note] if note else [])]
+    return DriftTrack(
+        tuple(stamps_ns),
+        follower.path(live=live),
+        dict(Counter(update.kind for update in follower.updates).most_common()),
+        follower.tracker.predictor(),
+        microscope,
+        tuple(notes),
+    )
+
+
+def describe_rate(path: DriftPath) -> str:
+    """The drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
+    if len(path) < 2:
+        return ""
+    x, y = _format_lengths(path.velocity_m_s[-1], path.velocity_sigma_m_s[-1])
+    return f"final drift rate: x {x}, y {y} nm/s"
+
+
+def describe_forecast(forecast: DriftEstimate, after_s: float) -> str:
+    """A forecast for ``after_s`` seconds after the last frame, with its 1-sigma in nm."""
+    x, y = _format_lengths(forecast.drift_m, np.sqrt(np.diag(forecast.covariance)[:2]))
+    return f"drift {after_s:g} s after the last frame: x {x}, y {y} nm"
+
+
+def _format_lengths(values: Array, sigmas: Array) -> list[str]:
+    """Lengths in nm with their 1-sigma, to two digits of the smaller uncertainty."""
+    smaller = 1e9 * float(np.min(sigmas))
+    digits = int(np.clip(1 - np.floor(np.log10(smaller)), 0, 9)) if smaller > 0.0 else 3
+    pairs = zip(1e9 * values, 1e9 * sigmas, strict=True)
+    return [f"{v:.{digits}f} +- {s:.{digits}f}" for v, s in pairs]
+
+
+def _follow(
+    opened: Recording,
+    model: Calibration | None,
+    microscope: MicroscopeConfig,
+    on_progress: OnProgress,
+) -> tuple[list[int], DriftFollower]:
+    """Stamps of all frames, and their drift."""
+    follower = DriftFollower()
+    stamps_ns: list[int] = []
+    advance = count_frames(on_progress, "drift", opened.frame_count)
+    for frame in opened.frames():
+        stamps_ns.append(frame.stamp_ns)
+        camera = camera_for(frame, model, microscope)
+        time_s = start_time_s(frame, stamps_ns[0], microscope)
+        follower.update(frame, time_s, camera, microscope.scan)
+        advance(1)
+    return stamps_ns, follower
