@@ -8,7 +8,18 @@ from pathlib import Path
 
 from semcal_ros.core.errors import SemcalError
 
-__all__ = ["read_text_file"]
+__all__ = ["CONSTRUCTOR_ERRORS", "read_text_file"]
+
+CONSTRUCTOR_ERRORS = (
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+    AssertionError,
+)
+"""What libraries for YAML raise, beside their own errors, where a value does not fit its tag (``!!bool maybe``)."""
 
 
 def read_text_file(

@@ -52,7 +52,7 @@ def find_config_file(name_or_path: str | Path) -> Path:
     Raises
     ------
     ConfigError
-        There is none.
+        There is no such configuration.
     """
     text = str(name_or_path)
     path = _existing_file(Path(text))

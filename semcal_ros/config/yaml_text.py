@@ -11,22 +11,13 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLWarning
 from ruamel.yaml.events import AliasEvent
 
 from semcal_ros.core.errors import ConfigError
+from semcal_ros.text_files import CONSTRUCTOR_ERRORS
 
-__all__ = ["CONSTRUCTOR_ERRORS", "load_yaml"]
+__all__ = ["load_yaml"]
 
 _MAX_REASON = 80  # a longer one would not fit on a line beside the name of the file
 # A configuration is nested 3 deep. Without a limit 3000 brackets keep the parser busy for seconds.
 _MAX_DEPTH = 16
-CONSTRUCTOR_ERRORS = (
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-    AssertionError,
-)
-"""What surfaces, beside the errors of a YAML library, where a value does not fit its tag: ``!!bool maybe``."""
 
 
 class _PlainComposer(Composer):

@@ -65,7 +65,7 @@ def diagnose(
     around = collect_environment()
     found = [finding for check in ENVIRONMENT_CHECKS for finding in check(around)]
     session = None
-    # In a domain that there is none the middleware would end this process.
+    # With an invalid domain id the middleware would end this process.
     needed = [*check_rclpy(around), *check_domain(around)]
     if "rclpy" not in around.import_errors and not any(map(_is_problem, needed)):
         try:

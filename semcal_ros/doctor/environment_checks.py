@@ -112,7 +112,7 @@ def check_rclpy(seen: Environment) -> list[Finding]:
             problem("ROS 2", f"rclpy is not there{here * bool(seen.installations)}", do=_GET_ROS)
         ]
     if _wrong_middleware(seen):
-        return []  # check_rmw tells
+        return []  # check_rmw says so
     return [
         problem(
             "ROS 2",
@@ -136,7 +136,7 @@ def check_one_ros(seen: Environment) -> list[Finding]:
                     "ROS 2 wheels",
                     f"{name} {seen.packages.get(name, '')} with {wanted.name} {have or 'missing'}",
                     expected=f"{wanted.name}{wanted.specifier}, of the same distribution",
-                    do="make the environment anew: `make setup`",
+                    do="make the environment again: `make setup`",
                 )
             ]
     others = [
@@ -259,11 +259,11 @@ def _memory(seen: Environment) -> SharedMemory | None:
     try:
         return shared_memory(seen.environment)
     except ConfigError:
-        return None  # check_profile tells
+        return None  # check_profile says so
 
 
 def check_profile(seen: Environment) -> list[Finding]:
-    """Whether a profile is set and can be used. Whether it is needed depends on the images: `large images`."""
+    """Whether a profile is set and can be used; `large images` says whether it is needed."""
     if seen.rmw and not seen.rmw.startswith("rmw_fastrtps"):
         return []
     try:
@@ -308,7 +308,7 @@ def check_shared_memory(seen: Environment) -> list[Finding]:
         return []
     free = seen.shm_free_bytes
     if free is None:
-        return [note("/dev/shm", "there is none: processes talk through the network stack")]
+        return [note("/dev/shm", "it does not exist: processes talk through the network stack")]
     if free < memory.segment_bytes:
         return [
             problem(

@@ -108,7 +108,7 @@ def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
 
 
 def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
-    """Who publishes and who listens, with which type and quality; nothing of an output that nobody touches."""
+    """Publishers and subscribers of a topic, with type and quality of service; empty for an unused output."""
     publishers = graph.publishers.get(topic.name, ())
     subscriptions = graph.subscriptions.get(topic.name, ())
     if not publishers and not topic.is_input:
@@ -191,7 +191,7 @@ def _qualities(
                     topic.name,
                     f"{listener.node} asks for {' and '.join(refused)}, {sender.node} offers {sender.quality}:"
                     " nothing arrives there",
-                    expected="an offer that is no less than the demand",
+                    expected="a publisher that offers at least what is asked for",
                     do="change the quality of service of either; nodes of the suite give way by themselves",
                 )
         if not sender.reliable:

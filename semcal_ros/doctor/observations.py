@@ -57,7 +57,7 @@ class Environment:
     rmw
         The middleware in use; empty without rclpy.
     shm_free_bytes
-        Room in /dev/shm, or None where there is none.
+        Room in /dev/shm, or None on a system without it.
     receive_buffer_bytes
         Largest receive buffer that the kernel grants a socket, or None where it does not say.
     """
@@ -93,7 +93,7 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class Graph:
-    """Who runs and who talks to whom, without the observer.
+    """The nodes, topics and parameters of a ROS graph, without the observer's own.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ def _rate(arrivals: tuple[Arrival, ...]) -> str:
 
 
 def check_images(topic: Topic, session: Session) -> list[Finding]:
-    """Whether images arrive that can be used. Nothing without a publisher, which another check tells."""
+    """Whether usable images arrive; empty without a publisher, which another check reports."""
     if not session.graph.publishers.get(topic.name):
         return []
     arrivals = session.arrivals.get(topic.name, ())

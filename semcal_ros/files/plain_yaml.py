@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from semcal_ros.config.yaml_text import CONSTRUCTOR_ERRORS
 from semcal_ros.core.errors import CalibrationFileError
+from semcal_ros.text_files import CONSTRUCTOR_ERRORS
 
 __all__ = ["check_plain_yaml", "load_plain_yaml"]
 

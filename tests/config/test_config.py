@@ -228,6 +228,26 @@ def test_a_wrong_key_is_named(path: str, value: object) -> None:
     assert len(line) < 400
 
 
+@pytest.mark.parametrize(
+    "path",
+    ["name", "image", "magnification.unit", "magnification.image_width_px", "scan", "squares_m"],
+)
+def test_a_key_without_a_value_is_named(path: str) -> None:
+    with pytest.raises(ConfigError, match=rf"key {path} is None"):
+        parse_config(edited(path, None))
+
+
+def test_a_misspelt_key_is_named_before_the_one_that_is_missing() -> None:
+    with pytest.raises(ConfigError, match="unknown key nmae"):
+        parse_config(GOOD.replace("name:", "nmae:"))
+
+
+def test_the_unit_is_not_a_truth_value() -> None:
+    text = "{name: a, display_width_m: 1, magnification: {quantity: magnification, unit: true}}"
+    with pytest.raises(ConfigError, match="key magnification.unit is True"):
+        parse_config(text)
+
+
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_wrong_list_element_is_named(index: int) -> None:
     squares: list[object] = [25e-6, 1e-6]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.node_scenes import make_calibration
 from tests.helpers.project import ROOT, runtime_imports
 
 PACKAGE = ROOT / "semcal_ros"
@@ -235,3 +236,23 @@ def test_the_blocker_blocks() -> None:
     done = _run(BLOCKER.replace("import semcal_ros.core\n", "import rclpy\n", 1))
     assert done.returncode != 0
     assert "rclpy is blocked" in done.stderr
+
+
+def test_quick_commands_load_only_what_they_use(tmp_path: Path) -> None:
+    make_calibration().save(tmp_path / "cal.yaml")
+    slow = ("pydantic", "rosbags", "ruamel", "matplotlib", "tifffile", "rclpy", "trimesh")
+    code = (
+        "import sys; from semcal_ros.cli import main; "
+        "status = main(sys.argv[1:]); "
+        f"loaded = [name for name in {slow} if name in sys.modules]; "
+        "sys.exit(str(loaded) if status or loaded else 0)"
+    )
+    for arguments in (["--help"], ["at", str(tmp_path / "cal.yaml"), "1000"]):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
