@@ -36,7 +36,11 @@ from semcal_ros.synthetic import (
     preset,
     truth_of,
 )
-from semcal_ros.synthetic.cantilever import CANTILEVER_PUSHES, CantileverPlan, cantilever_plan
+from semcal_ros.synthetic.specimens.cantilever import (
+    CANTILEVER_PUSHES,
+    CantileverPlan,
+    cantilever_plan,
+)
 
 GRID = (100, 250, 600, 1200, 2500, 4000, 5500, 7000, 8500, 10000)
 QUICK_GRID = (1500, 4000, 7000, 10000)

@@ -33,8 +33,8 @@ from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import INK, OURS, SECOND, create_figure, style_axes
-from semcal_ros.synthetic.ball import BallPlan, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
+from semcal_ros.synthetic.specimens.ball import BallPlan, ball_plan
 
 GRID_MAGNIFICATIONS = (100, 500, 1000, 2000, 3000, 4500, 6000, 7500, 9000, 10000)
 CONFIG = """\

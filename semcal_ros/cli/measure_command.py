@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from semcal_ros.applications.cantilever import SHAPES, frames_of_poses
+from semcal_ros.applications.cantilever import SHAPES, group_frames
 from semcal_ros.cli.options import (
     FIGURE_SUFFIXES,
     PATH,
@@ -177,7 +177,7 @@ def _draw(
     if plot is not None:
         write_poses_figure(done.repeatability, plot)
     if strip is not None:
-        firsts = [group[0] for group in frames_of_poses(len(images[0]), done.poses)]
+        firsts = [group[0] for group in group_frames(len(images[0]), done.poses)]
         write_strip_figure(images, series, firsts, strip)
     if video is not None:
         write_bending_video(images, series, done.poses, fps, video)

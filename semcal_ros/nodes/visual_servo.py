@@ -16,8 +16,8 @@ from semcal_ros.applications.servoing import (
     PlaneCamera,
     Servo,
     ServoStep,
+    choose_projection,
     find_target,
-    projection_of_frame,
 )
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
@@ -172,7 +172,7 @@ class VisualServo(SemNode):
             return self._servo.stopped("waiting for a second frame")
         self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
         try:
-            projection = projection_of_frame(frame.k, frame.projections)
+            projection = choose_projection(frame.k, frame.projections)
             camera = PlaneCamera.from_projection(projection, self.settings["height_m"])
         except NODE_ERRORS as error:
             self.warn_seldom(str(error))

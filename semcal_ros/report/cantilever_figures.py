@@ -18,7 +18,7 @@ from semcal_ros.applications.cantilever import (
     Deflection,
     Repeatability,
     Series,
-    frames_of_poses,
+    group_frames,
 )
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
@@ -87,7 +87,7 @@ def write_bending_video(
     series
         What was measured in them.
     poses
-        As for :func:`~semcal_ros.applications.cantilever.repeatability.frames_of_poses`.
+        As for :func:`~semcal_ros.applications.cantilever.repeatability.group_frames`.
     fps
         Frames per second.
     file
@@ -110,7 +110,7 @@ def write_bending_video(
     with open_video(file, (width, height), count, fps, (low, high)) as film:
         assert film is not None
         for pictures, one in zip(images, series, strict=True):
-            groups = enumerate(frames_of_poses(len(pictures), poses), 1)
+            groups = enumerate(group_frames(len(pictures), poses), 1)
             pose_of = {k: number for number, group in groups for k in group}
             for k, frame in enumerate(one.frames):
                 nm, sigma = 1e9 * frame.deflection_m, 1e9 * frame.sigma_m

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
-from semcal_ros.synthetic.gold import GoldOnCarbon
 from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
 from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
 from semcal_ros.synthetic.microscope import Residual, VirtualMicroscope
@@ -26,7 +25,14 @@ from semcal_ros.synthetic.plans import (
 from semcal_ros.synthetic.pose import Pose, random_poses
 from semcal_ros.synthetic.presets import PRESETS, preset
 from semcal_ros.synthetic.render import render_frame, render_reflectivity
-from semcal_ros.synthetic.specimens import SQUARES_M, ChessGrid, FlatSpecimen, Specimen, square_for
+from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
+from semcal_ros.synthetic.specimens.grid import (
+    SQUARES_M,
+    ChessGrid,
+    FlatSpecimen,
+    Specimen,
+    square_for,
+)
 from semcal_ros.synthetic.truth import TRUTH_SCHEMA, parameters_of, truth_of
 
 __all__ = [

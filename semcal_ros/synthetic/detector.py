@@ -130,13 +130,15 @@ class Detector:
         np.rint(signal, out=signal)
         np.clip(signal, 0, top, out=signal)
         if self.databar_rows > 0:
-            signal = np.concatenate([signal, _databar(self.databar_rows, signal.shape[1], top)])
+            signal = np.concatenate(
+                [signal, _draw_databar(self.databar_rows, signal.shape[1], top)]
+            )
         if self.bits == 8:
             return signal.astype(np.uint8)
         return signal.astype(np.uint16)
 
 
-def _databar(rows: int, width: int, top: int) -> Image:
+def _draw_databar(rows: int, width: int, top: int) -> Image:
     """Black bar with a scale line and tick marks, whose corners are none of the specimen's."""
     bar = np.zeros((rows, width), dtype=np.float32)
     middle = rows // 2

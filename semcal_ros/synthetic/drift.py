@@ -67,12 +67,12 @@ class Drift:
             wave = np.sin(2.0 * math.pi * self.vibration_hz * t)
             drift += wave[:, None] * np.array(self.vibration_m)
         if self.wander_m > 0.0:
-            drift += self.wander_m * _wander(t, self.seed, *self.wander_period_s)
+            drift += self.wander_m * _evaluate_wander(t, self.seed, *self.wander_period_s)
         return drift
 
 
 @lru_cache(maxsize=16)
-def _spectrum(seed: int, longest_s: float, shortest_s: float) -> tuple[Array, Array, Array]:
+def _draw_spectrum(seed: int, longest_s: float, shortest_s: float) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng([seed, 77])
     omega = 2.0 * math.pi / np.geomspace(longest_s, shortest_s, _TERMS)
     omega *= rng.uniform(0.9, 1.1, _TERMS)
@@ -81,8 +81,8 @@ def _spectrum(seed: int, longest_s: float, shortest_s: float) -> tuple[Array, Ar
     return omega, amplitude, rng.uniform(0.0, 2.0 * math.pi, (2, _TERMS))
 
 
-def _wander(t: Array, seed: int, longest_s: float, shortest_s: float) -> Array:
-    omega, amplitude, phase = _spectrum(seed, longest_s, shortest_s)
+def _evaluate_wander(t: Array, seed: int, longest_s: float, shortest_s: float) -> Array:
+    omega, amplitude, phase = _draw_spectrum(seed, longest_s, shortest_s)
     components = [
         (np.sin(t[:, None] * omega + phase[axis]) - np.sin(phase[axis])) @ amplitude
         for axis in (0, 1)

@@ -42,7 +42,7 @@ def grid_view(
         assert rng is not None
         xy = xy + rng.normal(scale=noise_px, size=xy.shape)
     sigma = np.full(len(xy), noise_px if noise_px > 0.0 else 0.01)
-    return GridView(camera.magnification, board[seen], xy, sigma, name)
+    return GridView(camera.magnification, board[seen].astype(np.float64), xy, sigma, name)
 
 
 def grid_views(

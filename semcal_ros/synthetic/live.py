@@ -16,7 +16,7 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.plans import specimen_for
 from semcal_ros.synthetic.pose import Pose, rotation_about_beam
 from semcal_ros.synthetic.render import render_frame
-from semcal_ros.synthetic.specimens import Specimen
+from semcal_ros.synthetic.specimens.grid import Specimen
 
 __all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
 

@@ -142,7 +142,7 @@ class VirtualMicroscope:
 
     def nominal_pixel_size_m(self, magnification: float) -> float:
         """Pixel size that the microscope itself would display, from the display width alone."""
-        return self.display_width_m / (_checked(magnification) * self.width)
+        return self.display_width_m / (_check_magnification(magnification) * self.width)
 
     def camera_at(self, magnification: float) -> ScanCamera:
         """True camera at a magnification, without the residual.
@@ -152,7 +152,7 @@ class VirtualMicroscope:
         InvalidValueError
             If the magnification is not a positive finite number.
         """
-        g = _checked(magnification)
+        g = _check_magnification(magnification)
         nominal = g * self.native_width / self.display_width_m
         camera = ScanCamera(
             magnification=g,
@@ -216,7 +216,7 @@ class VirtualMicroscope:
         )
 
 
-def _checked(magnification: float) -> float:
+def _check_magnification(magnification: float) -> float:
     g = float(magnification)
     if not (math.isfinite(g) and g > 0.0):
         raise InvalidValueError(f"magnification {magnification}", expected="a positive number")

@@ -13,12 +13,12 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, DriftFunction
-from semcal_ros.synthetic.gold import GoldOnCarbon
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose, random_poses
 from semcal_ros.synthetic.render import render_frame
-from semcal_ros.synthetic.specimens import ChessGrid, FlatSpecimen, Specimen, square_for
-from semcal_ros.synthetic.target import TargetSpecimen
+from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
+from semcal_ros.synthetic.specimens.grid import ChessGrid, FlatSpecimen, Specimen, square_for
+from semcal_ros.synthetic.specimens.target import TargetSpecimen
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",

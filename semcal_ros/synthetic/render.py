@@ -13,8 +13,8 @@ from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
-from semcal_ros.synthetic.raylattice import PlaneLattice, ray_lattice
-from semcal_ros.synthetic.specimens import Specimen
+from semcal_ros.synthetic.specimens.grid import Specimen
+from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_lattice
 
 __all__ = ["render_frame", "render_reflectivity"]
 
@@ -97,7 +97,7 @@ def render_reflectivity(
 ) -> Image:
     """Reflectivity (height + 2 pad, width + 2 pad) averaged over each pixel and over the passes."""
     samples = specimen.supersampling if supersampling is None else supersampling
-    lattice = ray_lattice(microscope, float(magnification), samples, pad).meet(pose)
+    lattice = trace_ray_lattice(microscope, float(magnification), samples, pad).meet(pose)
     groups = _pass_groups(microscope, magnification, start_time_s, drift)
     left_s, right_s = lattice.line_times_s(microscope.timing)
     total = np.zeros((microscope.height + 2 * pad, microscope.width + 2 * pad), dtype=np.float32)

@@ -72,14 +72,14 @@ def truth_of(plan: RecordingPlan) -> dict[str, Any]:
             "averages": microscope.timing.averages,
             "flyback_fraction": microscope.timing.flyback_fraction,
         },
-        "frames": [_frame(plan, index) for index in range(len(plan))],
+        "frames": [_describe_frame(plan, index) for index in range(len(plan))],
         "parameters": [parameters_of(microscope, g) for g in magnifications],
         "residual_sine_cycles": microscope.residual.sine_cycles,
         "residual_settling_length": microscope.residual.settling_length,
     }
 
 
-def _frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
+def _describe_frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
     frame = plan.frames[index]
     return {
         "start_time_s": frame.start_time_s,

@@ -15,9 +15,9 @@ from semcal_ros.applications.cantilever import (
     Repeatability,
     Series,
     SeriesSettings,
-    frames_of_poses,
+    group_frames,
     measure_series,
-    repeatability,
+    compare_series,
 )
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
@@ -210,7 +210,7 @@ def measure_cantilever(
     series = []
     for run, (base, tip) in zip(runs, ends, strict=True):
         settings = SeriesSettings(length_m, shape, base, tip)
-        groups = frames_of_poses(len(run.images), poses)
+        groups = group_frames(len(run.images), poses)
         measured = measure_series(
             run.images,
             run.times_s,
@@ -235,7 +235,7 @@ def measure_cantilever(
         notes.append(f"the configuration has no scan: frames are instants; {GIVE_FRAME_TIME}")
     if not all(one.camera.in_range for one in series):
         notes.append("frames outside of the calibrated range")
-    agreement = repeatability([one.measured for one in series], poses)
+    agreement = compare_series([one.measured for one in series], poses)
     return CantileverMeasurement(tuple(series), agreement, poses, tuple(notes))
 
 

@@ -13,8 +13,8 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.files.meshes import encode_mesh, save_cloud, save_mesh
 from semcal_ros.synthetic import Detector
-from semcal_ros.synthetic.ball import Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import drift_preset
+from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
 from tests.helpers.semcal_runs import run
 
 

@@ -23,7 +23,7 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.synthetic import NOISE_FREE, Pose, preset, render_frame
-from semcal_ros.synthetic.target import TargetSpecimen
+from semcal_ros.synthetic.specimens.target import TargetSpecimen
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import LATCHED, RELIABLE, NodeProcess, Peer, running
 

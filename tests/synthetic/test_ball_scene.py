@@ -11,8 +11,8 @@ import pytest
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import NOISE_FREE
-from semcal_ros.synthetic.ball import BallOnTip, Turning, ball_microscope, ball_plan
 from semcal_ros.synthetic.drift import Drift
+from semcal_ros.synthetic.specimens.ball import BallOnTip, Turning, ball_microscope, ball_plan
 
 # The same pixel size as 2048 px at 9000x, in a smaller picture.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")

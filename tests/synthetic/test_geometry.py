@@ -21,7 +21,7 @@ from semcal_ros.synthetic import (
     render_reflectivity,
     square_for,
 )
-from semcal_ros.synthetic.raylattice import ray_lattice
+from semcal_ros.synthetic.specimens.ray_lattice import trace_ray_lattice
 
 REACH_PX = 4.0
 STEPS = np.linspace(-REACH_PX, REACH_PX, 81)
@@ -179,7 +179,7 @@ def test_drift_inside_a_frame_shears_it_by_velocity_times_time(averages: int) ->
 
 def test_averaging_is_the_mean_of_the_single_passes() -> None:
     single = preset("jsm820").with_timing(ScanTiming(0.5, 1, 0.1))
-    averaged = preset("jsm820").with_timing(ScanTiming(0.5, 4, 0.1))
+    average_edges = preset("jsm820").with_timing(ScanTiming(0.5, 4, 0.1))
     board, pose, g = ChessGrid(2e-6), Pose.flat(rotation_rad=0.1), 5000.0
     for speed, tolerance in ((2e-6, 1e-5), (4e-9, 0.02)):
         # Fast: every pass is drawn. Slow (0.17 px in all): drawn once, and the smear is left out.
@@ -192,7 +192,7 @@ def test_averaging_is_the_mean_of_the_single_passes() -> None:
             render_reflectivity(single, board, pose, g, start_time_s=0.5 * k, drift=drift)
             for k in range(4)
         ]
-        image = render_reflectivity(averaged, board, pose, g, drift=drift)
+        image = render_reflectivity(average_edges, board, pose, g, drift=drift)
         assert np.abs(image - np.mean(passes, axis=0)).max() < tolerance
 
 
@@ -219,7 +219,7 @@ def test_a_vibration_in_step_with_the_passes_is_drawn() -> None:
 @pytest.mark.parametrize("g", [100.0, 20000.0])
 def test_interpolated_rays_agree_with_the_exact_inverse(name: str, g: float) -> None:
     microscope = preset(name)
-    lattice = ray_lattice(microscope, g, 2, 4)
+    lattice = trace_ray_lattice(microscope, g, 2, 4)
     camera = lattice.camera
     rng = np.random.default_rng(3)
     line, col = (

@@ -18,7 +18,7 @@ from semcal_ros.applications.servoing import (
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import NOISE_FREE, Detector, LiveScene, Pose, preset, render_frame
-from semcal_ros.synthetic.target import TargetSpecimen
+from semcal_ros.synthetic.specimens.target import TargetSpecimen
 
 TARGET = NestedTarget()
 SCOPE = replace(preset("jsm820"), timing=ScanTiming(0.1))

@@ -6,8 +6,8 @@ from semcal_ros.applications.cantilever.bending import SHAPES, Bending
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.repeatability import (
     Repeatability,
-    frames_of_poses,
-    repeatability,
+    compare_series,
+    group_frames,
 )
 from semcal_ros.applications.cantilever.series import (
     Deflection,
@@ -24,8 +24,8 @@ __all__ = [
     "Series",
     "SeriesSettings",
     "Strip",
+    "compare_series",
     "find_strip",
-    "frames_of_poses",
+    "group_frames",
     "measure_series",
-    "repeatability",
 ]

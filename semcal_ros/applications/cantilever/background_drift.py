@@ -93,19 +93,19 @@ def follow_background(
     if axis.base_seen:
         # The holder stands still.
         beam &= along > first - 0.2 * axis.half_width_m
-    rough_px = _rough_drift(pictures, beam)
-    moving = _changes(pictures, rough_px, beam)
-    still = np.asarray(np.clip(2.0 * _soft(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
+    rough_px = _estimate_rough_drift(pictures, beam)
+    moving = _find_changes(pictures, rough_px, beam)
+    still = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
     tracker = DriftTracker(history=history)
     for picture, time_s, shift in zip(pictures, times_s, rough_px, strict=True):
-        weight = _shifted(still, shift)
-        tracker.update(_covered(picture, weight), time_s, plane.camera, plane.timing)
+        weight = _shift_image(still, shift)
+        tracker.update(_cover(picture, weight), time_s, plane.camera, plane.timing)
         on_frame()
     return Background(history.smooth(), still)
 
 
-def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
+def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
     """(n, 2) px: the shift against the first picture that most tiles agree on, to some 0.1 px.
 
     A pusher moves or covers some of them only, and the median does not care.
@@ -123,7 +123,7 @@ def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
             for p in pictures
         ]
         reduced = beam[: size[1] * shrink : shrink, : size[0] * shrink : shrink]
-        return np.asarray(shrink * _rough_drift(small, reduced))
+        return np.asarray(shrink * _estimate_rough_drift(small, reduced))
     height, width = beam.shape
     side = max(_LEAST_TILE_PX, min(height, width) // _TILES)
     tiles = []
@@ -131,11 +131,11 @@ def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
         for left in np.linspace(0, width - side, max(width // side, 1)).astype(int):
             part = slice(top, top + side), slice(left, left + side)
             if beam[part].mean() < _MOSTLY:
-                tiles.append((part, prepare_reference(_covered(pictures[0], _soft(beam))[part])))
+                tiles.append((part, prepare_reference(_cover(pictures[0], _soften(beam))[part])))
     shift, shifts = np.zeros(2), [np.zeros(2)]
     spread = np.eye(2) * (0.2 * side) ** 2
     for picture in pictures[1:]:
-        covered = _covered(picture, _shifted(_soft(beam), shift))
+        covered = _cover(picture, _shift_image(_soften(beam), shift))
         found = [
             register(reference, covered[part], guess_px=shift, guess_covariance=spread)
             for part, reference in tiles
@@ -147,12 +147,12 @@ def _rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
     return np.array(shifts)
 
 
-def _soft(beam: Mask) -> Image:
+def _soften(beam: Mask) -> Image:
     """1 outside of the beam, with a soft rim."""
     return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), _SOFT_PX), np.float32)
 
 
-def _shifted(image: Image, shift: Array) -> Image:
+def _shift_image(image: Image, shift: Array) -> Image:
     """The image moved by a shift; its border goes on."""
     matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
     size = (image.shape[1], image.shape[0])
@@ -162,29 +162,29 @@ def _shifted(image: Image, shift: Array) -> Image:
     return np.asarray(moved, dtype=np.float32)
 
 
-def _changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
+def _find_changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
     """Where the picture changes by itself."""
     if len(pictures) < 2:
         return np.zeros_like(beam)
     cells = []
     for picture, shift in zip(pictures, shifts, strict=True):
-        cells.append(_cells(_shifted(picture, -shift)))
+        cells.append(_average_cells(_shift_image(picture, -shift)))
     stack = np.stack(cells)
     change = stack.max(axis=0) - stack.min(axis=0)
     middle = np.median(stack, axis=0)
     gy, gx = np.gradient(middle)
     slope = np.hypot(gx, gy) / _CELL_PX
     # Noise as most of the cells show it, growing with the root of the brightness.
-    ground = _cells(beam.astype(np.float32)) < 0.5
+    ground = _average_cells(beam.astype(np.float32)) < 0.5
     level = np.sqrt(np.maximum(middle / max(float(np.median(middle[ground])), 1.0), 0.25))
     usual = float(np.median((change / level)[ground]))
     limit = (1.0 + _CHANCE / np.sqrt(len(stack))) * usual * level + 2.0 * _ROUGH_PX * slope
     strong = change > limit
     wide = cv2.dilate(strong.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-    return _enlarged(wide | _moved_bodies(middle, strong, ground), beam.shape)
+    return _enlarge(wide | _find_moving_bodies(middle, strong, ground), beam.shape)
 
 
-def _moved_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
+def _find_moving_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
     """Bright bodies with several changed cells: all of them, with edges along which they slid."""
     grey = np.clip(255.0 * (middle - middle.min()) / max(float(np.ptp(middle)), 1e-9), 0.0, 255.0)
     level, _ = cv2.threshold(grey.astype(np.uint8), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
@@ -200,14 +200,14 @@ def _moved_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
     return np.asarray(cv2.dilate(moved.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool))
 
 
-def _enlarged(cells: Mask, shape: tuple[int, ...]) -> Mask:
+def _enlarge(cells: Mask, shape: tuple[int, ...]) -> Mask:
     """Cells as pixels; the border that no whole cell covers is that of the last ones."""
     large = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
     rows, cols = shape[0] - large.shape[0], shape[1] - large.shape[1]
     return np.pad(large, ((0, rows), (0, cols)), mode="edge")
 
 
-def _cells(picture: Image) -> Array:
+def _average_cells(picture: Image) -> Array:
     rows, cols = (n // _CELL_PX for n in picture.shape)
     cut = picture[: rows * _CELL_PX, : cols * _CELL_PX]
     return np.asarray(
@@ -215,7 +215,7 @@ def _cells(picture: Image) -> Array:
     )
 
 
-def _covered(picture: Image, weight: Image) -> Image:
+def _cover(picture: Image, weight: Image) -> Image:
     """The picture with what moves replaced by the smooth level of what stands still around it."""
     known = np.asarray(cv2.GaussianBlur(weight, (0, 0), _FILL_PX), dtype=np.float32)
     level = np.asarray(cv2.GaussianBlur(picture * weight, (0, 0), _FILL_PX), dtype=np.float32)

@@ -25,11 +25,11 @@ __all__ = [
     "SHAPES",
     "Bending",
     "Shape",
-    "common_shape",
-    "curve_of",
-    "end_along_axis",
+    "evaluate_bending",
     "fit_bending",
-    "shape_of",
+    "fit_common_shape",
+    "locate_end",
+    "parse_shape",
 ]
 
 
@@ -76,7 +76,7 @@ class Bending:
 
     def curve(self, u: Array) -> Array:
         """Bending alone at fractions of the length; it goes on straight beyond the ends."""
-        return curve_of(self.coefficients[2:], u)
+        return evaluate_bending(self.coefficients[2:], u)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Shape:
     relative: float = 0.0
 
 
-def shape_of(name: str) -> Shape | None:
+def parse_shape(name: str) -> Shape | None:
     """The shape of a name in :data:`SHAPES`; None where it is free.
 
     Raises
@@ -110,7 +110,7 @@ def shape_of(name: str) -> Shape | None:
     return {"beam": Shape(-0.5, 0.0), "parabola": Shape(0.0, 0.0)}.get(name)
 
 
-def common_shape(
+def fit_common_shape(
     frames: Sequence[Bending], reference_sigma_m: float, reference_count: int
 ) -> Shape:
     """The shape that several frames have in common.
@@ -139,7 +139,7 @@ def common_shape(
         normal = (rows / variance[:, None]).T @ rows + np.diag(prior)
         right = (rows / variance[:, None]).T @ b + np.array([prior[0] * _PRIOR[0], 0.0])
         c = float(np.linalg.solve(normal, right)[0])
-    excess = _shared_excess(good, d, reference_count)
+    excess = _estimate_shared_excess(good, d, reference_count)
     sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))
     along = float(np.sum((d - d.mean()) ** 2)) if len(d) > 1 else 0.0
     single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
@@ -147,7 +147,7 @@ def common_shape(
     return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
 
 
-def _shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) -> float:
+def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) -> float:
     """How many times more the residuals of an edge grow with the deflection than noise explains.
 
     A bright grain beside an edge pulls it in all frames alike; what the reference did to it does
@@ -173,7 +173,7 @@ def _shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) ->
     return float(max(ratio * number / max(number - 4.0, 1.0), 1.0))
 
 
-def curve_of(terms: Array, u: Array) -> Array:
+def evaluate_bending(terms: Array, u: Array) -> Array:
     """Factors (2,) times u^2 and u^3 within the beam, and its tangent beyond."""
     a, b = terms
     inside = np.clip(u, 0.0, 1.0)
@@ -183,7 +183,7 @@ def curve_of(terms: Array, u: Array) -> Array:
 
 def fit_bending(
     u: Array,
-    displacement_m: Array,
+    compute_displacement_m: Array,
     sigma_m: Array,
     length_m: float,
     offset_sigma_m: float,
@@ -209,12 +209,12 @@ def fit_bending(
     Bending
         With an infinite sigma where too little of the beam was seen.
     """
-    usable = np.isfinite(sigma_m) & np.isfinite(displacement_m)
+    usable = np.isfinite(sigma_m) & np.isfinite(compute_displacement_m)
     cubic = u**3 - u**2
     terms = [u**2, cubic] if shape is None else [u**2 + shape.value * cubic]
     design = np.column_stack([np.ones(len(u)), u, *terms])
     rows = np.repeat(design, 2, axis=0)[usable.ravel()]
-    seen, sigma = displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
+    seen, sigma = compute_displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
     if len(seen) < _LEAST:
         unknown = np.full((2, 2), np.inf)
         nothing = np.full(4, np.nan)
@@ -224,7 +224,7 @@ def fit_bending(
     prior = np.zeros(design.shape[1])
     prior[0] = 1.0 / max(offset_sigma_m, 1e-13) ** 2
     prior[1] = 1.0 / (_TURN_RAD * length_m) ** 2
-    solution, weight, scale, covariance = _robust(rows, seen, sigma, prior)
+    solution, weight, scale, covariance = _fit_robustly(rows, seen, sigma, prior)
     kept = weight > 0.05
     used = np.zeros(usable.size, dtype=bool)
     used[np.flatnonzero(usable.ravel())[kept]] = True
@@ -253,7 +253,7 @@ def fit_bending(
     )
 
 
-def _robust(
+def _fit_robustly(
     rows: Array, seen: Array, sigma: Array, prior: Array
 ) -> tuple[Array, Array, float, Array]:
     """Reweighted least squares (Tukey's biweight), with the scatter of the residuals as scale."""
@@ -279,7 +279,7 @@ def _robust(
     return solution, weight, scale, np.asarray(covariance)
 
 
-def end_along_axis(terms: Array, length_m: float) -> float:
+def locate_end(terms: Array, length_m: float) -> float:
     """Where along the axis the end of the bent beam is, by its conserved arc length.
 
     Parameters

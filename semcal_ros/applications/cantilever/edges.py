@@ -15,7 +15,15 @@ from scipy.special import ndtr
 
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 
-__all__ = ["EdgeFit", "EdgeModel", "StepFit", "best_width", "fit_edges", "fit_step", "same_width"]
+__all__ = [
+    "EdgeFit",
+    "EdgeModel",
+    "StepFit",
+    "choose_width",
+    "find_unchanged_width",
+    "fit_edges",
+    "fit_step",
+]
 
 
 _STEPS = 5
@@ -106,11 +114,13 @@ def fit_edges(
     along, across, level = (v[inside] for v in (along_m, across_m, grey))
     results, chi2 = [], 0.0
     for side, sign in enumerate((1.0, -1.0)):
-        line = _along_line(along, model, predicted_m[:, side])
+        line = _interpolate_line(along, model, predicted_m[:, side])
         near = np.abs(across - line) < 2.0 * model.reach_m
         # With the sign the beam is always on the side of growing coordinates.
         distance = sign * (across - line)[near]
-        place, sigma, step, left = _fitted(block[near], distance, level[near], model, model.blocks)
+        place, sigma, step, left = _fit_blocks(
+            block[near], distance, level[near], model, model.blocks
+        )
         results.append((predicted_m[:, side] + sign * place, sigma, step))
         chi2 += left
     across_fit, sigmas, steps = (np.stack(parts, axis=1) for parts in zip(*results, strict=True))
@@ -132,7 +142,7 @@ def fit_step(
         if near.sum() < _LEAST_PIXELS:
             continue
         zero = np.zeros(int(near.sum()), dtype=np.intp)
-        found = _fitted(zero, distance_m[near] - start, grey[near], model, 1)
+        found = _fit_blocks(zero, distance_m[near] - start, grey[near], model, 1)
         place, sigma, step = (float(v[0]) for v in found[:3])
         if np.isfinite(sigma) and step > 0.0 and (best is None or step / sigma > best[3]):
             best = (start + place, sigma, step, step / sigma)
@@ -141,7 +151,7 @@ def fit_step(
     return StepFit(*best[:3])
 
 
-def best_width(
+def choose_width(
     along_m: Array, across_m: Array, grey: Array, model: EdgeModel, predicted_m: Array, px_m: float
 ) -> float:
     """The width of the edges, m, that leaves least; ``px_m`` is the size of a pixel."""
@@ -157,7 +167,7 @@ def best_width(
     return float(widths[k] * 1.16 ** float(np.clip(shift, -1.0, 1.0)))
 
 
-def _along_line(along: Array, model: EdgeModel, values: Array) -> Array:
+def _interpolate_line(along: Array, model: EdgeModel, values: Array) -> Array:
     """Values at the blocks' centres, interpolated and continued to the pixels."""
     centres = model.centres_m
     if len(centres) < 2:
@@ -168,7 +178,7 @@ def _along_line(along: Array, model: EdgeModel, values: Array) -> Array:
     return np.asarray(values[k] + part * (values[k + 1] - values[k]))
 
 
-def _fitted(
+def _fit_blocks(
     block: Indices, distance: Array, grey: Array, model: EdgeModel, count: int
 ) -> tuple[Array, Array, Array, float]:
     """Place, 1-sigma and step of each block's edge, and the squares that are left."""
@@ -187,12 +197,12 @@ def _fitted(
             # Scaled by the width, so that the equations are well conditioned.
             third = -slope[block] * np.exp(-0.5 * (z / width) ** 2) / np.sqrt(2.0 * np.pi)
         columns = (np.ones_like(z), shape, third)
-        information = _gram(block, taper, columns, count)
+        information = _accumulate_normal(block, taper, columns, count)
         sums = [np.bincount(block, taper * c * grey, count) for c in columns]
         right = np.asarray(np.stack(sums, axis=1), dtype=np.float64)
         if turn == 0:
             information[:, 2, 2] = 1.0
-        solution = _solved(information, right)
+        solution = _solve_guarded(information, right)
         low, step = solution[:, 0], solution[:, 1]
         slope = step
         place = place + np.clip(solution[:, 2] * width, -0.5 * reach, 0.5 * reach)
@@ -204,14 +214,16 @@ def _fitted(
     noise = np.bincount(block, taper**2, count) / np.maximum(weight_sum, _TINY)
     variance = squares / np.maximum(weight_sum - 3.0 * noise, 1.0)
     inverse = np.linalg.pinv(information, hermitian=True)
-    sandwich = inverse @ _gram(block, taper**2, columns, count) @ inverse
+    sandwich = inverse @ _accumulate_normal(block, taper**2, columns, count) @ inverse
     sigma = width * np.sqrt(np.maximum(variance * sandwich[:, 2, 2], 0.0))
     good = (weight_sum > _LEAST_PIXELS) & (np.abs(place) < 0.95 * reach) & (step > 0.0)
     sigma = np.where(good & (sigma > 0.0), sigma, np.inf)
     return place, sigma, step, float(squares.sum())
 
 
-def _gram(block: Indices, weight: Array, columns: tuple[Array, Array, Array], count: int) -> Array:
+def _accumulate_normal(
+    block: Indices, weight: Array, columns: tuple[Array, Array, Array], count: int
+) -> Array:
     gram = np.zeros((count, 3, 3))
     for i in range(3):
         for j in range(i, 3):
@@ -220,13 +232,13 @@ def _gram(block: Indices, weight: Array, columns: tuple[Array, Array, Array], co
     return gram
 
 
-def _solved(matrix: Array, right: Array) -> Array:
+def _solve_guarded(matrix: Array, right: Array) -> Array:
     """Solutions of (n, 3, 3) systems that may be singular."""
     guard = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + _TINY
     return np.asarray(np.linalg.solve(matrix + guard * np.eye(3), right[..., None])[..., 0])
 
 
-def same_width(moved: Array, noise: Array) -> Mask:
+def find_unchanged_width(moved: Array, noise: Array) -> Mask:
     """(blocks,) where the width is what it was: elsewhere something lies on an edge.
 
     The neighbours of such blocks are left out, too: it may reach into them a little.

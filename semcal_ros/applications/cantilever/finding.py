@@ -108,10 +108,10 @@ def find_strip(
         )
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
     if base_px is None or tip_px is None:
-        found = _searched(smooth)
+        found = _search_strip(smooth)
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
-        found = _clicked(smooth, clicks[0], clicks[1])
+        found = _follow_clicks(smooth, clicks[0], clicks[1])
     return Strip(
         (found.base_px + 0.5) * shrink - 0.5,
         (found.tip_px + 0.5) * shrink - 0.5,
@@ -121,7 +121,7 @@ def find_strip(
     )
 
 
-def _lines(smooth: Array) -> _Lines:
+def _prepare_lines(smooth: Array) -> _Lines:
     gy, gx = np.gradient(smooth)
     y, x = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
     # The border of the picture is no edge.
@@ -133,7 +133,7 @@ def _lines(smooth: Array) -> _Lines:
     return _Lines(parts[0], parts[1], parts[2], parts[3], (width, height))
 
 
-def _best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
+def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
     """Rising line, and falling line after it, of which the weaker is strongest."""
     best = (0.0, 0, 0)
     for width in range(low, min(high, len(rise) - 1)):
@@ -144,25 +144,25 @@ def _best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, in
     return best
 
 
-def _widened(sums: Array) -> Array:
+def _widen(sums: Array) -> Array:
     """An edge is some pixels wide, and a little bent."""
     return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
 
 
-def _searched(smooth: Array) -> Strip:
+def _search_strip(smooth: Array) -> Strip:
     """The strongest strip in any direction: found in a small picture, then in the large one."""
     shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
     size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
     part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
-    lines = _lines(small)
+    lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
     best, angle, offset = 0.0, 0.0, 0.0
     # Both senses of a direction are the same strip: rising and falling edge change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
         sums, first = lines.across(float(turn))
-        wide = _widened(sums)
-        strength, low, up = _best_pair(wide, -wide, _LEAST_WIDTH_PX // shrink + 1, high)
+        wide = _widen(sums)
+        strength, low, up = _find_best_pair(wide, -wide, _LEAST_WIDTH_PX // shrink + 1, high)
         if strength > best:
             best, angle, offset = strength, float(turn), 0.5 * (low + up) + first
     if best <= 0.0:
@@ -170,24 +170,26 @@ def _searched(smooth: Array) -> Strip:
     across = np.array([-np.sin(angle), np.cos(angle)])
     middle = 0.5 * (np.array(size) - 1.0)
     point = middle + (offset - float(across @ middle)) * across
-    angle, offset, half = _pair_near(_lines(smooth), angle, (point + 0.5) * shrink - 0.5)
-    return _bounded(smooth, angle, offset, half)
+    angle, offset, half = _find_pair_near(
+        _prepare_lines(smooth), angle, (point + 0.5) * shrink - 0.5
+    )
+    return _find_ends(smooth, angle, offset, half)
 
 
-def _pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, float, float]:
+def _find_pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, float, float]:
     """Direction, distance from the origin and half width of the strip around a point."""
     reach = int(_LARGEST_WIDTH * min(lines.size))
     best, found = 0.0, (nominal, 0.0, 0.0)
     for angle in nominal + _FINE_RAD:
         sums, first = lines.across(float(angle))
         here = round(float(point[1] * np.cos(angle) - point[0] * np.sin(angle)) - first)
-        wide = _widened(sums)
+        wide = _widen(sums)
         left, right = max(here - reach, 0), min(here + reach, len(wide))
         if not left < here < right:
             continue
         rise, fall = wide[left:right].copy(), -wide[left:right]
         rise[here - left :], fall[: here - left] = -np.inf, -np.inf
-        strength, low, up = _best_pair(rise, fall, _LEAST_WIDTH_PX, right - left)
+        strength, low, up = _find_best_pair(rise, fall, _LEAST_WIDTH_PX, right - left)
         if strength > best:
             best = strength
             found = float(angle), 0.5 * (low + up) + left + first, 0.5 * (up - low)
@@ -198,26 +200,26 @@ def _pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, floa
     return found
 
 
-def _clicked(smooth: Array, base: Array, tip: Array) -> Strip:
+def _follow_clicks(smooth: Array, base: Array, tip: Array) -> Strip:
     """The strip around two points; what they say of its ends holds."""
     if not float(np.hypot(*(tip - base))) > 10.0:
         raise InvalidValueError("base and tip at the same place", expected="two ends of a beam")
     nominal = float(np.arctan2(tip[1] - base[1], tip[0] - base[0]))
-    seen = [_inside(p, smooth.shape) for p in (base, tip)]
+    seen = [_is_inside(p, smooth.shape) for p in (base, tip)]
     # Of what is in view: a click outside is only good for the direction.
     points = [p for p, inside in zip((base, tip), seen, strict=True) if inside]
     inwards = [(tip - base) / 20.0, (base - tip) / 20.0]
     point = np.mean(points, axis=0) if points else 0.5 * (base + tip)
     if len(points) == 1:
         point = points[0] + inwards[0 if seen[0] else 1]
-    angle, offset, half = _pair_near(_lines(smooth), nominal, point)
+    angle, offset, half = _find_pair_near(_prepare_lines(smooth), nominal, point)
     along = np.array([np.cos(angle), np.sin(angle)])
     across = offset * np.array([-along[1], along[0]])
     ends = [across + along * float(along @ p) for p in (base, tip)]
-    return Strip(*_within(ends, smooth.shape), half, seen[0], seen[1])
+    return Strip(*_clip_to_view(ends, smooth.shape), half, seen[0], seen[1])
 
 
-def _within(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:
+def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:
     """The part of a line that is in view."""
     steps = np.linspace(0.0, 1.0, 2001)[:, None]
     points = ends[0] + steps * (ends[1] - ends[0])
@@ -231,7 +233,7 @@ def _within(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:
     return points[inside[0]], points[inside[-1]]
 
 
-def _inside(point: Array, shape: tuple[int, ...]) -> bool:
+def _is_inside(point: Array, shape: tuple[int, ...]) -> bool:
     x, y = point
     return bool(
         _BORDER_PX <= x <= shape[1] - 1 - _BORDER_PX
@@ -239,7 +241,7 @@ def _inside(point: Array, shape: tuple[int, ...]) -> bool:
     )
 
 
-def _sampled(picture: Array, points: Array) -> Array:
+def _sample(picture: Array, points: Array) -> Array:
     """Grey levels at (n, 2) pixels; NaN outside."""
     maps = [np.ascontiguousarray(points[None, :, k], dtype=np.float32) for k in (0, 1)]
     out = cv2.remap(
@@ -253,7 +255,7 @@ def _sampled(picture: Array, points: Array) -> Array:
     return np.asarray(out[0], dtype=np.float64)
 
 
-def _bounded(smooth: Array, angle: float, offset: float, half: float) -> Strip:
+def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip:
     """Where along its lines the strip begins and ends, and which end is free."""
     c, s = np.cos(angle), np.sin(angle)
     along, across = np.array([c, s]), np.array([-s, c])
@@ -261,7 +263,7 @@ def _bounded(smooth: Array, angle: float, offset: float, half: float) -> Strip:
     steps = np.arange(-reach, reach)
     line = offset * across + steps[:, None] * along
     places = (-half - 2.5, -half + 2.5, 0.0, half - 2.5, half + 2.5)
-    levels = [_sampled(smooth, line + d * across) for d in places]
+    levels = [_sample(smooth, line + d * across) for d in places]
     lower, upper = levels[1] - levels[0], levels[3] - levels[4]
     if half < 4.0:  # a narrow beam is brightest in its middle
         lower, upper = levels[2] - levels[0], levels[2] - levels[4]
@@ -272,7 +274,7 @@ def _bounded(smooth: Array, angle: float, offset: float, half: float) -> Strip:
     count = np.convolve(known.astype(float), weight, mode="same")
     mean = np.where(count > 4, filled / np.maximum(count, 1.0), -np.inf)
     strong = float(np.quantile(strength[known], 0.9)) if known.any() else 0.0
-    run = _longest_run(mean > _EDGE_SHARE * strong, max(4, int(_GAP * min(smooth.shape))))
+    run = _find_longest_run(mean > _EDGE_SHARE * strong, max(4, int(_GAP * min(smooth.shape))))
     side = min(smooth.shape)
     if run is None or strong <= 0.0 or run[1] - run[0] < _LEAST_LENGTH * side:
         raise InvalidValueError(
@@ -280,22 +282,22 @@ def _bounded(smooth: Array, angle: float, offset: float, half: float) -> Strip:
         )
     ends = [offset * across + steps[k] * along for k in run]
     seen = [
-        all(_inside(p, smooth.shape) for p in _corners(end, sign * along, across, half))
+        all(_is_inside(p, smooth.shape) for p in _get_corners(end, sign * along, across, half))
         for end, sign in zip(ends, (-1.0, 1.0), strict=True)
     ]
     free = [
-        _free(smooth, end, sign * along, across, half)
+        _measure_freedom(smooth, end, sign * along, across, half)
         for end, sign in zip(ends, (-1, 1), strict=True)
     ]
-    return _told_apart(ends, seen, free, half)
+    return _decide_ends(ends, seen, free, half)
 
 
-def _corners(end: Array, outwards: Array, across: Array, half: float) -> list[Array]:
+def _get_corners(end: Array, outwards: Array, across: Array, half: float) -> list[Array]:
     """Points a little beyond both corners of an end: a strip may leave the picture askew."""
     return [end + 4.0 * outwards + side * (half + 3.0) * across for side in (-1.0, 1.0)]
 
 
-def _longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
+def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
     """First and last index of the longest stretch, gaps closed."""
     places = np.flatnonzero(good)
     if not places.size:
@@ -307,14 +309,16 @@ def _longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
     return int(places[firsts[longest]]), int(places[lasts[longest]])
 
 
-def _free(picture: Array, end: Array, outwards: Array, across: Array, half: float) -> float:
+def _measure_freedom(
+    picture: Array, end: Array, outwards: Array, across: Array, half: float
+) -> float:
     """How dark it is beyond an end: 1 as beside the strip, 0 as in it; NaN out of view."""
     spread = np.linspace(-0.5 * half, 0.5 * half, 5)
     beyond = np.linspace(8.0, 8.0 + max(half, 8.0), 9)
 
     def level(steps: Array, offsets: Array) -> float:
         points = end + steps[:, None, None] * outwards + offsets[None, :, None] * across
-        values = _sampled(picture, points.reshape(-1, 2))
+        values = _sample(picture, points.reshape(-1, 2))
         return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
 
     inside = level(-beyond, spread)
@@ -323,7 +327,7 @@ def _free(picture: Array, end: Array, outwards: Array, across: Array, half: floa
     return (inside - outside) / max(inside - beside, 1e-9)
 
 
-def _told_apart(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:
+def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:
     """Which end is the base: the one behind which it stays bright, or that is out of view."""
     is_tip = [s and f > 0.5 for s, f in zip(seen, free, strict=True)]
     is_base = [s and f <= 0.5 for s, f in zip(seen, free, strict=True)]

@@ -17,7 +17,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 
-__all__ = ["Axis", "PlaneMap", "drift_at"]
+__all__ = ["Axis", "PlaneMap", "evaluate_drift"]
 
 
 _NODE_SPACING_PX = 10.0
@@ -89,7 +89,7 @@ class PlaneMap:
     def __init__(self, camera: ScanCamera, timing: ScanTiming | None) -> None:
         self.camera, self.timing = camera, timing
         width, height = camera.width, camera.height
-        cols, rows = _nodes(width), _nodes(height)
+        cols, rows = _place_nodes(width), _place_nodes(height)
         xy = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
         ideal = camera.undistort(xy)
         if not np.all(np.isfinite(ideal)):
@@ -99,8 +99,8 @@ class PlaneMap:
                 do="calibrate again",
             )
         sem = camera.sem_from_ideal(ideal).reshape(len(rows), len(cols), 3)
-        self.x_m, self.y_m = (_upsampled(rows, cols, sem[..., k], (height, width)) for k in (0, 1))
-        self.since_s, self.square_s2 = _times(width, height, timing)
+        self.x_m, self.y_m = (_upsample(rows, cols, sem[..., k], (height, width)) for k in (0, 1))
+        self.since_s, self.square_s2 = _compute_times(width, height, timing)
 
     @property
     def pixel_m(self) -> float:
@@ -120,11 +120,11 @@ class PlaneMap:
         """Coordinates, relative to where the specimen was at zero drift, of pixels by flat index."""
         since = self.since_s.ravel()[pixels]
         square = self.square_s2.ravel()[pixels]
-        x_moved, y_moved = drift_at(drift, since, square)
+        x_moved, y_moved = evaluate_drift(drift, since, square)
         return self.x_m.ravel()[pixels] - x_moved, self.y_m.ravel()[pixels] - y_moved
 
 
-def drift_at(drift: RasterDrift, since_s: Array, square_s2: Array) -> tuple[Array, Array]:
+def evaluate_drift(drift: RasterDrift, since_s: Array, square_s2: Array) -> tuple[Array, Array]:
     """Drift along x and y at times after the centre of the acquisition, whose mean squares over
     the passes are ``square_s2``.
     """
@@ -135,7 +135,7 @@ def drift_at(drift: RasterDrift, since_s: Array, square_s2: Array) -> tuple[Arra
     )
 
 
-def _times(width: int, height: int, timing: ScanTiming | None) -> tuple[Array, Array]:
+def _compute_times(width: int, height: int, timing: ScanTiming | None) -> tuple[Array, Array]:
     """(h, w) each: time after the centre of the acquisition, and its mean square over passes."""
     if timing is None:
         return np.zeros((height, width)), np.zeros((height, width))
@@ -144,10 +144,10 @@ def _times(width: int, height: int, timing: ScanTiming | None) -> tuple[Array, A
     return since, since**2 + timing.pass_variance_s2
 
 
-def _nodes(pixels: int) -> Array:
+def _place_nodes(pixels: int) -> Array:
     return np.linspace(0.0, pixels - 1.0, max(2 * _DEGREE, round(pixels / _NODE_SPACING_PX) + 1))
 
 
-def _upsampled(rows: Array, cols: Array, values: Array, shape: tuple[int, int]) -> Array:
+def _upsample(rows: Array, cols: Array, values: Array, shape: tuple[int, int]) -> Array:
     spline = RectBivariateSpline(rows, cols, values, kx=_DEGREE, ky=_DEGREE)
     return np.asarray(spline(np.arange(shape[0]), np.arange(shape[1])), dtype=np.float64)

@@ -11,7 +11,7 @@ from semcal_ros.applications.cantilever.series import Series
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Repeatability", "frames_of_poses", "repeatability"]
+__all__ = ["Repeatability", "compare_series", "group_frames"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Repeatability:
     expected_spread_m: float
 
 
-def frames_of_poses(frames: int, poses: int | None) -> list[list[int]]:
+def group_frames(frames: int, poses: int | None) -> list[list[int]]:
     """Frames of each pose: ``frames`` in the order of time, cut into ``poses`` equal parts.
 
     None makes each frame a pose of its own.
@@ -68,7 +68,7 @@ def frames_of_poses(frames: int, poses: int | None) -> list[list[int]]:
     return [list(range(k * each, (k + 1) * each)) for k in range(count)]
 
 
-def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeatability:
+def compare_series(series: Sequence[Series], poses: int | None = None) -> Repeatability:
     """Compare series whose k-th poses are the same.
 
     Parameters
@@ -76,7 +76,7 @@ def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeata
     series
         One per magnification.
     poses
-        As for :func:`frames_of_poses`.
+        As for :func:`group_frames`.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeata
     """
     if not series:
         raise InvalidValueError("no series", expected="at least one magnification")
-    groups = [frames_of_poses(len(s.frames), poses) for s in series]
+    groups = [group_frames(len(s.frames), poses) for s in series]
     counts = sorted({len(g) for g in groups})
     if len(counts) > 1:
         seen = ", ".join(f"{s.magnification:g}: {len(s.frames)}" for s in series)
@@ -94,9 +94,9 @@ def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeata
             expected="the same poses at each magnification",
             do="state how many poses there are, or cut the recordings",
         )
-    value, sigma = _means(series, groups, by_length=False)
-    known, known_sigma = _means(series, groups, by_length=True)
-    spread, known_spread = _spread(value), _spread(known)
+    value, sigma = _average_poses(series, groups, by_length=False)
+    known, known_sigma = _average_poses(series, groups, by_length=True)
+    spread, known_spread = _compute_spread(value), _compute_spread(known)
     return Repeatability(
         tuple(s.magnification for s in series),
         value,
@@ -105,13 +105,13 @@ def repeatability(series: Sequence[Series], poses: int | None = None) -> Repeata
         known_sigma,
         spread,
         known_spread,
-        _rms(spread),
-        _rms(known_spread),
-        _rms(np.sqrt(np.mean(sigma**2, axis=0))) if len(series) > 1 else float("nan"),
+        _compute_rms(spread),
+        _compute_rms(known_spread),
+        _compute_rms(np.sqrt(np.mean(sigma**2, axis=0))) if len(series) > 1 else float("nan"),
     )
 
 
-def _means(
+def _average_poses(
     series: Sequence[Series], groups: list[list[list[int]]], *, by_length: bool
 ) -> tuple[Array, Array]:
     value = np.full((len(series), len(groups[0])), np.nan)
@@ -138,13 +138,13 @@ def _means(
     return value, sigma
 
 
-def _spread(value: Array) -> Array:
+def _compute_spread(value: Array) -> Array:
     if len(value) < 2:
         return np.full(value.shape[1], np.nan)
     return np.asarray(np.std(value, axis=0, ddof=1))
 
 
-def _rms(values: Array) -> float:
+def _compute_rms(values: Array) -> float:
     """Over all poses but the first, which is the reference."""
     rest = values[1:]
     known = rest[np.isfinite(rest)]

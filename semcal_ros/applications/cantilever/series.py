@@ -12,13 +12,13 @@ from semcal_ros.applications.cantilever.background_drift import follow_backgroun
 from semcal_ros.applications.cantilever.bending import (
     Bending,
     Shape,
-    common_shape,
-    curve_of,
-    end_along_axis,
+    evaluate_bending,
     fit_bending,
-    shape_of,
+    fit_common_shape,
+    locate_end,
+    parse_shape,
 )
-from semcal_ros.applications.cantilever.edges import EdgeFit, fit_edges, same_width
+from semcal_ros.applications.cantilever.edges import EdgeFit, find_unchanged_width, fit_edges
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
 from semcal_ros.applications.cantilever.undeformed import (
@@ -75,7 +75,7 @@ class SeriesSettings:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
                 raise InvalidValueError(f"{name} = {value}", expected="a positive length")
-        shape_of(self.shape)
+        parse_shape(self.shape)
 
     @property
     def reach_m(self) -> float:
@@ -182,15 +182,15 @@ def measure_series(
     height, width = images[0].shape
     plane = PlaneMap(camera.resized(width, height), timing)
     strip = find_strip(images[0], base_px=settings.base_px, tip_px=settings.tip_px)
-    rough = _axis_of(strip, plane, settings.length_m)
+    rough = _make_rough_axis(strip, plane, settings.length_m)
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
-    work = _Work(images, plane, background.path, settings, rough)
+    work = _SeriesMeasurement(images, plane, background.path, settings, rough)
     rest = measure_undeformed_beam(
         rough, [work.view(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
     frames, shape = work.deflections(rest, tuple(reference), on_frame)
-    notes = _notes(rest, frames, background.path, settings)
+    notes = _collect_notes(rest, frames, background.path, settings)
     return Series(camera.magnification, rest, tuple(frames), shape, background.path, notes)
 
 
@@ -208,7 +208,7 @@ def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequ
         )
 
 
-def _axis_of(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
+def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
     """The strip in the sem frame, with arc lengths as far as they are known yet."""
     ends = plane.sem_of(np.stack([strip.base_px, strip.tip_px]))
     seen_m = float(np.hypot(*(ends[1] - ends[0])))
@@ -220,7 +220,7 @@ def _axis_of(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
     return Axis(origin, direction, half_m, visible, strip.base_seen, strip.tip_seen)
 
 
-def _notes(
+def _collect_notes(
     rest: UndeformedBeam, frames: Sequence[Deflection], path: DriftPath, settings: SeriesSettings
 ) -> tuple[str, ...]:
     notes = list(rest.notes)
@@ -236,7 +236,7 @@ def _notes(
     return tuple(notes)
 
 
-class _Work:
+class _SeriesMeasurement:
     """The pictures of a series, and what is done to each."""
 
     def __init__(
@@ -282,11 +282,11 @@ class _Work:
             if np.isfinite(free[-1].deflection_m):
                 terms = free[-1].coefficients[2:]
             on_frame()
-        shape = shape_of(self._settings.shape)
+        shape = parse_shape(self._settings.shape)
         if shape is None:
             others = [f for k, f in enumerate(free) if k not in reference]
             own = [free[k].covariance[1, 1] for k in reference]
-            shape = common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
+            shape = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
         bent = [self._bending(k, fit, rest, reference, shape) for k, fit in enumerate(edges)]
         return [self._result(k, one, rest) for k, one in enumerate(bent)], shape
 
@@ -294,7 +294,7 @@ class _Work:
         """A bending to start from: that with the largest contrast between beam and surroundings."""
         model, reach = rest.model, self._settings.reach_m
         along, across, grey = view
-        line = curve_of(np.array([1.5, -0.5]), along / self._settings.length_m)
+        line = evaluate_bending(np.array([1.5, -0.5]), along / self._settings.length_m)
         centres = model.centres_m
         inside = (along > centres[0]) & (along < centres[-1])
         inside &= np.abs(across) < model.half_width_m + reach + model.reach_m
@@ -318,7 +318,7 @@ class _Work:
         """Edges of a frame, looked for again where the first look has found the beam."""
         length, model = self._settings.length_m, rest.model
         u = model.centres_m / length
-        fit = fit_edges(*view, model, rest.across_m + curve_of(terms, u)[:, None])
+        fit = fit_edges(*view, model, rest.across_m + evaluate_bending(terms, u)[:, None])
         for _ in range(2):
             rough = fit_bending(u, fit.across_m - rest.across_m, fit.sigma_m, length, _UNTRACKED_M)
             if not np.isfinite(rough.deflection_m):
@@ -350,7 +350,7 @@ class _Work:
         same = (ratio > _SAME_STEP[0]) & (ratio < _SAME_STEP[1]) & np.isfinite(rest.sigma_m)
         noise = np.where(same, noise, np.inf)
         moved = fit.across_m - rest.across_m
-        noise = np.where(same_width(moved, noise)[:, None], noise, np.inf)
+        noise = np.where(find_unchanged_width(moved, noise)[:, None], noise, np.inf)
         u = rest.model.centres_m / length
         found = fit_bending(u, moved, noise, length, offset, shape)
         if abs(found.deflection_m) > _ABSURD * self._settings.reach_m:
@@ -366,9 +366,9 @@ class _Work:
         sigma = float(np.sqrt(noise**2 + axis.normal @ scale @ axis.normal))
         factor, relative = length / rest.length_m, rest.length_sigma_m / rest.length_m
         terms = np.nan_to_num(bending.coefficients[2:])
-        end = axis.point(np.array([end_along_axis(terms, length)]), np.array([known]))
+        end = axis.point(np.array([locate_end(terms, length)]), np.array([known]))
         along = np.linspace(*axis.visible_m, _LINE_POINTS)
-        line = axis.point(along, curve_of(terms, along / length))
+        line = axis.point(along, evaluate_bending(terms, along / length))
         drift = self._path.drift_m[frame]
         return Deflection(
             value,

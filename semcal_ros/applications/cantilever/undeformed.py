@@ -10,7 +10,7 @@ from semcal_ros.applications.cantilever.edges import (
     EdgeFit,
     EdgeModel,
     StepFit,
-    best_width,
+    choose_width,
     fit_edges,
     fit_step,
 )
@@ -86,13 +86,13 @@ def measure_undeformed_beam(
     InvalidValueError
         If no end of it is in view, or too little of its edges.
     """
-    axis, width_m = _straightened(rough, views, px_m)
-    moved = [_moved(view, rough, axis) for view in views]
-    counted, seen_m, seen_sigma_m, notes = _with_ends(axis, moved, width_m, length_m, px_m)
-    final = [_moved(view, axis, counted) for view in moved]
-    model = _blocks(counted, width_m, px_m)
-    fits = [fit_edges(*view, model, _straight(model)) for view in final]
-    across, sigma, step = averaged(fits)
+    axis, width_m = _align_axis(rough, views, px_m)
+    moved = [_change_axis(view, rough, axis) for view in views]
+    counted, seen_m, seen_sigma_m, notes = _locate_ends(axis, moved, width_m, length_m, px_m)
+    final = [_change_axis(view, axis, counted) for view in moved]
+    model = _place_blocks(counted, width_m, px_m)
+    fits = [fit_edges(*view, model, _predict_straight_edges(model)) for view in final]
+    across, sigma, step = average_edges(fits)
     if int(np.isfinite(sigma).all(axis=1).sum()) < _LEAST_BLOCKS:
         raise InvalidValueError(
             "a strip whose edges cannot be measured",
@@ -102,7 +102,7 @@ def measure_undeformed_beam(
     return UndeformedBeam(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
 
 
-def averaged(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
+def average_edges(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
     """Mean edges of several frames, their 1-sigma, and their steps, (blocks, 2) each."""
     weight = np.stack([1.0 / fit.sigma_m**2 for fit in fits])
     total = weight.sum(axis=0)
@@ -114,12 +114,12 @@ def averaged(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
     return across, sigma, step
 
 
-def _straight(model: EdgeModel) -> Array:
+def _predict_straight_edges(model: EdgeModel) -> Array:
     """(blocks, 2) edges of a straight beam."""
     return np.asarray(np.ones((model.blocks, 1)) * np.array([-1.0, 1.0]) * model.half_width_m)
 
 
-def _blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
+def _place_blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
     first, last = axis.visible_m
     # The ends of the beam are edges of their own.
     inset = REACH_PX * px_m
@@ -129,27 +129,29 @@ def _blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
     return EdgeModel(width_m, reach, first + inset, size, count, axis.half_width_m)
 
 
-def _moved(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
+def _change_axis(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
     """A view in the coordinates of another axis."""
     points = before.point(view[0], view[1])
     return (*now.coordinates(points[:, 0], points[:, 1]), view[2])
 
 
-def _straightened(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
+def _align_axis(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
     """The axis along the middle of both edges, and the width of these."""
     axis, width_m = rough, _EDGE_PX * px_m
     for turn in range(4):
-        model = _blocks(axis, width_m, px_m)
-        moved = [_moved(view, rough, axis) for view in views]
+        model = _place_blocks(axis, width_m, px_m)
+        moved = [_change_axis(view, rough, axis) for view in views]
         if turn == 2:
-            width_m = best_width(*moved[0], model, _straight(model), px_m)
+            width_m = choose_width(*moved[0], model, _predict_straight_edges(model), px_m)
             model = replace(model, width_m=width_m)
-        across, sigma, _ = averaged([fit_edges(*v, model, _straight(model)) for v in moved])
-        axis = _refined(axis, model, across, sigma)
+        across, sigma, _ = average_edges(
+            [fit_edges(*v, model, _predict_straight_edges(model)) for v in moved]
+        )
+        axis = _refine_axis(axis, model, across, sigma)
     return axis, width_m
 
 
-def _refined(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
+def _refine_axis(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
     good = np.isfinite(sigma).all(axis=1)
     if int(good.sum()) < 3:
         return axis
@@ -173,16 +175,24 @@ def _refined(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> Axis:
 # -- the ends -------------------------------------------------------------------------------------
 
 
-def _with_ends(
+def _locate_ends(
     axis: Axis, views: list[PixelSamples], width_m: float, length_m: float, px_m: float
 ) -> tuple[Axis, float, float, list[str]]:
     """The axis with arc lengths from the base; the length in view and its 1-sigma; notes."""
     notes: list[str] = []
-    model = _blocks(axis, width_m, px_m)
+    model = _place_blocks(axis, width_m, px_m)
     first, last = axis.visible_m
     unseen = StepFit(float("nan"), float("inf"), 0.0)
-    base = _mean([_base_edge(v, first, model, px_m) for v in views]) if axis.base_seen else unseen
-    end = _mean([_end_edge(v, last, model, px_m) for v in views]) if axis.end_seen else unseen
+    base = (
+        _average_steps([_fit_base_edge(v, first, model, px_m) for v in views])
+        if axis.base_seen
+        else unseen
+    )
+    end = (
+        _average_steps([_fit_end_edge(v, last, model, px_m) for v in views])
+        if axis.end_seen
+        else unseen
+    )
     start_m, stop_m = first - base.place_m, last - end.place_m
     if axis.base_seen and not np.isfinite(start_m):
         notes.append("the edge of the holder is not seen: the base is where the beam fades")
@@ -210,7 +220,7 @@ def _with_ends(
     return counted, seen_m, sigma_m, notes
 
 
-def _mean(steps: list[StepFit]) -> StepFit:
+def _average_steps(steps: list[StepFit]) -> StepFit:
     known = [s for s in steps if np.isfinite(s.sigma_m) and s.sigma_m > 0.0]
     if not known:
         return StepFit(float("nan"), float("inf"), 0.0)
@@ -219,7 +229,7 @@ def _mean(steps: list[StepFit]) -> StepFit:
     return StepFit(place, float(1.0 / np.sqrt(weight.sum())), known[0].step)
 
 
-def _base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+def _fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
     """Edge of the holder on both sides of the beam; distances grow into the holder."""
     along, across, grey = view
     away = np.abs(across) - model.half_width_m
@@ -227,7 +237,7 @@ def _base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -
     return fit_step(at_m - along[beside], grey[beside], model, rough_m=_END_SEARCH_PX * px_m)
 
 
-def _end_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
+def _fit_end_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
     """Edge of the free end; distances grow into the beam."""
     along, across, grey = view
     middle = np.abs(across) < max(model.half_width_m - _BESIDE_PX * px_m, 0.5 * model.half_width_m)

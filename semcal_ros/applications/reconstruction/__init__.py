@@ -14,10 +14,10 @@ from semcal_ros.applications.reconstruction.feature_tracks import (
     TrackerSettings,
     TrackKeyframe,
 )
-from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, triangulate_cloud
 from semcal_ros.applications.reconstruction.metric_upgrade import (
     MetricUpgrade,
-    mirrored,
+    mirror_structure,
     upgrade_to_metric,
 )
 from semcal_ros.applications.reconstruction.reconstruct import (
@@ -46,8 +46,8 @@ __all__ = [
     "factorize",
     "fit_sphere",
     "measure_ball",
-    "mesh_of_cloud",
-    "mirrored",
+    "mirror_structure",
     "reconstruct",
+    "triangulate_cloud",
     "upgrade_to_metric",
 ]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.applications.reconstruction.types import Observations, camera_table
+from semcal_ros.applications.reconstruction.types import Observations, tabulate_cameras
 from semcal_ros.core.arrays import Array, Indices, invert_scaled, solve_scaled
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -107,7 +107,7 @@ class _Problem:
         reference: int,
     ) -> None:
         self.observed = observations
-        table = camera_table(cameras)
+        table = tabulate_cameras(cameras)
         table[:, 0] *= unit_m
         table[:, 5] *= unit_m
         self.table = table[observations.view]
@@ -141,7 +141,7 @@ class _Problem:
     def cost(self, state: _State, sigma: float) -> float:
         white = self.whitened(self.residuals(state)[0]) / sigma
         priors = np.sum(self.heights(state) ** 2) + np.sum(self.depths(state) ** 2)
-        return _loss(white) + 0.5 * float(priors)
+        return _compute_loss(white) + 0.5 * float(priors)
 
     def normal(self, state: _State, sigma: float) -> tuple[Array, Array, Array, Array, Array]:
         """Blocks of the normal equations: poses (v, 6, 6), points (p, 3, 3), coupling (6v, 3p) and
@@ -164,12 +164,12 @@ class _Problem:
         error = np.einsum("nij,nj->ni", root, error)
         by_pose = np.concatenate([-rows @ cross_matrices(turned), rows], axis=2)
         by_point = rows @ state.rotations[seen.view]
-        pose = _summed(_outer(by_pose, by_pose), seen.view, self.views)
-        point = _summed(_outer(by_point, by_point), seen.point, len(state.points))
+        pose = _sum_by_index(_multiply_outer(by_pose, by_pose), seen.view, self.views)
+        point = _sum_by_index(_multiply_outer(by_point, by_point), seen.point, len(state.points))
         coupling = np.zeros((self.views, 6, len(state.points), 3))
-        coupling[seen.view, :, seen.point, :] = _outer(by_pose, by_point)
-        right_pose = _summed(np.einsum("nki,nk->ni", by_pose, error), seen.view, self.views)
-        right_point = _summed(
+        coupling[seen.view, :, seen.point, :] = _multiply_outer(by_pose, by_point)
+        right_pose = _sum_by_index(np.einsum("nki,nk->ni", by_pose, error), seen.view, self.views)
+        right_point = _sum_by_index(
             np.einsum("nki,nk->ni", by_point, error), seen.point, len(state.points)
         )
         heights = self.heights(state)
@@ -220,17 +220,17 @@ def adjust(
     )
     held = np.arange(6 * reference, 6 * reference + 6)
     free = np.setdiff1d(np.arange(6 * len(cameras)), held)
-    iterations, converged, sigma = 0, False, _scale(problem, state)
+    iterations, converged, sigma = 0, False, _estimate_scale(problem, state)
     for _ in range(3):
         # The scale of the residuals belongs to the robust loss: settle both in turns.
         state, taken, converged = _descend(problem, state, sigma, free, max_iterations, tolerance)
         iterations += taken
-        better = _scale(problem, state)
+        better = _estimate_scale(problem, state)
         settled = abs(better - sigma) < 0.02 * sigma
         sigma = better
         if settled:
             break
-    return _finished(problem, state, sigma, free, unit_m, iterations, converged)
+    return _finish(problem, state, sigma, free, unit_m, iterations, converged)
 
 
 def _descend(
@@ -240,7 +240,7 @@ def _descend(
     for iteration in range(limit):
         blocks = problem.normal(state, sigma)
         while True:
-            trial = _stepped(state, blocks, damping, free)
+            trial = _step(state, blocks, damping, free)
             new = problem.cost(trial, sigma)
             if new <= cost:
                 break
@@ -254,12 +254,12 @@ def _descend(
     return state, limit, False
 
 
-def _stepped(
+def _step(
     state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Indices
 ) -> _State:
     pose, point, coupling, right_pose, right_point = blocks
-    inverse = _inverted(_damped(point, damping))
-    reduced, moved = _reduced(_damped(pose, damping), inverse, coupling, free)
+    inverse = _inverted(_damp(point, damping))
+    reduced, moved = _form_schur_complement(_damp(pose, damping), inverse, coupling, free)
     right = right_pose.ravel()[free] - moved @ right_point.ravel()
     step = np.zeros(6 * len(pose))
     step[free] = solve_scaled(reduced, right)
@@ -272,7 +272,7 @@ def _stepped(
     )
 
 
-def _damped(blocks: Array, damping: float) -> Array:
+def _damp(blocks: Array, damping: float) -> Array:
     out = blocks.copy()
     axes = np.arange(blocks.shape[1])
     diagonal = blocks[:, axes, axes]
@@ -285,7 +285,9 @@ def _inverted(blocks: Array) -> Array:
     return np.asarray(np.linalg.inv(blocks), dtype=np.float64)
 
 
-def _reduced(pose: Array, inverse: Array, coupling: Array, free: Indices) -> tuple[Array, Array]:
+def _form_schur_complement(
+    pose: Array, inverse: Array, coupling: Array, free: Indices
+) -> tuple[Array, Array]:
     """Schur complement on the free pose parameters, and coupling @ inverse of the points."""
     part = coupling[free]
     by_point = np.swapaxes(part.reshape(len(free), -1, 3), 0, 1) @ inverse
@@ -296,7 +298,7 @@ def _reduced(pose: Array, inverse: Array, coupling: Array, free: Indices) -> tup
     return whole[np.ix_(free, free)] - moved @ part.T, moved
 
 
-def _scale(problem: _Problem, state: _State) -> float:
+def _estimate_scale(problem: _Problem, state: _State) -> float:
     """Robust scale of the whitened residuals, corrected for the parameters that they determine."""
     white = problem.whitened(problem.residuals(state)[0])
     size = 2.0 * len(white)
@@ -307,16 +309,16 @@ def _scale(problem: _Problem, state: _State) -> float:
     return max(float(scale), _LEAST_SCALE)
 
 
-def _loss(white: Array) -> float:
+def _compute_loss(white: Array) -> float:
     squared = np.sum(white**2, axis=1)
     return 0.5 * _ROBUST**2 * float(np.sum(np.log1p(squared / _ROBUST**2)))
 
 
-def _outer(a: Array, b: Array) -> Array:
+def _multiply_outer(a: Array, b: Array) -> Array:
     return np.asarray(np.swapaxes(a, 1, 2) @ b, dtype=np.float64)
 
 
-def _summed(values: Array, index: Indices, count: int) -> Array:
+def _sum_by_index(values: Array, index: Indices, count: int) -> Array:
     """Sums of values (n, ...) over equal indices."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(index, weights=column, minlength=count) for column in flat.T]
@@ -324,7 +326,7 @@ def _summed(values: Array, index: Indices, count: int) -> Array:
     return np.asarray(summed, dtype=np.float64)
 
 
-def _finished(
+def _finish(
     problem: _Problem,
     state: _State,
     sigma: float,
@@ -334,8 +336,8 @@ def _finished(
     converged: bool,
 ) -> Adjustment:
     pose, point, coupling, _, _ = problem.normal(state, sigma)
-    inverse = _inverted(_damped(point, 1e-12))
-    reduced, moved = _reduced(pose, inverse, coupling, free)
+    inverse = _inverted(_damp(point, 1e-12))
+    reduced, moved = _form_schur_complement(pose, inverse, coupling, free)
     poses = invert_scaled(reduced, rcond=1e-14)
     # About the middle of the points: where the whole lies along the beam is not determined.
     through = moved.reshape(len(free), -1, 3)

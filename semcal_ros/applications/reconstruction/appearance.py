@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Image, mad_sigma
 
-__all__ = ["Appearance", "appearance_of", "bytes_for_tracking"]
+__all__ = ["Appearance", "convert_for_tracking", "prepare_appearance"]
 
 # Of a difference of neighbours across the diagonal, sum of squares of its kernel.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
@@ -53,35 +53,35 @@ class Appearance:
         return np.asarray(response, dtype=np.float32), 4.0 * gradient
 
 
-def appearance_of(
+def prepare_appearance(
     image: NDArray[Any], *, smoothing_px: float = 1.0, local_px: float = 6.0
 ) -> Appearance:
     """Texture of a grey picture (h, w) of any depth."""
     grey = np.sqrt(np.maximum(image.astype(np.float32), 0.0))
-    noise = _noise(grey)
+    noise = _estimate_noise(grey)
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), smoothing_px), dtype=np.float32)
-    high = smooth - _widely(smooth, local_px)
-    power = _widely(high * high, local_px)
+    high = smooth - _blur_widely(smooth, local_px)
+    power = _blur_widely(high * high, local_px)
     # Where there is noise only, it is not blown up to look like texture.
     floor = noise**2 / (4.0 * math.pi * smoothing_px**2)
     texture = high / np.sqrt(power + np.float32(floor + 1e-12))
     return Appearance(smooth, np.asarray(texture, dtype=np.float32), noise, smoothing_px)
 
 
-def bytes_for_tracking(appearance: Appearance) -> NDArray[np.uint8]:
+def convert_for_tracking(appearance: Appearance) -> NDArray[np.uint8]:
     """The texture as 8-bit picture, as OpenCV's tracker takes it."""
     levels = np.rint(128.0 + 40.0 * appearance.texture)
     return np.asarray(np.clip(levels, 0, 255), dtype=np.uint8)
 
 
-def _widely(image: Image, sigma_px: float) -> Image:
+def _blur_widely(image: Image, sigma_px: float) -> Image:
     """Two running means, which look like a Gaussian of that sigma and cost the same at any width."""
     side = 2 * round(0.5 * math.sqrt(6.0 * sigma_px**2)) + 1
     once = cv2.blur(image, (side, side))
     return np.asarray(cv2.blur(once, (side, side)), dtype=np.float32)
 
 
-def _noise(grey: Image) -> float:
+def _estimate_noise(grey: Image) -> float:
     """Noise of a pixel from second differences, which smooth texture hardly reaches (Immerkaer 1996)."""
     rough = cv2.filter2D(grey, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
     return mad_sigma(rough)

@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
 from semcal_ros.applications.reconstruction.adjustment import adjust
-from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, mesh_of_cloud
+from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, triangulate_cloud
 from semcal_ros.applications.reconstruction.moving_least_squares import (
+    compute_spacing_m,
     fit_local_surface,
-    typical_spacing_m,
 )
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
@@ -92,21 +92,21 @@ def measure_ball(
     """
     sphere = fit_sphere(structure.points_m, structure.normal_sigma_m)
     variance = structure.adjustment.variance_of(sphere.radius_gradient)
-    noise = 2.0 * np.sqrt(variance * _sharing(structure))
+    noise = 2.0 * np.sqrt(variance * _count_sharing(structure))
     groups = min(groups, len(structure.cameras) // 4)
     freedom = np.inf
     if groups >= 3:
-        measured = _jackknife(structure, sphere, groups)
+        measured = _run_jackknife(structure, sphere, groups)
         if measured > noise:
             noise, freedom = measured, groups - 1.0
     shape = 2.0 * sphere.radius_sigma_m
     diameter = 2.0 * sphere.radius_m
-    scale = diameter * _scale_sigma(structure, height_sigma_m)
+    scale = diameter * _compute_scale_sigma(structure, height_sigma_m)
     total = float(np.sqrt(noise**2 + shape**2 + scale**2))
     # Welch and Satterthwaite: only the jackknife has few degrees of freedom.
     degrees = freedom * (total / noise) ** 4 if np.isfinite(freedom) else 1e6
     reach = float(student.ppf(0.5 + 0.5 * confidence, min(degrees, 1e6))) * total
-    mesh = _meshed(structure, sphere)
+    mesh = _mesh_ball(structure, sphere)
     return Ball(
         sphere=sphere,
         mesh=mesh,
@@ -116,11 +116,11 @@ def measure_ball(
         scale_sigma_m=scale,
         interval_m=(diameter - reach, diameter + reach),
         groups=groups,
-        coverage=_covered(mesh, sphere),
+        coverage=_compute_coverage(mesh, sphere),
     )
 
 
-def _sharing(structure: Structure) -> float:
+def _count_sharing(structure: Structure) -> float:
     """How many points share the noise of a patch: two windows at a distance correlate as Gaussians do."""
     wide = 2.0 * structure.patch_sigma_m
     tree = cKDTree(structure.points_m)
@@ -128,7 +128,7 @@ def _sharing(structure: Structure) -> float:
     return float(np.sum(np.exp(-((pairs["v"] / wide) ** 2))) / len(structure.points_m))
 
 
-def _jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
+def _run_jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
     """1-sigma of the diameter from leaving out every group of views once."""
     done, seen = structure.adjustment, structure.observations
     # Neighbouring views share little but their noise is independent: interleave.
@@ -157,7 +157,7 @@ def _jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
     return float(np.sqrt((groups - 1.0) / groups * np.sum(spread**2)))
 
 
-def _scale_sigma(structure: Structure, height_sigma_m: float) -> float:
+def _compute_scale_sigma(structure: Structure, height_sigma_m: float) -> float:
     """Relative 1-sigma of lengths: pixel size and height."""
     camera = structure.cameras[structure.adjustment.reference]
     height = camera.rho * height_sigma_m
@@ -167,14 +167,14 @@ def _scale_sigma(structure: Structure, height_sigma_m: float) -> float:
     return float(np.hypot(max(sigma / size for sigma, size in sizes), height))
 
 
-def _meshed(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
+def _mesh_ball(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
     points = structure.points_m[sphere.inliers]
-    radius = max(2.0 * typical_spacing_m(points), 0.12 * sphere.radius_m)
+    radius = max(2.0 * compute_spacing_m(points), 0.12 * sphere.radius_m)
     surface = fit_local_surface(points, points, radius).facing(points - sphere.centre_m)
-    return mesh_of_cloud(surface.points_m, sphere.centre_m, surface.normals, surface.sigma_m)
+    return triangulate_cloud(surface.points_m, sphere.centre_m, surface.normals, surface.sigma_m)
 
 
-def _covered(mesh: SurfaceMesh, sphere: SphereFit) -> float:
+def _compute_coverage(mesh: SurfaceMesh, sphere: SphereFit) -> float:
     """Part of the full solid angle (van Oosterom and Strackee 1983)."""
     unit = mesh.vertices_m - sphere.centre_m
     unit = unit / np.linalg.norm(unit, axis=1)[:, None]

@@ -14,7 +14,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["AffineEpipolar", "epipolar_of", "robust_epipolar"]
+__all__ = ["AffineEpipolar", "epipolar_of", "fit_epipolar"]
 
 
 _LEAST_POINTS = 5
@@ -64,13 +64,13 @@ def epipolar_of(first: Array, second: Array) -> AffineEpipolar:
     """
     if len(first) < _LEAST_POINTS - 1:
         raise StructureError(f"{len(first)} points in two views", expected="at least 4")
-    normal, offset = _plane(np.hstack([second, first]))
+    normal, offset = _fit_plane(np.hstack([second, first]))
     distance = np.hstack([second, first]) @ normal + offset
     everything = np.ones(len(first), dtype=bool)
-    return AffineEpipolar(normal, offset, everything, _rms(distance))
+    return AffineEpipolar(normal, offset, everything, _compute_rms(distance))
 
 
-def robust_epipolar(
+def fit_epipolar(
     first: Array, second: Array, tolerance: float, *, trials: int = 200, seed: int = 0
 ) -> AffineEpipolar:
     """Epipolar geometry of pairs (n, 2) of which some are wrong (RANSAC, then refitted).
@@ -105,22 +105,22 @@ def robust_epipolar(
     for _ in range(10):
         if np.count_nonzero(inliers) < _LEAST_POINTS:
             break
-        normal, offset = _plane(joint[inliers])
+        normal, offset = _fit_plane(joint[inliers])
         distance = np.abs(joint @ normal + offset)
         sigma = mad_sigma(distance[inliers])
         better = distance <= min(tolerance, max(4.0 * sigma, 0.1 * tolerance))
         if np.array_equal(better, inliers):
             break
         inliers = better
-    return AffineEpipolar(normal, offset, inliers, _rms((joint @ normal + offset)[inliers]))
+    return AffineEpipolar(normal, offset, inliers, _compute_rms((joint @ normal + offset)[inliers]))
 
 
-def _plane(joint: Array) -> tuple[Array, float]:
+def _fit_plane(joint: Array) -> tuple[Array, float]:
     centre = joint.mean(axis=0)
     _, vectors = np.linalg.eigh((joint - centre).T @ (joint - centre))
     normal = np.asarray(vectors[:, 0], dtype=np.float64)
     return normal, -float(normal @ centre)
 
 
-def _rms(values: Array) -> float:
+def _compute_rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

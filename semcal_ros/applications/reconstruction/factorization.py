@@ -67,8 +67,8 @@ def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
     StructureError
         If no three views share 12 points that move against each other.
     """
-    start = _first_block(tracks)
-    state = _Growing(tracks, *start)
+    start = _choose_first_block(tracks)
+    state = _GrowingStructure(tracks, *start)
     state.grow()
     for _ in range(sweeps):
         state.place_points(~np.zeros(tracks.seen.shape[1], dtype=bool))
@@ -77,7 +77,7 @@ def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
     return state.result()
 
 
-def _first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
+def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
     """Views and points of the block with the most relief, and that relief over its noise."""
     best: tuple[float, Indices, Indices, float] | None = None
     n_views = len(tracks.seen)
@@ -87,7 +87,7 @@ def _first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
             points = np.flatnonzero(tracks.seen[views].all(axis=0))
             if len(points) < _LEAST_COMMON:
                 continue
-            table = _centred(tracks.xy_m[np.ix_(views, points)])
+            table = _centre_rows(tracks.xy_m[np.ix_(views, points)])
             values = np.linalg.svd(table, compute_uv=False)
             if len(values) < 4:
                 continue
@@ -106,13 +106,13 @@ def _first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
     return best[1], best[2], best[3]
 
 
-def _centred(block: Array) -> Array:
+def _centre_rows(block: Array) -> Array:
     """(2 views, points) tracks about the mean of each row."""
     table = np.moveaxis(block, 2, 1).reshape(-1, block.shape[1])
     return np.asarray(table - table.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
-class _Growing:
+class _GrowingStructure:
     """The structure while views and points are added to it."""
 
     def __init__(self, tracks: Tracks, views: Indices, points: Indices, relief: float) -> None:
@@ -125,7 +125,7 @@ class _Growing:
         self.points_in = np.zeros(n_points, dtype=bool)
         self.relief = relief
         block = self.xy[np.ix_(views, points)]
-        u, s, vt = np.linalg.svd(_centred(block), full_matrices=False)
+        u, s, vt = np.linalg.svd(_centre_rows(block), full_matrices=False)
         # Points of unit spread, cameras in metres: both sides of a good size for the alternation.
         root = np.sqrt(len(points))
         self.points[points] = vt[:3].T * root

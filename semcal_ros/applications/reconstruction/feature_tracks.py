@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from semcal_ros.applications.reconstruction.appearance import (
     Appearance,
-    appearance_of,
-    bytes_for_tracking,
+    convert_for_tracking,
+    prepare_appearance,
 )
-from semcal_ros.applications.reconstruction.epipolar import robust_epipolar
+from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
 from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["SequenceTracker", "TrackKeyframe", "TrackerSettings", "to_plane"]
+__all__ = ["SequenceTracker", "TrackKeyframe", "TrackerSettings", "project_to_plane"]
 
 
 _FEW = 30
@@ -104,12 +104,12 @@ class TrackKeyframe:
     velocity: Array
 
 
-def to_plane(camera: ScanCamera, raw: Array) -> Array:
+def project_to_plane(camera: ScanCamera, raw: Array) -> Array:
     """Sem-frame X, Y (n, 2) in m at height 0 of raw pixels (n, 2); NaN where there are none."""
     return camera.sem_from_ideal(camera.undistort(raw))[:, :2]
 
 
-def _from_plane(camera: ScanCamera, xy_m: Array) -> Array:
+def _project_from_plane(camera: ScanCamera, xy_m: Array) -> Array:
     return camera.project(np.column_stack([xy_m, np.zeros(len(xy_m))]))
 
 
@@ -168,7 +168,7 @@ class SequenceTracker:
                 expected="frames in the order of their times",
             )
         seen = self._looked_at(image, camera)
-        picture = bytes_for_tracking(seen)
+        picture = convert_for_tracking(seen)
         index, self.frames = self.frames, self.frames + 1
         previous_s, self._last_time_s = self._last_time_s, time_s
         reference = self._reference
@@ -178,9 +178,9 @@ class SequenceTracker:
             return True
         start = reference.latest_m
         raw, found = self._tracked(reference, picture, camera)
-        now_m = to_plane(camera, raw)
+        now_m = project_to_plane(camera, raw)
         found &= np.all(np.isfinite(now_m), axis=1)
-        motion = _affine_motion(start[found], now_m[found], time_s - previous_s)
+        motion = _fit_affine_motion(start[found], now_m[found], time_s - previous_s)
         if reference.after is None and index == reference.frame.index + 1:
             reference.after = motion
         reference.alive = found
@@ -214,7 +214,7 @@ class SequenceTracker:
     def _looked_at(self, image: NDArray[Any], camera: ScanCamera) -> Appearance:
         """The picture as it is compared; plain grey far from where features are expected, to save time."""
         box = self._expected(camera)
-        seen = appearance_of(image[box], smoothing_px=self.settings.smoothing_px)
+        seen = prepare_appearance(image[box], smoothing_px=self.settings.smoothing_px)
         if seen.smooth.shape == image.shape:
             return seen
         smooth, texture = np.zeros((2, *image.shape), dtype=np.float32)
@@ -227,8 +227,8 @@ class SequenceTracker:
         everything = (slice(0, camera.height), slice(0, camera.width))
         if reference is None or np.count_nonzero(reference.alive) < _FEW:
             return everything
-        raw = _from_plane(camera, reference.latest_m[reference.alive])
-        return _around(raw, camera, self.settings.room_px)[0]
+        raw = _project_from_plane(camera, reference.latest_m[reference.alive])
+        return _make_box(raw, camera, self.settings.room_px)[0]
 
     def _tracked(
         self, reference: _Reference, picture: NDArray[np.uint8], camera: ScanCamera
@@ -244,9 +244,9 @@ class SequenceTracker:
             "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
         }
         at = reference.frame.xy.astype(np.float32)
-        guess = np.nan_to_num(_from_plane(camera, reference.latest_m)).astype(np.float32)
+        guess = np.nan_to_num(_project_from_plane(camera, reference.latest_m)).astype(np.float32)
         # Pyramids of the part where all this happens only.
-        box, corner = _around(np.concatenate([at, guess]), camera, s.room_px)
+        box, corner = _make_box(np.concatenate([at, guess]), camera, s.room_px)
         first, second = (
             np.ascontiguousarray(reference.picture[box]),
             np.ascontiguousarray(picture[box]),
@@ -257,7 +257,7 @@ class SequenceTracker:
         raw = forward.astype(np.float64) + corner
         found = (ok.ravel() == 1) & (ok_back.ravel() == 1)
         found &= np.linalg.norm(back - at, axis=1) < s.backwards_px
-        found &= _inside(raw, camera, s.border_px)
+        found &= _find_inside(raw, camera, s.border_px)
         return raw, found
 
     def _is_new(self, reference: _Reference, found: Mask, now_m: Array, camera: ScanCamera) -> bool:
@@ -266,7 +266,9 @@ class SequenceTracker:
             return True
         if number < (1.0 - self.settings.lost_fraction) * total:
             return True
-        moved = (now_m - to_plane(reference.frame.camera, reference.frame.xy))[found] * camera.m
+        moved = (now_m - project_to_plane(reference.frame.camera, reference.frame.xy))[
+            found
+        ] * camera.m
         against = moved - np.median(moved, axis=0)
         return float(np.median(np.linalg.norm(against, axis=1))) > self.settings.parallax_px
 
@@ -277,9 +279,9 @@ class SequenceTracker:
         index = np.flatnonzero(found)
         if len(index) < 12:
             return found
-        before_m = to_plane(reference.frame.camera, reference.frame.xy[index])
+        before_m = project_to_plane(reference.frame.camera, reference.frame.xy[index])
         tolerance_m = self.settings.epipolar_px / camera.m
-        geometry = robust_epipolar(before_m, now_m[index], tolerance_m)
+        geometry = fit_epipolar(before_m, now_m[index], tolerance_m)
         good = np.zeros_like(found)
         good[index[geometry.inliers]] = True
         return good
@@ -325,7 +327,7 @@ class SequenceTracker:
         self._settle()
         frame = TrackKeyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
         self.keyframes.append(frame)
-        latest = to_plane(camera, xy)
+        latest = project_to_plane(camera, xy)
         self._reference = _Reference(
             picture, frame, latest, np.ones(len(ids), dtype=bool), motion, None
         )
@@ -341,7 +343,7 @@ class SequenceTracker:
             self.keyframes[-1] = replace(reference.frame, velocity=velocity)
 
 
-def _around(
+def _make_box(
     raw: NDArray[Any], camera: ScanCamera, room: int
 ) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
     """Rows and columns about raw pixels, and their first corner (x, y)."""
@@ -351,12 +353,12 @@ def _around(
     return (slice(low[1], high[1]), slice(low[0], high[0])), low.astype(np.float32)
 
 
-def _inside(raw: Array, camera: ScanCamera, border: int) -> Mask:
+def _find_inside(raw: Array, camera: ScanCamera, border: int) -> Mask:
     size = np.array([camera.width, camera.height]) - 1.0 - border
     return np.asarray(np.all((raw > border) & (raw < size), axis=1))
 
 
-def _affine_motion(before_m: Array, after_m: Array, seconds: float) -> Array | None:
+def _fit_affine_motion(before_m: Array, after_m: Array, seconds: float) -> Array | None:
     """(2, 3) affine velocity field of points (n, 2), m/s; None for too few of them."""
     if len(before_m) < 6 or not np.isfinite(seconds):
         return None

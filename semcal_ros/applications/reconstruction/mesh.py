@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["SurfaceMesh", "mesh_of_cloud"]
+__all__ = ["SurfaceMesh", "triangulate_cloud"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class SurfaceMesh:
         return self.boundary_edges == 0
 
 
-def mesh_of_cloud(
+def triangulate_cloud(
     points_m: Array,
     centre_m: Array,
     normals: Array,
@@ -86,8 +86,8 @@ def mesh_of_cloud(
     inward = np.sum(cross * (a + b + c), axis=1) < 0.0
     faces[inward] = faces[inward][:, [0, 2, 1]]
     spacing = float(np.median(cKDTree(directions).query(directions, k=2)[0][:, 1]))
-    keep = _circumradius(a, b, c) < 0.5 * largest_gap * spacing
-    faces = _largest_part(faces[keep], len(points_m))
+    keep = _compute_circumradius(a, b, c) < 0.5 * largest_gap * spacing
+    faces = _keep_largest_part(faces[keep], len(points_m))
     if not len(faces):
         raise StructureError("points that span no surface", expected="a denser cloud")
     used = np.unique(faces)
@@ -99,30 +99,30 @@ def mesh_of_cloud(
         renumbered[faces],
         outward[used],
         sigma_m[used],
-        _open_edges(faces),
+        _count_open_edges(faces),
     )
 
 
-def _circumradius(a: Array, b: Array, c: Array) -> Array:
+def _compute_circumradius(a: Array, b: Array, c: Array) -> Array:
     sides = [np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))]
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.asarray(sides[0] * sides[1] * sides[2] / (4.0 * np.maximum(area, 1e-300)))
 
 
-def _edges(faces: Indices) -> Indices:
+def _list_edges(faces: Indices) -> Indices:
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return np.sort(pairs, axis=1)
 
 
-def _open_edges(faces: Indices) -> int:
-    _, counts = np.unique(_edges(faces), axis=0, return_counts=True)
+def _count_open_edges(faces: Indices) -> int:
+    _, counts = np.unique(_list_edges(faces), axis=0, return_counts=True)
     return int(np.count_nonzero(counts == 1))
 
 
-def _largest_part(faces: Indices, points: int) -> Indices:
+def _keep_largest_part(faces: Indices, points: int) -> Indices:
     """The triangles that hang together by edges, of the largest such part."""
 
-    edges = _edges(faces)
+    edges = _list_edges(faces)
     order = np.lexsort(edges.T[::-1])
     same = np.all(edges[order][1:] == edges[order][:-1], axis=1)
     owner = np.tile(np.arange(len(faces)), 3)[order]

@@ -7,7 +7,7 @@ whatever the number of views:
 
 - the *bas-relief* direction is weak when the views differ by small rotations; :attr:`MetricUpgrade.condition`
   tells;
-- the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well: :func:`mirrored`.
+- the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well: :func:`mirror_structure`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from semcal_ros.applications.reconstruction.factorization import AffineStructure
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["MetricUpgrade", "mirrored", "upgrade_to_metric"]
+__all__ = ["MetricUpgrade", "mirror_structure", "upgrade_to_metric"]
 
 
 _MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -75,7 +75,7 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
     scaled = cameras @ spread
     unit = float(np.sqrt(np.mean(scaled**2)))
     scaled = scaled / unit
-    rows, right = _equations(scaled, 1.0 / unit**2)
+    rows, right = _form_equations(scaled, 1.0 / unit**2)
     solution, _, rank, values = np.linalg.lstsq(rows, right, rcond=None)
     condition = float(values[-1] / values[0])
     if rank < 6 or condition < 1e-7:
@@ -88,29 +88,29 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
         q[i, j] = q[j, i] = value
     smallest = float(np.linalg.eigvalsh(q)[0])
     positive = smallest > 0.0
-    root = np.asarray(np.linalg.cholesky(_positive(q)), dtype=np.float64)
-    root = _descended(scaled, root, 1.0 / unit)
+    root = np.asarray(np.linalg.cholesky(_make_positive(q)), dtype=np.float64)
+    root = _refine_root(scaled, root, 1.0 / unit)
     metric = scaled @ root * unit
     points = affine.points @ np.linalg.inv(spread @ root).T
     rotations = np.broadcast_to(np.eye(3), (len(placed), 3, 3)).copy()
-    rotations[placed] = _rotations(metric)
+    rotations[placed] = _find_nearest_rotations(metric)
     error = metric @ np.swapaxes(metric, 1, 2) - np.eye(2)
     translations = np.zeros((len(placed), 3))
     translations[:, :2] = affine.offsets_m
     return MetricUpgrade(
-        *_about_first(rotations, translations, points, placed),
+        *_turn_to_middle_view(rotations, translations, points, placed),
         condition,
         float(np.sqrt(np.mean(error**2))),
         positive,
     )
 
 
-def mirrored(rotations: Array, points_m: Array) -> tuple[Array, Array]:
+def mirror_structure(rotations: Array, points_m: Array) -> tuple[Array, Array]:
     """The other structure with the same parallel projections: (views, 3, 3) and (points, 3)."""
     return _MIRROR @ rotations @ _MIRROR, points_m @ _MIRROR
 
 
-def _equations(cameras: Array, size: float) -> tuple[Array, Array]:
+def _form_equations(cameras: Array, size: float) -> tuple[Array, Array]:
     """Rows and right side of ``M Q M^T = size * I`` in the six entries of Q."""
     i, j = cameras[:, 0], cameras[:, 1]
 
@@ -123,13 +123,13 @@ def _equations(cameras: Array, size: float) -> tuple[Array, Array]:
     return rows, np.concatenate([ones, ones, 0.0 * ones]) * size
 
 
-def _positive(q: Array) -> Array:
+def _make_positive(q: Array) -> Array:
     values, vectors = np.linalg.eigh(q)
     values = np.maximum(values, 1e-3 * values[-1])
     return np.asarray((vectors * values) @ vectors.T, dtype=np.float64)
 
 
-def _descended(cameras: Array, root: Array, size: float) -> Array:
+def _refine_root(cameras: Array, root: Array, size: float) -> Array:
     """The root of Q that makes the rows orthonormal in the sense of least squares."""
     lower = np.tril_indices(3)
 
@@ -146,14 +146,14 @@ def _descended(cameras: Array, root: Array, size: float) -> Array:
     return out
 
 
-def _rotations(rows: Array) -> Array:
+def _find_nearest_rotations(rows: Array) -> Array:
     """Nearest rotations (n, 3, 3) of camera rows (n, 2, 3)."""
     u, _, vt = np.linalg.svd(rows, full_matrices=False)
     two = u @ vt
     return np.concatenate([two, np.cross(two[:, 0], two[:, 1])[:, None]], axis=1)
 
 
-def _about_first(
+def _turn_to_middle_view(
     rotations: Array, translations: Array, points: Array, placed: Mask
 ) -> tuple[Array, Array, Array]:
     """The same structure with the axes of the middle placed view, so that its depth is the depth."""

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["LocalSurface", "fit_local_surface", "typical_spacing_m"]
+__all__ = ["LocalSurface", "compute_spacing_m", "fit_local_surface"]
 
 
 _NEIGHBOURS = 48
@@ -52,7 +52,7 @@ class LocalSurface:
         )
 
 
-def typical_spacing_m(points_m: Array) -> float:
+def compute_spacing_m(points_m: Array) -> float:
     """Median distance of a point from its nearest neighbour, m."""
     return float(np.median(cKDTree(points_m).query(points_m, k=2)[0][:, 1]))
 
@@ -83,13 +83,13 @@ def fit_local_surface(
         raise StructureError(f"a cloud of {len(cloud_m)} points", expected=f"at least {_LEAST}")
     tree = cKDTree(cloud_m)
     at = np.array(at_m, dtype=np.float64)
-    surface = _fitted(cloud_m, tree, at, radius_m)
+    surface = _fit_quadrics(cloud_m, tree, at, radius_m)
     for _ in range(steps - 1):
-        surface = _fitted(cloud_m, tree, surface.points_m, radius_m)
+        surface = _fit_quadrics(cloud_m, tree, surface.points_m, radius_m)
     return surface
 
 
-def _fitted(cloud: Array, tree: cKDTree, at: Array, radius: float) -> LocalSurface:
+def _fit_quadrics(cloud: Array, tree: cKDTree, at: Array, radius: float) -> LocalSurface:
     count = min(_NEIGHBOURS, len(cloud))
     distance, index = tree.query(at, k=count)
     wide = np.maximum(radius, distance[:, min(_LEAST, count) - 1])[:, None]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.applications.reconstruction.appearance import Appearance
-from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, to_plane
+from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -23,14 +23,16 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 __all__ = [
     "WINDOW",
     "PatchSettings",
-    "Posed",
-    "displacement_m",
+    "PosedSurface",
+    "compute_displacement_m",
     "measure_patches",
-    "plane_at_centre",
+    "project_to_plane_at_centre",
 ]
 
 
-def displacement_m(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array, xy_m: Array) -> Array:
+def compute_displacement_m(
+    frame: TrackKeyframe, scan: ScanTiming | None, raw: Array, xy_m: Array
+) -> Array:
     """How far (n, 2) in m the specimen has moved since the centre of the acquisition when raw pixels
     (n, 2) are seen that show the places ``xy_m`` (n, 2) of the sem frame.
     """
@@ -42,10 +44,10 @@ def displacement_m(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array, xy
     return np.asarray(velocity * offset[:, None], dtype=np.float64)
 
 
-def plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array) -> Array:
+def project_to_plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array) -> Array:
     """Sem-frame X, Y (n, 2) in m of raw pixels (n, 2), as they were at the centre of the acquisition."""
-    seen = to_plane(frame.camera, raw)
-    return seen - displacement_m(frame, scan, raw, seen)
+    seen = project_to_plane(frame.camera, raw)
+    return seen - compute_displacement_m(frame, scan, raw, seen)
 
 
 WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
@@ -82,7 +84,7 @@ class PatchSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosedSurface:
     """What is known about the structure when patches are cut out.
 
     Attributes
@@ -115,13 +117,16 @@ def measure_patches(
     frames: Sequence[TrackKeyframe],
     looks: Sequence[Appearance],
     scan: ScanTiming | None,
-    posed: Posed,
+    posed: PosedSurface,
     settings: PatchSettings,
 ) -> Observations:
     """Observations of every point in every view that faces it and agrees with the template."""
     size_m = float(np.mean([np.mean(f.camera.pixel_size_m) for f in frames]))
-    grid = _grid(settings.half_px)
-    cuts = [_cut(view, frame, scan, posed, size_m, settings) for view, frame in enumerate(frames)]
+    grid = _make_patch_grid(settings.half_px)
+    cuts = [
+        _cut_patches(view, frame, scan, posed, size_m, settings)
+        for view, frame in enumerate(frames)
+    ]
     shape = (len(frames), len(posed.points_m))
     shift = np.zeros((*shape, 2))
     seen = np.zeros(shape, dtype=bool)
@@ -131,35 +136,37 @@ def measure_patches(
     for _ in range(settings.rounds):
         patches = np.zeros((*shape, len(grid)), dtype=np.float32)
         for view, cut in enumerate(cuts):
-            patches[view, cut.points] = _sampled(
+            patches[view, cut.points] = _sample_patches(
                 looks[view].texture, cut, shift[view, cut.points], grid
             )
-        found = _matched(patches, seen, settings.half_px)
+        found = _match_patches(patches, seen, settings.half_px)
         shift += np.where(seen[..., None], np.clip(found.shift, -1.0, 1.0), 0.0)
     assert found is not None
     good = seen & (found.correlation >= settings.least_correlation)
     good &= np.linalg.norm(shift, axis=2) <= settings.largest_shift_px
     good &= np.linalg.norm(found.shift, axis=2) < 0.7
-    return _observed(frames, scan, cuts, shift, found.covariance, good, settings.floor_px)
+    return _collect_observations(
+        frames, scan, cuts, shift, found.covariance, good, settings.floor_px
+    )
 
 
-def _grid(half: int) -> Array:
+def _make_patch_grid(half: int) -> Array:
     v, u = np.mgrid[-half : half + 1, -half : half + 1]
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
 
 
-def _tangents(normals: Array) -> tuple[Array, Array]:
+def _choose_tangents(normals: Array) -> tuple[Array, Array]:
     axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     first = np.cross(normals, axis)
     first /= np.linalg.norm(first, axis=1)[:, None]
     return first, np.cross(normals, first)
 
 
-def _cut(
+def _cut_patches(
     view: int,
     frame: TrackKeyframe,
     scan: ScanTiming | None,
-    posed: Posed,
+    posed: PosedSurface,
     size_m: float,
     settings: PatchSettings,
 ) -> _Cut:
@@ -167,7 +174,7 @@ def _cut(
     towards_gun = -(posed.normals @ rotation[2])
     points = np.flatnonzero(towards_gun > np.cos(settings.steepest_rad))
     at, normal = posed.points_m[points], posed.normals[points]
-    first, second = _tangents(normal)
+    first, second = _choose_tangents(normal)
     step = settings.half_px * size_m
     places = np.concatenate(
         [at, at + step * first, at - step * first, at + step * second, at - step * second]
@@ -175,7 +182,7 @@ def _cut(
     )
     sem = places @ rotation.T + translation
     raw = frame.camera.project(sem)
-    sem[:, :2] += displacement_m(frame, scan, np.nan_to_num(raw), sem[:, :2])
+    sem[:, :2] += compute_displacement_m(frame, scan, np.nan_to_num(raw), sem[:, :2])
     raw = frame.camera.project(sem).reshape(7, -1, 2)
     span = 2.0 * settings.half_px
     by_patch = np.stack([(raw[1] - raw[2]) / span, (raw[3] - raw[4]) / span], axis=2)
@@ -189,7 +196,7 @@ def _cut(
     return _Cut(points, np.nan_to_num(raw[0]), by_patch, bend, inside)
 
 
-def _sampled(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
+def _sample_patches(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
     """(n, grid) patches of unit spread about zero."""
     if not len(cut.points):
         return np.zeros((0, len(grid)), dtype=np.float32)
@@ -211,11 +218,11 @@ class _Matched:
     correlation: Array
 
 
-def _matched(patches: Image, seen: Mask, half: int) -> _Matched:
+def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
     """Shift of every patch (views, points) against the mean of the others, in patch px."""
     views, points, _size = patches.shape
     side = 2 * half + 1
-    window = np.exp(-0.5 * np.sum(_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
+    window = np.exp(-0.5 * np.sum(_make_patch_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
     shift = np.zeros((views, points, 2))
     covariance = np.tile(np.eye(2), (views, points, 1, 1))
     correlation = np.zeros((views, points))
@@ -224,7 +231,7 @@ def _matched(patches: Image, seen: Mask, half: int) -> _Matched:
         if len(at) < 3:
             continue
         stack = patches[at, point].astype(np.float64)
-        template = _template(stack)
+        template = _average_template(stack)
         others = (template[None] * len(at) - stack) / (len(at) - 1)
         picture = template.reshape(side, side)
         slope_v, slope_u = np.gradient(picture)
@@ -246,7 +253,7 @@ def _matched(patches: Image, seen: Mask, half: int) -> _Matched:
     return _Matched(shift, covariance, correlation)
 
 
-def _template(stack: Array) -> Array:
+def _average_template(stack: Array) -> Array:
     """Mean of patches (views, size), those that disagree with most others left out."""
     mean = stack.mean(axis=0)
     for _ in range(2):
@@ -256,7 +263,7 @@ def _template(stack: Array) -> Array:
     return np.asarray(mean, dtype=np.float64)
 
 
-def _observed(
+def _collect_observations(
     frames: Sequence[TrackKeyframe],
     scan: ScanTiming | None,
     cuts: Sequence[_Cut],
@@ -270,7 +277,7 @@ def _observed(
         use = good[view, cut.points]
         index = cut.points[use]
         raw = cut.centres[use] + np.einsum("nij,nj->ni", cut.by_patch[use], shift[view, index])
-        plane = plane_at_centre(frame, scan, raw)
+        plane = project_to_plane_at_centre(frame, scan, raw)
         known = np.all(np.isfinite(plane), axis=1)
         ideal = frame.camera.project_ideal(
             np.column_stack([plane[known], np.zeros(np.count_nonzero(known))])

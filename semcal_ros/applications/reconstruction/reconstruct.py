@@ -10,20 +10,23 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
-from semcal_ros.applications.reconstruction.appearance import Appearance, appearance_of
+from semcal_ros.applications.reconstruction.appearance import Appearance, prepare_appearance
 from semcal_ros.applications.reconstruction.factorization import factorize
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
-from semcal_ros.applications.reconstruction.metric_upgrade import mirrored, upgrade_to_metric
+from semcal_ros.applications.reconstruction.metric_upgrade import (
+    mirror_structure,
+    upgrade_to_metric,
+)
 from semcal_ros.applications.reconstruction.moving_least_squares import (
+    compute_spacing_m,
     fit_local_surface,
-    typical_spacing_m,
 )
 from semcal_ros.applications.reconstruction.patches import (
     WINDOW,
     PatchSettings,
-    Posed,
+    PosedSurface,
     measure_patches,
-    plane_at_centre,
+    project_to_plane_at_centre,
 )
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask
@@ -31,7 +34,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["Structure", "StructureSettings", "mirror_of", "reconstruct", "tracks_of"]
+__all__ = ["Structure", "StructureSettings", "collect_tracks", "mirror_poses", "reconstruct"]
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,7 @@ def reconstruct(
     """
     chosen = settings or StructureSettings()
     on_step("factorizing")
-    tracks = tracks_of(keyframes, scan, chosen.least_track)
+    tracks = collect_tracks(keyframes, scan, chosen.least_track)
     affine = factorize(tracks)
     metric = upgrade_to_metric(affine)
     views = np.flatnonzero(affine.views_placed)
@@ -170,7 +173,7 @@ def reconstruct(
         tracks.xy_m[np.ix_(views, points)].copy(), tracks.seen[np.ix_(views, points)].copy()
     )
     cameras = tuple(keyframes[int(v)].camera for v in views)
-    work = _Work(
+    work = _Refinement(
         [keyframes[int(v)] for v in views],
         cameras,
         scan,
@@ -183,7 +186,8 @@ def reconstruct(
     on_step("adjusting")
     work.first()
     work.looks = [
-        appearance_of(frame.image, smoothing_px=chosen.smoothing_px) for frame in work.keyframes
+        prepare_appearance(frame.image, smoothing_px=chosen.smoothing_px)
+        for frame in work.keyframes
     ]
     while not work.settled and work.passes < chosen.most_passes:
         on_step(f"measuring, pass {work.passes + 1}")
@@ -192,7 +196,7 @@ def reconstruct(
     return work.structure(len(keyframes), tracks.seen.shape[1], metric.condition)
 
 
-def tracks_of(
+def collect_tracks(
     keyframes: Sequence[TrackKeyframe], scan: ScanTiming | None, least: int = 3
 ) -> Tracks:
     """Tracks through keyframes, in the plane of the specimen, those of at least ``least`` views."""
@@ -207,22 +211,22 @@ def tracks_of(
     seen = np.zeros((len(keyframes), len(names)), dtype=bool)
     for view, frame in enumerate(keyframes):
         known = np.isin(frame.ids, names)
-        plane = plane_at_centre(frame, scan, frame.xy[known])
+        plane = project_to_plane_at_centre(frame, scan, frame.xy[known])
         finite = np.all(np.isfinite(plane), axis=1)
         column = np.searchsorted(names, frame.ids[known][finite])
         xy[view, column], seen[view, column] = plane[finite], True
     return Tracks(xy, seen)
 
 
-def mirror_of(
+def mirror_poses(
     rotations: Array, translations_m: Array, points_m: Array
 ) -> tuple[Array, Array, Array]:
     """The structure that parallel projection cannot tell from the given one."""
-    turned, points = mirrored(rotations, points_m)
+    turned, points = mirror_structure(rotations, points_m)
     return turned, translations_m * np.array([1.0, 1.0, -1.0]), points
 
 
-class _Work:
+class _Refinement:
     """The structure while it is refined; views and points that fail are dropped on the way."""
 
     def __init__(
@@ -257,7 +261,7 @@ class _Work:
         self._merge()
         _normals, curvature = self._surface(wide=True)
         if np.count_nonzero(curvature > 0.0) < 0.5 * len(curvature):
-            self.rotations, self.translations, self.points = mirror_of(
+            self.rotations, self.translations, self.points = mirror_poses(
                 self.rotations, self.translations, self.points
             )
 
@@ -265,7 +269,7 @@ class _Work:
         """Measure all patches against their templates, and adjust."""
         ids, before = self.ids, self.points
         normals, curvature = self._surface()
-        posed = Posed(self.rotations, self.translations, self.points, normals, curvature)
+        posed = PosedSurface(self.rotations, self.translations, self.points, normals, curvature)
         self.seen = measure_patches(
             self.keyframes, self.looks, self.scan, posed, self.settings.patches
         )
@@ -356,7 +360,7 @@ class _Work:
     def _surface(self, *, wide: bool = False) -> tuple[Array, Array]:
         """Normals towards the gun and the mean curvature about them."""
         spread = float(np.sqrt(np.mean(np.var(self.points, axis=0))))
-        radius = 0.5 * spread if wide else max(3.0 * typical_spacing_m(self.points), 0.2 * spread)
+        radius = 0.5 * spread if wide else max(3.0 * compute_spacing_m(self.points), 0.2 * spread)
         surface = fit_local_surface(self.points, self.points, radius, steps=1)
         towards = np.zeros((len(self.points), 3))
         np.add.at(towards, self.seen.point, -self.rotations[self.seen.view, 2])
@@ -374,7 +378,7 @@ class _Work:
         other = adjust(
             self.seen,
             self.cameras,
-            *mirror_of(done.rotations, done.translations_m, done.points_m),
+            *mirror_poses(done.rotations, done.translations_m, done.points_m),
             reference=done.reference,
             height_sigma_m=self.settings.height_sigma_m,
             max_iterations=8,

@@ -81,12 +81,12 @@ def fit_sphere(
     middle = np.median(points_m, axis=0)
     unit = float(np.median(np.linalg.norm(points_m - middle, axis=1)))
     points = (points_m - middle) / unit
-    weight = np.ones(len(points)) if sigma_m is None else _weights(sigma_m)
-    centre, radius, inliers = _searched(points, tolerance, seed)
+    weight = np.ones(len(points)) if sigma_m is None else _compute_weights(sigma_m)
+    centre, radius, inliers = _search_sphere(points, tolerance, seed)
     converged, iterations = False, 0
     for _ in range(60):
         iterations += 1
-        step = _step(points[inliers], weight[inliers], centre, radius)
+        step = _solve_step(points[inliers], weight[inliers], centre, radius)
         centre, radius = centre + step[:3], radius + float(step[3])
         distance = np.linalg.norm(points - centre, axis=1) - radius
         sigma = mad_sigma(distance[inliers])
@@ -101,16 +101,18 @@ def fit_sphere(
         if same and float(np.abs(step).max()) < 1e-10:
             converged = True
             break
-    return _result(points, weight, centre, radius, inliers, middle, unit, iterations, converged)
+    return _make_result(
+        points, weight, centre, radius, inliers, middle, unit, iterations, converged
+    )
 
 
-def _weights(sigma: Array) -> Array:
+def _compute_weights(sigma: Array) -> Array:
     """Relative weights, bounded: a few points shall not decide alone."""
     bounded = np.clip(sigma, 0.5 * np.median(sigma), None)
     return np.asarray((np.median(bounded) / bounded) ** 2, dtype=np.float64)
 
 
-def _searched(points: Array, tolerance: float, seed: int) -> tuple[Array, float, Mask]:
+def _search_sphere(points: Array, tolerance: float, seed: int) -> tuple[Array, float, Mask]:
     """Centre, radius and inliers of the sphere through four points that most others agree with."""
     rng = np.random.default_rng(seed)
     samples = np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :4]
@@ -133,20 +135,20 @@ def _searched(points: Array, tolerance: float, seed: int) -> tuple[Array, float,
     return centres[best], float(radii[best]), np.abs(distance[best]) <= tolerance
 
 
-def _design(points: Array, centre: Array) -> tuple[Array, Array]:
+def _form_design(points: Array, centre: Array) -> tuple[Array, Array]:
     offset = points - centre
     distance = np.linalg.norm(offset, axis=1)
     outward = offset / distance[:, None]
     return np.column_stack([outward, np.ones(len(points))]), distance
 
 
-def _step(points: Array, weight: Array, centre: Array, radius: float) -> Array:
-    design, distance = _design(points, centre)
+def _solve_step(points: Array, weight: Array, centre: Array, radius: float) -> Array:
+    design, distance = _form_design(points, centre)
     weighted = design * weight[:, None]
     return np.asarray(np.linalg.solve(weighted.T @ design, weighted.T @ (distance - radius)))
 
 
-def _result(
+def _make_result(
     points: Array,
     weight: Array,
     centre: Array,
@@ -157,7 +159,7 @@ def _result(
     iterations: int,
     converged: bool,
 ) -> SphereFit:
-    design, distance = _design(points, centre)
+    design, distance = _form_design(points, centre)
     weight = np.where(inliers, weight, 0.0)
     inverse = np.linalg.inv((design * weight[:, None]).T @ design)
     residuals = distance - radius

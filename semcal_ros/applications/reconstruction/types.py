@@ -11,7 +11,7 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Observations", "Tracks", "camera_table"]
+__all__ = ["Observations", "Tracks", "tabulate_cameras"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Observations:
     ) -> Observations:
         """All that is seen in tracks, with one standard deviation."""
         view, point = np.nonzero(tracks.seen)
-        table = camera_table(cameras)[view]
+        table = tabulate_cameras(cameras)[view]
         x, y = tracks.xy_m[view, point].T
         m, a, skew, px, py = table[:, :5].T
         xy = np.stack([px + m * (a * x + skew * y), py + m * y / a], axis=1)
@@ -82,6 +82,6 @@ class Observations:
         return Observations(view, point, xy, np.array(root))
 
 
-def camera_table(cameras: Sequence[ScanCamera]) -> Array:
+def tabulate_cameras(cameras: Sequence[ScanCamera]) -> Array:
     """(views, 6) m, aspect, skew, px, py, rho."""
     return np.array([camera.parameters[:6] for camera in cameras]).reshape(-1, 6)

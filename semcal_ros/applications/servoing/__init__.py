@@ -6,8 +6,13 @@ from semcal_ros.applications.servoing.axis import AxisObserver
 from semcal_ros.applications.servoing.detection import TargetView, find_target
 from semcal_ros.applications.servoing.law import Servo, ServoStep
 from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
-from semcal_ros.applications.servoing.plane_camera import PlaneCamera, projection_of_frame
-from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
+from semcal_ros.applications.servoing.plane_camera import PlaneCamera, choose_projection
+from semcal_ros.applications.servoing.pose import (
+    PlanePose,
+    PoseFit,
+    compute_interaction_matrix,
+    fit_pose,
+)
 from semcal_ros.applications.servoing.settings import ServoSettings
 from semcal_ros.applications.servoing.target import NestedTarget
 
@@ -23,8 +28,8 @@ __all__ = [
     "ServoSettings",
     "ServoStep",
     "TargetView",
+    "choose_projection",
+    "compute_interaction_matrix",
     "find_target",
     "fit_pose",
-    "interaction_matrix",
-    "projection_of_frame",
 ]

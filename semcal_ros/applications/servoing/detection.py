@@ -89,24 +89,24 @@ def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
     grey = check_image(image, channels=(1,), least_side=32)
     picture = np.ascontiguousarray(grey, dtype=np.float32)
     if not np.all(np.isfinite(picture)):
-        return _none("image: holds values that are not finite")
+        return _reject("image: holds values that are not finite")
     factor = -(-max(picture.shape) // _SEARCHED_PX)
-    stretched = _stretched(picture, factor)
+    stretched = _stretch(picture, factor)
     if stretched is None:
-        return _none("image: blank")
-    ids, corners = _searched(stretched, factor, target)
+        return _reject("image: blank")
+    ids, corners = _search_markers(stretched, factor, target)
     if len(ids) == 0:
-        return _none("no marker of the target in view")
+        return _reject("no marker of the target in view")
     refined = refine_quads(picture, corners)
     if not np.any(refined.good):
-        return _none("no marker of the target with four straight sides")
+        return _reject("no marker of the target with four straight sides")
     good = refined.good
     return TargetView(
         ids[good], target.corners_m(ids[good]), refined.xy[good], refined.covariance_px2[good]
     )
 
 
-def _none(reason: str) -> TargetView:
+def _reject(reason: str) -> TargetView:
     return TargetView(
         np.empty(0, np.int64),
         np.empty((0, 4, 2)),
@@ -116,7 +116,7 @@ def _none(reason: str) -> TargetView:
     )
 
 
-def _stretched(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
+def _stretch(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
     """8 bits for the search, and less noise; None where there is nothing to see."""
     small = picture
     if factor > 1:
@@ -136,7 +136,7 @@ def _stretched(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] |
 
 
 @lru_cache(maxsize=1)
-def _detector() -> cv2.aruco.ArucoDetector:
+def _create_detector() -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     # A code with a wrong bit is that of another marker as likely as not.
     parameters.errorCorrectionRate = 0.0
@@ -147,11 +147,11 @@ def _detector() -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(dictionary(), parameters)
 
 
-def _searched(
+def _search_markers(
     picture: NDArray[np.uint8], factor: int, target: NestedTarget
 ) -> tuple[NDArray[np.int64], Array]:
     """Numbers (n,) and rough corners (n, 4, 2), in px of the whole image, of what can be read."""
-    found, numbers, _ = _detector().detectMarkers(picture)
+    found, numbers, _ = _create_detector().detectMarkers(picture)
     if numbers is None or len(found) == 0:
         return np.empty(0, np.int64), np.empty((0, 4, 2))
     ids = np.asarray(numbers, dtype=np.int64).reshape(-1)

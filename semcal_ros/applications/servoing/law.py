@@ -21,7 +21,12 @@ from semcal_ros.applications.servoing.motion import (
     StageMonitor,
 )
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
-from semcal_ros.applications.servoing.pose import PlanePose, PoseFit, fit_pose, interaction_matrix
+from semcal_ros.applications.servoing.pose import (
+    PlanePose,
+    PoseFit,
+    compute_interaction_matrix,
+    fit_pose,
+)
 from semcal_ros.applications.servoing.settings import ServoSettings
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
@@ -95,7 +100,7 @@ class ServoStep:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _PosedFrame:
     """The latest frame with a pose; the camera is that which came with it."""
 
     pose: PlanePose
@@ -137,7 +142,7 @@ class Servo:
         """Forget what was seen and commanded, and a fault; not where the axis is."""
         self.history = CommandHistory()
         self.fault = ""
-        self._last: _Seen | None = None
+        self._last: _PosedFrame | None = None
         self._near = 0
         self._watch = StageMonitor()
         self._observer = DisturbanceObserver(
@@ -195,13 +200,13 @@ class Servo:
             return self.stopped(self.fault)
         shift = np.asarray(shift_m, dtype=np.float64)
         corrected = self._axis_observer.corrected(camera)
-        fit = fit_pose(_shifted(view, corrected, shift), corrected)
+        fit = fit_pose(_shift_view(view, corrected, shift), corrected)
         refusal = self._refusal(fit, corrected)
         if refusal:
             return self.stopped(refusal, fit)
         if self._learnt_axis(fit, camera, time_s):
             corrected = self._axis_observer.corrected(camera)
-            fit = fit_pose(_shifted(view, corrected, shift), corrected)
+            fit = fit_pose(_shift_view(view, corrected, shift), corrected)
         self._learn(fit, camera, time_s)
         if self.fault:
             return self.stopped(self.fault, fit)
@@ -213,7 +218,7 @@ class Servo:
             return fit.reason
         if abs(fit.scale - 1.0) > limits.scale_tolerance + 3.0 * fit.scale_sigma:
             return f"the target is {fit.scale:.3f} times as large as the camera of the frame says"
-        sigma_px = _origin_sigma(fit, camera)[1]
+        sigma_px = _compute_origin_sigma(fit, camera)[1]
         if not sigma_px <= limits.max_sigma_px:
             return f"the pose of the target is only known to {sigma_px:.2g} px"
         return ""
@@ -229,7 +234,9 @@ class Servo:
         way[:2] += np.array([(c - 1.0) * arm[0] - s * arm[1], s * arm[0] + (c - 1.0) * arm[1]])
         return way
 
-    def _expected(self, fit: PoseFit, before: _Seen, time_s: float) -> tuple[Array, Array, Array]:
+    def _expected(
+        self, fit: PoseFit, before: _PosedFrame, time_s: float
+    ) -> tuple[Array, Array, Array]:
         """Way (2,) of the target since the frame before as commanded and as seen; variance (2,) of the difference."""
         way = self._way(before.time_s, time_s, before.pose)
         seen = fit.pose.minus(before.pose)
@@ -256,7 +263,7 @@ class Servo:
     def _learn(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> None:
         """Compare with the frame before: drift, and whether the stage does what it is told."""
         before = self._last
-        self._last = _Seen(fit.pose, fit.covariance, camera, time_s)
+        self._last = _PosedFrame(fit.pose, fit.covariance, camera, time_s)
         # Two cameras do not agree on a place to the noise of a picture; that is no drift.
         if before is None or not camera.is_same(before.camera) or time_s <= before.time_s:
             return
@@ -289,7 +296,7 @@ class Servo:
         twist = -gain_hz * self._correction(fit, camera, ahead)
         twist[:2] -= drift
         twist, limited = self._limited(twist, fit, camera, interval_s)
-        sigma_m, sigma_px = _origin_sigma(fit, camera)
+        sigma_m, sigma_px = _compute_origin_sigma(fit, camera)
         error = fit.pose.minus(self.goal)
         own = fit.view.target_xy_m.reshape(-1, 2)
         away = camera.project(fit.pose.apply(own)) - camera.project(self.goal.apply(own))
@@ -320,8 +327,8 @@ class Servo:
         seen = fit.view.xy.reshape(-1, 2) - camera.project(fit.pose.apply(own))
         features = camera.project(ahead.apply(own)) + seen
         wanted = camera.project(self.goal.apply(own))
-        here = interaction_matrix(camera, features, self._axis(ahead))
-        there = interaction_matrix(camera, wanted, self._axis(self.goal))
+        here = compute_interaction_matrix(camera, features, self._axis(ahead))
+        there = compute_interaction_matrix(camera, wanted, self._axis(self.goal))
         # The mean of both ends is right to the second order (Chaumette and Hutchinson 2006).
         slope = 0.5 * (here + there)
         whitening = np.linalg.inv(np.linalg.cholesky(fit.view.covariance_px2 + 1e-8 * np.eye(8)))
@@ -341,7 +348,9 @@ class Servo:
         """The twist, slower but in the same direction where it is too fast."""
         limits = self.settings
         pixels = fit.view.xy.reshape(-1, 2)
-        moved = interaction_matrix(camera, pixels, self._axis(fit.pose)) @ twist * interval_s
+        moved = (
+            compute_interaction_matrix(camera, pixels, self._axis(fit.pose)) @ twist * interval_s
+        )
         travel_px = float(np.sqrt(np.sum(moved.reshape(-1, 2) ** 2, axis=1)).max())
         shares = {
             "speed": limits.speed_limit_m_s / max(float(np.hypot(twist[0], twist[1])), 1e-30),
@@ -354,7 +363,7 @@ class Servo:
         return twist * shares[name], name
 
 
-def _shifted(view: TargetView, camera: PlaneCamera, shift_m: Array) -> TargetView:
+def _shift_view(view: TargetView, camera: PlaneCamera, shift_m: Array) -> TargetView:
     if shift_m.shape != (2,) or not np.all(np.isfinite(shift_m)):
         raise InvalidValueError(f"a shift {shift_m.tolist()}", expected="two finite numbers")
     if not view.accepted or not np.any(shift_m):
@@ -363,7 +372,7 @@ def _shifted(view: TargetView, camera: PlaneCamera, shift_m: Array) -> TargetVie
     return view.moved(moved.reshape(view.xy.shape))
 
 
-def _origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:
+def _compute_origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:
     """1-sigma of the target's origin in the worst direction, m and px."""
     block = fit.covariance[:2, :2]
     slope = camera.jacobian(fit.pose.values[None, :2])[0]

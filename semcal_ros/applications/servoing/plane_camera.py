@@ -12,7 +12,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlaneCamera", "projection_of_frame"]
+__all__ = ["PlaneCamera", "choose_projection"]
 
 
 # Two matrices that were computed from the same numbers, one of them divided by rho and multiplied by it again.
@@ -91,7 +91,7 @@ class PlaneCamera:
         )
 
 
-def projection_of_frame(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
+def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
     """P_g (3, 4) of a frame, from its own K and those P_g that were published lately.
 
     K belongs to the frame, by its stamp, but holds f = m / rho only: without the distance 1 / rho of the pivot

@@ -14,7 +14,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlanePose", "PoseFit", "fit_pose", "interaction_matrix"]
+__all__ = ["PlanePose", "PoseFit", "compute_interaction_matrix", "fit_pose"]
 
 
 _MOST_STEPS = 12
@@ -119,30 +119,30 @@ def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
         Camera of this image.
     """
     if not view.accepted:
-        return _refused(view, view.reason)
+        return _reject(view, view.reason)
     kept, scale = view, 1.0
     start = PlanePose(0.0, 0.0)
     while True:
-        start, scale = _similarity(kept, camera)
-        misfit = np.linalg.norm(_residual(kept, camera, start, scale), axis=2).max(axis=1)
+        start, scale = _fit_similarity(kept, camera)
+        misfit = np.linalg.norm(_compute_residual(kept, camera, start, scale), axis=2).max(axis=1)
         sides = np.linalg.norm(np.roll(kept.xy, -1, axis=1) - kept.xy, axis=2).mean(axis=1)
         excess = misfit / (_MISREAD * sides)
         if float(excess.max()) <= 1.0:
             break
         if len(kept.ids) <= 2 or 2 * (len(kept.ids) - 1) < len(view.ids):
-            return _refused(view, "the markers contradict each other")
+            return _reject(view, "the markers contradict each other")
         kept = kept.chosen(np.arange(len(kept.ids)) != int(np.argmax(excess)))
-    return _adjusted(kept, camera, start, scale)
+    return _adjust(kept, camera, start, scale)
 
 
-def _refused(view: TargetView, reason: str) -> PoseFit:
+def _reject(view: TargetView, reason: str) -> PoseFit:
     spread = np.full((3, 3), np.inf)
     return PoseFit(
         PlanePose(0.0, 0.0), spread, float("nan"), float("nan"), float("nan"), view, reason
     )
 
 
-def _similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float]:
+def _fit_similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float]:
     """Pose and scale by least squares in the plane, as of complex numbers: b = scale exp(i angle) a + c."""
     seen = camera.plane_from_px(view.xy.reshape(-1, 2)) @ np.array([1.0, 1.0j])
     own = view.target_xy_m.reshape(-1, 2) @ np.array([1.0, 1.0j])
@@ -153,23 +153,25 @@ def _similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float
     return PlanePose(origin.real, origin.imag, float(np.angle(factor))), abs(factor)
 
 
-def _residual(view: TargetView, camera: PlaneCamera, pose: PlanePose, scale: float = 1.0) -> Array:
+def _compute_residual(
+    view: TargetView, camera: PlaneCamera, pose: PlanePose, scale: float = 1.0
+) -> Array:
     """(n, 4, 2) px."""
     predicted = camera.project(pose.apply(scale * view.target_xy_m.reshape(-1, 2)))
     residual: Array = view.xy - predicted.reshape(view.xy.shape)
     return residual
 
 
-def _adjusted(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: float) -> PoseFit:
-    whitening = _whitening(view)
+def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: float) -> PoseFit:
+    whitening = _form_whitening(view)
     pose, settled = start, False
     design, residual = np.empty((0, 3)), np.empty(0)
     own = view.target_xy_m.reshape(-1, 2)
     for _ in range(_MOST_STEPS):
-        residual = _white(whitening, _residual(view, camera, pose))
+        residual = _whiten(whitening, _compute_residual(view, camera, pose))
         moved = pose.apply(own)
-        slope = interaction_of_points(camera, moved, pose.values[:2])
-        design = _white(whitening, slope.reshape(len(view.ids), 8, 3))
+        slope = compute_interaction_of_points(camera, moved, pose.values[:2])
+        design = _whiten(whitening, slope.reshape(len(view.ids), 8, 3))
         # Columns of m and rad differ by seven orders of magnitude.
         size = np.linalg.norm(design, axis=0)
         step = np.linalg.lstsq(design / size, residual, rcond=None)[0] / size
@@ -177,8 +179,8 @@ def _adjusted(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: fl
         if float(np.max(np.abs(slope @ step))) < _SETTLED_PX:
             settled = True
             break
-    left = _residual(view, camera, pose)
-    residual = _white(whitening, left)
+    left = _compute_residual(view, camera, pose)
+    residual = _whiten(whitening, left)
     size = np.linalg.norm(design, axis=0)
     normal = (design / size).T @ (design / size)
     # Where the corners scatter more than they say, the pose does too.
@@ -187,10 +189,10 @@ def _adjusted(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: fl
     rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
     pose = PlanePose(pose.x_m, pose.y_m, math.remainder(pose.angle_rad, 2.0 * math.pi))
     reason = "" if settled else f"the pose did not settle in {_MOST_STEPS} steps"
-    return PoseFit(pose, covariance, scale, _scale_sigma(view), rms_px, view, reason)
+    return PoseFit(pose, covariance, scale, _compute_scale_sigma(view), rms_px, view, reason)
 
 
-def _scale_sigma(view: TargetView) -> float:
+def _compute_scale_sigma(view: TargetView) -> float:
     """1-sigma of the scale, from the scatter of the corners and how far they spread."""
     flat = view.xy.reshape(-1, 2)
     reach = float(np.sum((flat - flat.mean(axis=0)) ** 2))
@@ -198,28 +200,28 @@ def _scale_sigma(view: TargetView) -> float:
     return math.sqrt(variance / max(reach, 1e-9))
 
 
-def _whitening(view: TargetView) -> Array:
+def _form_whitening(view: TargetView) -> Array:
     """(n, 8, 8) inverse Cholesky factors of the markers' covariances."""
     floor = 1e-8 * np.eye(8)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(view.covariance_px2 + floor)))
 
 
-def _white(whitening: Array, values: Array) -> Array:
+def _whiten(whitening: Array, values: Array) -> Array:
     """Whitened values (8 n, ...) of (n, 4, 2) or (n, 8, k)."""
     if values.ndim == 3 and values.shape[1:] == (4, 2):
         return np.asarray(np.einsum("nij,nj->ni", whitening, values.reshape(-1, 8)).reshape(-1))
     return np.asarray((whitening @ values).reshape(-1, values.shape[-1]))
 
 
-def interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Array) -> Array:
-    """(2n, 3) of points (n, 2) of the plane, m; see :func:`interaction_matrix`."""
+def compute_interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Array) -> Array:
+    """(2n, 3) of points (n, 2) of the plane, m; see :func:`compute_interaction_matrix`."""
     slope = camera.jacobian(xy_m)
     arm = xy_m - centre_m
     turned = np.column_stack([-arm[:, 1], arm[:, 0]])
     return np.concatenate([slope, slope @ turned[:, :, None]], axis=2).reshape(-1, 3)
 
 
-def interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) -> Array:
+def compute_interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) -> Array:
     """Derivative of ideal pixels by the velocity of the stage in the sem frame.
 
     With P_g of the frame known, and with it the depth 1 / rho of the stage plane, a pixel has one place in the
@@ -240,4 +242,4 @@ def interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) 
     (2n, 3): rows u, v of each point; columns px per m for x and y, px per rad for the rotation from x towards y.
     """
     centre = np.asarray(centre_m, dtype=np.float64).reshape(2)
-    return interaction_of_points(camera, camera.plane_from_px(xy), centre)
+    return compute_interaction_of_points(camera, camera.plane_from_px(xy), centre)

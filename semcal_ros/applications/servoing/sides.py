@@ -70,24 +70,25 @@ def refine_quads(image: Image, corners: Array) -> RefinedQuads:
     xy, covariance = np.array(corners, dtype=np.float64), np.zeros((count, 8, 8))
     good = np.zeros(count, dtype=np.bool_)
     for index in range(count):
-        refined = _refined(image, xy[index])
+        refined = _refine_quad(image, xy[index])
         if refined is not None:
             xy[index], covariance[index] = refined
             good[index] = True
     return RefinedQuads(xy, covariance, good)
 
 
-def _refined(image: Image, quad: Array) -> tuple[Array, Array] | None:
+def _refine_quad(image: Image, quad: Array) -> tuple[Array, Array] | None:
     covariance = np.zeros((8, 8))
     for _ in range(_ROUNDS):
         before = quad
         found = [
-            _line(image, quad[side], quad[(side + 1) % 4], _winding(quad)) for side in range(4)
+            _measure_side(image, quad[side], quad[(side + 1) % 4], _compute_winding(quad))
+            for side in range(4)
         ]
         lines = [line for line in found if line is not None]
         if len(lines) < 4:
             return None
-        quad, covariance = _corners_of(quad, lines)
+        quad, covariance = _intersect_lines(quad, lines)
         if not np.all(np.isfinite(quad)):
             return None
         if float(np.max(np.abs(quad - before))) < _SETTLED_PX:
@@ -95,12 +96,12 @@ def _refined(image: Image, quad: Array) -> tuple[Array, Array] | None:
     return quad, covariance
 
 
-def _winding(quad: Array) -> float:
+def _compute_winding(quad: Array) -> float:
     x, y = quad[:, 0], quad[:, 1]
     return float(np.sign(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
 
 
-def _frame_of(first: Array, second: Array, winding: float) -> tuple[float, Array, Array]:
+def _make_side_frame(first: Array, second: Array, winding: float) -> tuple[float, Array, Array]:
     """Length of a side, and the unit vectors along it and outward."""
     along = second - first
     length = float(np.hypot(along[0], along[1]))
@@ -109,8 +110,8 @@ def _frame_of(first: Array, second: Array, winding: float) -> tuple[float, Array
     return length, along, outward
 
 
-def _line(image: Image, first: Array, second: Array, winding: float) -> _Line | None:
-    length, along, outward = _frame_of(first, second, winding)
+def _measure_side(image: Image, first: Array, second: Array, winding: float) -> _Line | None:
+    length, along, outward = _make_side_frame(first, second, winding)
     places = int(min((1.0 - 2.0 * _ENDS) * length, _MOST_PLACES))
     if places < _LEAST_PLACES:
         return None
@@ -136,10 +137,10 @@ def _line(image: Image, first: Array, second: Array, winding: float) -> _Line | 
     # The trapezoidal mean: the two ends of the window count half.
     mean = (seen.sum(axis=1) - 0.5 * (seen[:, 0] + seen[:, -1])) / (seen.shape[1] - 1)
     step = half * (black + white - 2.0 * mean) / (white - black)
-    return _fitted(tau, np.clip(step, -half, half), half)
+    return _fit_line(tau, np.clip(step, -half, half), half)
 
 
-def _fitted(tau: Array, step: Array, half: float) -> _Line | None:
+def _fit_line(tau: Array, step: Array, half: float) -> _Line | None:
     keep = np.ones(len(tau), dtype=np.bool_)
     offset = slope = sigma = 0.0
     for _ in range(2):
@@ -161,10 +162,10 @@ def _fitted(tau: Array, step: Array, half: float) -> _Line | None:
     )
 
 
-def _corners_of(quad: Array, lines: list[_Line]) -> tuple[Array, Array]:
+def _intersect_lines(quad: Array, lines: list[_Line]) -> tuple[Array, Array]:
     """Where neighbouring lines meet, and the (8, 8) covariance of that."""
-    winding = _winding(quad)
-    frames = [_frame_of(quad[k], quad[(k + 1) % 4], winding) for k in range(4)]
+    winding = _compute_winding(quad)
+    frames = [_make_side_frame(quad[k], quad[(k + 1) % 4], winding) for k in range(4)]
     moved, gradient = np.empty((4, 2)), np.zeros((8, 8))
     for corner in range(4):
         # The corner ends the side before it and begins its own.

@@ -9,16 +9,16 @@ import pytest
 
 from semcal_ros.applications.cantilever import (
     SeriesSettings,
+    compare_series,
     find_strip,
-    frames_of_poses,
+    group_frames,
     measure_series,
-    repeatability,
 )
-from semcal_ros.applications.cantilever.bending import end_along_axis, fit_bending, shape_of
+from semcal_ros.applications.cantilever.bending import fit_bending, locate_end, parse_shape
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
-from semcal_ros.synthetic.cantilever import CantileverScene, cantilever_plan
+from semcal_ros.synthetic.specimens.cantilever import CantileverScene, cantilever_plan
 
 LENGTH = 35e-6
 DRIFT = Drift(velocity_m_s=(6e-9, -4e-9), settling_m=(60e-9, 90e-9), wander_m=10e-9, seed=4)
@@ -93,7 +93,7 @@ def test_each_shape_finds_its_own(shape):
     u = np.linspace(0.05, 0.98, 30)
     curve = {"beam": 0.5 * (3 * u**2 - u**3), "parabola": u**2}.get(shape, 1.3 * u**2 - 0.3 * u**3)
     moved = 2e-7 * np.stack([curve, curve], axis=1)
-    found = fit_bending(u, moved, np.full(moved.shape, 1e-9), LENGTH, 1e-9, shape_of(shape))
+    found = fit_bending(u, moved, np.full(moved.shape, 1e-9), LENGTH, 1e-9, parse_shape(shape))
     # The prior of no rotation costs nothing where there is none.
     assert found.deflection_m == pytest.approx(2e-7, abs=1e-13)
     assert found.used.all()
@@ -119,13 +119,15 @@ def test_the_second_order_differs_from_a_beam_by_what_theory_says():
     u = (np.arange(2000) + 0.5) / 2000
     moved = np.stack([0.5 * (3 * u**2 - u**3)] * 2, axis=1) * 1e-7
     # So little is known of each block that the base does not turn, as it may by 10 microradian.
-    found = fit_bending(u, moved, np.full(moved.shape, 1e-6), LENGTH, 1e-13, shape_of("parabola"))
+    found = fit_bending(
+        u, moved, np.full(moved.shape, 1e-6), LENGTH, 1e-13, parse_shape("parabola")
+    )
     assert found.deflection_m == pytest.approx(1e-7 * 13 / 12, rel=2e-3)
 
 
 def test_the_end_recedes_as_the_beam_bends():
     # Euler and Bernoulli: 3/5 of the deflection squared over the length.
-    receded = LENGTH - end_along_axis(np.array([1.5e-6, -0.5e-6]), LENGTH)
+    receded = LENGTH - locate_end(np.array([1.5e-6, -0.5e-6]), LENGTH)
     assert receded == pytest.approx(0.6 * (1e-6) ** 2 / LENGTH, rel=3e-3)
 
 
@@ -274,10 +276,10 @@ def test_frames_of_other_sizes_and_references_are_refused():
 
 
 def test_frames_are_cut_into_poses():
-    assert frames_of_poses(6, 3) == [[0, 1], [2, 3], [4, 5]]
-    assert frames_of_poses(2, None) == [[0], [1]]
+    assert group_frames(6, 3) == [[0, 1], [2, 3], [4, 5]]
+    assert group_frames(2, None) == [[0], [1]]
     with pytest.raises(InvalidValueError, match="7 frames for 3 poses"):
-        frames_of_poses(7, 3)
+        group_frames(7, 3)
 
 
 @pytest.mark.slow
@@ -291,11 +293,11 @@ def test_the_spread_is_that_of_the_poses():
         seed=5,
     )
     series = [measured(plan, magnification=g)[0] for g in (6450.0, 8890.0)]
-    table = repeatability(series)
+    table = compare_series(series)
     values = [s.frames[1].deflection_m for s in series]
     assert table.spread_m[1] == pytest.approx(np.std(values, ddof=1))
     assert table.rms_spread_m == pytest.approx(table.spread_m[1])
     assert table.spread_m[0] < 0.5e-9
     assert table.expected_spread_m == pytest.approx(np.sqrt(np.mean(table.sigma_m[:, 1] ** 2)))
     with pytest.raises(InvalidValueError, match="different numbers of frames"):
-        repeatability([series[0], replace(series[1], frames=series[1].frames[:1])])
+        compare_series([series[0], replace(series[1], frames=series[1].frames[:1])])

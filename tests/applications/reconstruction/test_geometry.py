@@ -11,11 +11,11 @@ from semcal_ros.applications.reconstruction import (
     adjust,
     factorize,
     fit_sphere,
-    mirrored,
+    mirror_structure,
     upgrade_to_metric,
 )
-from semcal_ros.applications.reconstruction.epipolar import epipolar_of, robust_epipolar
-from semcal_ros.applications.reconstruction.reconstruct import mirror_of
+from semcal_ros.applications.reconstruction.epipolar import epipolar_of, fit_epipolar
+from semcal_ros.applications.reconstruction.reconstruct import mirror_poses
 from semcal_ros.core.errors import StructureError
 from tests.helpers.structure_scenes import RADIUS_M, aligned_rms_m, ball_scene
 
@@ -28,9 +28,9 @@ def recovered(scene, sigma_px=0.2, height_sigma_m=5e-6):
     seen = Observations.of_tracks(scene.tracks, scene.cameras, sigma_px)
     start = (metric.rotations, metric.translations_m, metric.points_m)
     if aligned_rms_m(metric.points_m, scene.points_m) > aligned_rms_m(
-        mirrored(metric.rotations, metric.points_m)[1], scene.points_m
+        mirror_structure(metric.rotations, metric.points_m)[1], scene.points_m
     ):
-        start = mirror_of(*start)
+        start = mirror_poses(*start)
     done = adjust(
         seen,
         scene.cameras,
@@ -92,7 +92,7 @@ def test_the_mirror_image_explains_parallel_tracks_as_well():
     scene = ball_scene(views=16, points=100)
     _, done = recovered(scene)
     seen = Observations.of_tracks(scene.tracks, scene.cameras, 0.2)
-    start = mirror_of(done.rotations, done.translations_m, done.points_m)
+    start = mirror_poses(done.rotations, done.translations_m, done.points_m)
     other = adjust(seen, scene.cameras, *start, reference=done.reference)
     assert other.cost == pytest.approx(done.cost, rel=0.01)
     # It is another shape, not the same one seen from elsewhere.
@@ -152,7 +152,7 @@ def test_robust_epipolar_geometry_finds_the_wrong_points():
     scene = ball_scene(views=6, points=800, wrong=0.2, seed=3)
     both = scene.tracks.seen[0] & scene.tracks.seen[3]
     first, second = (scene.tracks.xy_m[v, both] / PIXEL_M for v in (0, 3))
-    found = robust_epipolar(first, second, 1.5)
+    found = fit_epipolar(first, second, 1.5)
     wrong = (scene.wrong[0] | scene.wrong[3])[both]
     # A wrong point may slide along its epipolar line; right ones are kept.
     assert np.mean(found.inliers[~wrong]) > 0.97

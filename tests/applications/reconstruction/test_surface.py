@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.applications.reconstruction import fit_sphere, mesh_of_cloud
+from semcal_ros.applications.reconstruction import fit_sphere, triangulate_cloud
 from semcal_ros.applications.reconstruction.moving_least_squares import fit_local_surface
 from semcal_ros.core.errors import StructureError
 
@@ -86,7 +86,7 @@ def test_moving_least_squares_smooths_and_bends():
 
 def test_mesh_of_a_whole_ball_is_watertight():
     points = cap(400, 180.0)
-    mesh = mesh_of_cloud(points, np.zeros(3), points / RADIUS_M, np.full(400, 1e-9))
+    mesh = triangulate_cloud(points, np.zeros(3), points / RADIUS_M, np.full(400, 1e-9))
     assert mesh.watertight
     # Euler's formula for a closed surface without handles.
     assert len(mesh.faces) == 2 * 400 - 4
@@ -97,7 +97,7 @@ def test_mesh_of_a_whole_ball_is_watertight():
 
 def test_mesh_is_open_where_nothing_was_seen():
     points = cap(300, 75.0)
-    mesh = mesh_of_cloud(points, np.zeros(3), points / RADIUS_M, np.full(300, 1e-9))
+    mesh = triangulate_cloud(points, np.zeros(3), points / RADIUS_M, np.full(300, 1e-9))
     assert not mesh.watertight
     edge = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     length = np.linalg.norm(np.diff(mesh.vertices_m[edge], axis=1)[:, 0], axis=1)

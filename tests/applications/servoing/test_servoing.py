@@ -18,9 +18,9 @@ from semcal_ros.applications.servoing import (
     ServoSettings,
     ServoStep,
     TargetView,
+    choose_projection,
+    compute_interaction_matrix,
     fit_pose,
-    interaction_matrix,
-    projection_of_frame,
 )
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
@@ -68,19 +68,19 @@ def test_the_projection_of_a_frame_is_the_one_that_fits_its_own_k() -> None:
     magnifications = (500.0, 1000.0, 2000.0)
     published = [SCOPE.camera_at(g).P_affine for g in magnifications]
     for g, expected in zip(magnifications, published, strict=True):
-        found = projection_of_frame(SCOPE.camera_at(g).K, published)
+        found = choose_projection(SCOPE.camera_at(g).K, published)
         np.testing.assert_array_equal(found, expected)
     with pytest.raises(InvalidValueError, match="no projection of the magnification"):
-        projection_of_frame(SCOPE.camera_at(1500.0).K, published)
+        choose_projection(SCOPE.camera_at(1500.0).K, published)
 
 
 def test_a_frame_without_k_is_refused_unless_the_projection_is_parallel() -> None:
     with pytest.raises(InvalidValueError, match="without a camera"):
-        projection_of_frame(np.zeros((3, 3)), [SCOPE.camera_at(500.0).P_affine])
+        choose_projection(np.zeros((3, 3)), [SCOPE.camera_at(500.0).P_affine])
     with pytest.raises(InvalidValueError, match="without a camera"):
-        projection_of_frame(np.zeros((3, 3)), [])
+        choose_projection(np.zeros((3, 3)), [])
     parallel = preset("parallel").camera_at(500.0).P_affine
-    np.testing.assert_array_equal(projection_of_frame(np.zeros((3, 3)), [parallel]), parallel)
+    np.testing.assert_array_equal(choose_projection(np.zeros((3, 3)), [parallel]), parallel)
 
 
 # -- pose and interaction matrix ------------------------------------------------------------------
@@ -105,7 +105,7 @@ def test_the_interaction_matrix_is_the_numerical_gradient(name: str, g: float) -
     numerical = np.column_stack(
         [(seen(d) - seen(-d)) / (2.0 * h) for d, h in zip(np.diag(steps), steps, strict=True)]
     )
-    analytic = interaction_matrix(camera, camera.project(points), centre)
+    analytic = compute_interaction_matrix(camera, camera.project(points), centre)
     scale = np.abs(analytic).max(axis=0)
     # Rounding of 1e-13 px over steps of 0.05 px, and the third derivative of a rotation.
     np.testing.assert_allclose(analytic / scale, numerical / scale, atol=1e-8)
@@ -331,7 +331,7 @@ def test_speeds_stay_within_their_limits_and_the_direction_is_kept() -> None:
 @pytest.mark.parametrize(
     "obeys",
     [np.zeros((3, 3)), -np.eye(3), np.diag([1.0, -1.0, 1.0])],
-    ids=["stuck", "reversed", "mirrored"],
+    ids=["stuck", "reversed", "mirror_structure"],
 )
 def test_a_stage_that_does_not_follow_is_stopped(obeys: np.ndarray) -> None:
     plant = Plant(Servo(GOAL, QUICK), obeys=obeys, pose=PlanePose(5e-6, -25e-6, 0.05))

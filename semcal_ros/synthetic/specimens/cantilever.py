@@ -19,10 +19,10 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
-from semcal_ros.synthetic.gold import GoldOnCarbon
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
+from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 
 __all__ = [
     "CANTILEVER_MAGNIFICATIONS",
@@ -140,17 +140,17 @@ class CantileverScene:
         return self.length_m - share * self.deflection_m**2 / self.length_m
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> NDArray[np.floating]:
-        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
         ground = GoldOnCarbon(self.seed, largest_m=6e-6, octaves=4)
         seen = self.background * np.asarray(ground.reflectivity(x_m, y_m, footprint_m), dtype=float)
         x_width, y_width = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
         line = self.deflection_m * self.bending(x_m / self.end_x_m)
         across = np.abs(y_m - line) - 0.5 * self.width_m
-        parts = [_edge(across, y_width), _edge(x_m - self.end_x_m, x_width)]
+        parts = [_soften_edge(across, y_width), _soften_edge(x_m - self.end_x_m, x_width)]
         inside = np.minimum(-across, self.end_x_m - x_m)
         self._lay(seen, self.beam, parts, inside)
         # The beam goes on inside of the holder, so that no seam is seen.
-        self._lay(seen, self.holder, [_edge(x_m, x_width)], -x_m)
+        self._lay(seen, self.holder, [_soften_edge(x_m, x_width)], -x_m)
         if self.gap_m is not None:
             self._lay_pusher(seen, x_m, y_m, x_width, y_width)
         return seen
@@ -160,7 +160,11 @@ class CantileverScene:
         first, last = self.pusher_m
         touched = self.deflection_m * float(self.bending(np.array([self.load]))[0])
         front = touched - 0.5 * self.width_m - self.gap_m
-        parts = [_edge(y - front, y_width), _edge(first - x, x_width), _edge(x - last, x_width)]
+        parts = [
+            _soften_edge(y - front, y_width),
+            _soften_edge(first - x, x_width),
+            _soften_edge(x - last, x_width),
+        ]
         self._lay(seen, self.pusher, parts, np.minimum(front - y, np.minimum(x - first, last - x)))
 
     def _lay(self, seen: Array, level: float, parts: Sequence[Array], inside: Array) -> None:
@@ -173,7 +177,7 @@ class CantileverScene:
         seen += cover * light
 
 
-def _edge(distance: Array, width: float) -> Array:
+def _soften_edge(distance: Array, width: float) -> Array:
     """1 where the distance is negative, averaged over a box of that width."""
     return np.asarray(np.clip(0.5 - distance / max(width, 1e-15), 0.0, 1.0))
 
@@ -324,12 +328,13 @@ def cantilever_plan(
             for _ in range(frames_per_pose):
                 planned.append(CantileverFrame(step_s * len(planned), float(g), number, bent))
     placed = {
-        float(g): _placed(microscope, float(g), base, view, rotation_rad) for g in magnifications
+        float(g): _place_specimen(microscope, float(g), base, view, rotation_rad)
+        for g in magnifications
     }
     return CantileverPlan(microscope, tuple(planned), placed, drift, detector or Detector(), seed)
 
 
-def _placed(
+def _place_specimen(
     microscope: VirtualMicroscope, g: float, scene: CantileverScene, view: str, turn: float
 ) -> Pose:
     field_m = microscope.nominal_pixel_size_m(g) * microscope.width

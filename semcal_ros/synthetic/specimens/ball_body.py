@@ -109,12 +109,12 @@ class BallOnTip:
     def texture(self, points_m: Array) -> Array:
         """(n,) relative reflectivity at body-frame points (n, 3): a solid texture, mean 1."""
         cells = (points_m / self.grain_m).T
-        grains = map_coordinates(_noise(self.seed), cells, order=1, mode="grid-wrap")
+        grains = map_coordinates(_make_noise(self.seed), cells, order=1, mode="grid-wrap")
         return np.asarray(np.clip(1.0 + self.contrast * grains, 0.2, 2.0), dtype=np.float64)
 
 
 @lru_cache(maxsize=2)
-def _noise(seed: int) -> Image:
+def _make_noise(seed: int) -> Image:
     """Periodic noise of unit spread: grains of two sizes."""
     rng = np.random.default_rng(seed)
     white = rng.standard_normal((2, _TILE, _TILE, _TILE), dtype=np.float32)

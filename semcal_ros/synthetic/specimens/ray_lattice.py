@@ -23,7 +23,7 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 
-__all__ = ["PlaneLattice", "RayLattice", "ray_lattice"]
+__all__ = ["PlaneLattice", "RayLattice", "trace_ray_lattice"]
 
 
 _NODE_SPACING_PX = 12.0
@@ -164,7 +164,7 @@ class PlaneLattice:
 
 
 @lru_cache(maxsize=4)
-def ray_lattice(
+def trace_ray_lattice(
     microscope: VirtualMicroscope, magnification: float, supersampling: int, pad: int
 ) -> RayLattice:
     """Rays of a frame; kept for the last few magnifications.
@@ -175,10 +175,10 @@ def ray_lattice(
         If the distortion has no inverse somewhere in the frame.
     """
     camera = microscope.camera_at(magnification)
-    lines = _samples(microscope.height, supersampling, pad)
-    cols = _samples(microscope.width, supersampling, pad)
-    nodes = _nodes(microscope.width, pad)
-    line_nodes = _nodes(microscope.height, pad)
+    lines = _place_samples(microscope.height, supersampling, pad)
+    cols = _place_samples(microscope.width, supersampling, pad)
+    nodes = _place_nodes(microscope.width, pad)
+    line_nodes = _place_nodes(microscope.height, pad)
     raw = np.stack(np.meshgrid(nodes, line_nodes), axis=-1).reshape(-1, 2)
     ideal = microscope.undistort(magnification, raw)
     if not np.all(np.isfinite(ideal)):
@@ -188,7 +188,7 @@ def ray_lattice(
             do="use a weaker xi_r or xi_t",
         )
     sem = camera.sem_from_ideal(ideal).reshape(len(line_nodes), len(nodes), 3)
-    down = _spline_basis(line_nodes, lines).T
+    down = _make_spline_basis(line_nodes, lines).T
     return RayLattice(
         camera,
         supersampling,
@@ -197,24 +197,24 @@ def ray_lattice(
         nodes,
         down @ sem[..., 0],
         down @ sem[..., 1],
-        _spline_basis(nodes, cols),
+        _make_spline_basis(nodes, cols),
     )
 
 
-def _nodes(pixels: int, pad: int) -> Array:
+def _place_nodes(pixels: int, pad: int) -> Array:
     """Nodes over an image side, pad included."""
     first, last = -0.5 - pad, pixels - 0.5 + pad
     spacing = max(_NODE_SPACING_PX, pixels / _MOST_INTERVALS)
     return np.linspace(first, last, max(2 * _DEGREE, round((last - first) / spacing) + 1))
 
 
-def _spline_basis(nodes: Array, samples: Array) -> Array:
+def _make_spline_basis(nodes: Array, samples: Array) -> Array:
     """(nodes, samples) matrix from values at the nodes to a spline's values at the samples."""
     spline = make_interp_spline(nodes, np.eye(len(nodes)), k=_DEGREE)
     return np.ascontiguousarray(spline(samples).T)
 
 
-def _samples(pixels: int, supersampling: int, pad: int) -> Array:
+def _place_samples(pixels: int, supersampling: int, pad: int) -> Array:
     index = np.arange((pixels + 2 * pad) * supersampling)
     samples: Array = (index + 0.5) / supersampling - 0.5 - pad
     return samples

@@ -1,4 +1,4 @@
-"""Specimens: reflectivity as a function of specimen-plane coordinates."""
+"""What the renderer needs of a specimen, and the two simplest: the chess grid and an even one."""
 
 from __future__ import annotations
 
@@ -81,17 +81,17 @@ class ChessGrid:
         # The box has the second moment of the sample's parallelogram projected on each axis of the
         # board.
         width = np.hypot(footprint_m[:, 0], footprint_m[:, 1]) / self.square_m
-        product = _filtered_wave(x_m / self.square_m, float(width[0]))
-        product *= _filtered_wave(y_m / self.square_m, float(width[1]))
+        product = _filter_wave(x_m / self.square_m, float(width[0]))
+        product *= _filter_wave(y_m / self.square_m, float(width[1]))
         product *= 0.5
         product += 0.5
         return product
 
 
-def _filtered_wave(u: Array, width: float) -> Array:
+def _filter_wave(u: Array, width: float) -> Array:
     """Square wave of period 2, +1 on (0, 1) and -1 on (1, 2), averaged over a box of that width."""
     if width >= 1.0:
-        return (_wave_integral(u + 0.5 * width) - _wave_integral(u - 0.5 * width)) / width
+        return (_integrate_wave(u + 0.5 * width) - _integrate_wave(u - 0.5 * width)) / width
     phase = u - 0.5
     phase -= 2.0 * np.floor(0.5 * phase)
     phase -= 1.0
@@ -102,7 +102,7 @@ def _filtered_wave(u: Array, width: float) -> Array:
     return np.clip(phase, -1.0, 1.0, out=phase)
 
 
-def _wave_integral(u: Array) -> Array:
+def _integrate_wave(u: Array) -> Array:
     phase = u - 2.0 * np.floor(0.5 * u)
     return 1.0 - np.abs(phase - 1.0)
 

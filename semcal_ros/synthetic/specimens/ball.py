@@ -19,12 +19,12 @@ from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.synthetic.ball_body import BallOnTip
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.presets import preset
-from semcal_ros.synthetic.raylattice import RayLattice, ray_lattice
+from semcal_ros.synthetic.specimens.ball_body import BallOnTip
+from semcal_ros.synthetic.specimens.ray_lattice import RayLattice, trace_ray_lattice
 from semcal_ros.synthetic.truth import parameters_of
 
 __all__ = [
@@ -36,6 +36,9 @@ __all__ = [
     "ball_microscope",
     "ball_plan",
 ]
+
+#: Magnifications of section 4.4 of Malti et al. (2012).
+BALL_MAGNIFICATIONS = tuple(9000.0 + 100.0 * step for step in range(11))
 
 
 BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
@@ -125,7 +128,7 @@ class BallPlan:
         """(height + databar_rows, width) image of a frame, every line at its own time."""
         frame = self.frames[index]
         pad = self.detector.pad_px
-        rays = ray_lattice(self.microscope, float(frame.magnification), _SAMPLES, pad)
+        rays = trace_ray_lattice(self.microscope, float(frame.magnification), _SAMPLES, pad)
         seen = self._reflectivity(rays, frame.start_time_s)
         return self.detector.expose(seen, np.random.default_rng((self.seed, index)))
 
@@ -140,9 +143,9 @@ class BallPlan:
         lines = slice(top * _SAMPLES, bottom * _SAMPLES)
         basis = rays.basis[:, left * _SAMPLES : right * _SAMPLES]
         x, y = rays.x_m[lines] @ basis, rays.y_m[lines] @ basis
-        left_s, right_s = _line_times(rays, self.microscope.timing)
+        left_s, right_s = _compute_line_times(rays, self.microscope.timing)
         rotation, place = self.pose_at(start_time_s + 0.5 * (left_s + right_s)[lines])
-        yields = _yield(self.specimen, x, y, camera.rho, rotation, place)
+        yields = _compute_yield(self.specimen, x, y, camera.rho, rotation, place)
         fine = yields.reshape(bottom - top, _SAMPLES, right - left, _SAMPLES)
         total[top:bottom, left:right] = fine.mean(axis=(1, 3))
         return total
@@ -214,7 +217,7 @@ class BallPlan:
 _CUBE = np.array([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
 
 
-def _line_times(rays: RayLattice, timing: ScanTiming) -> tuple[Array, Array]:
+def _compute_line_times(rays: RayLattice, timing: ScanTiming) -> tuple[Array, Array]:
     """Mean times over the passes, after the stamp, at both ends of every line of samples."""
     rows = np.rint(rays.lines)
     size = (rays.camera.height, rays.camera.width)
@@ -224,10 +227,12 @@ def _line_times(rays: RayLattice, timing: ScanTiming) -> tuple[Array, Array]:
     )
 
 
-def _yield(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array) -> Array:
+def _compute_yield(
+    body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
+) -> Array:
     """Reflectivity (lines, columns) of rays through (x, y) at height 0, one pose per line."""
     out = np.full(x.shape, body.background)
-    line, column = np.nonzero(_near(body, x, y, rho, rotation, place))
+    line, column = np.nonzero(_find_near(body, x, y, rho, rotation, place))
     x, y = x[line, column], y[line, column]
     origin = np.stack([x, y, np.zeros_like(x)], axis=1) - place[line]
     direction = np.stack([rho * x, rho * y, np.ones_like(x)], axis=1)
@@ -246,7 +251,9 @@ def _yield(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, pla
     return out
 
 
-def _near(body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array) -> Mask:
+def _find_near(
+    body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
+) -> Mask:
     """Which rays can meet the body at all: by the distance from its outline in parallel projection."""
     w = (1.0 + rho * place[:, 2])[:, None]
     dx, dy = x - place[:, :1] / w, y - place[:, 1:2] / w
@@ -278,7 +285,7 @@ def ball_plan(
     *,
     frames: int = 2000,
     interval_s: float | None = None,
-    magnifications: tuple[float, ...] = tuple(9000.0 + 100.0 * k for k in range(11)),
+    magnifications: tuple[float, ...] = BALL_MAGNIFICATIONS,
     specimen: BallOnTip | None = None,
     motion: Turning | None = None,
     drift: DriftFunction = NO_DRIFT,

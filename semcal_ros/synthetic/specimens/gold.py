@@ -56,7 +56,7 @@ class GoldOnCarbon:
         return 1
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
-        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
         pixel_m = math.sqrt(abs(float(np.linalg.det(footprint_m))))
         seen = np.full(x_m.shape, self.carbon, dtype=np.float32)
         for octave in range(self.octaves):
@@ -70,7 +70,7 @@ class GoldOnCarbon:
         self, octave: int, texel_m: float, pixel_m: float, x_m: Array, y_m: Array
     ) -> tuple[Image | np.float32, Image | np.float32]:
         """What the particles of one octave cover, and their light (already times the cover)."""
-        pyramid, mean = _tile_pyramid(self.seed)
+        pyramid, mean = _make_pyramid(self.seed)
         level = max(0, math.floor(math.log2(max(0.5 * pixel_m / texel_m, 1.0))))
         if level >= len(pyramid):
             return mean[0], mean[1]
@@ -80,15 +80,15 @@ class GoldOnCarbon:
         angle = _GOLDEN_ANGLE * (octave + 1)
         shift = np.random.default_rng([self.seed, octave]).uniform(0.0, 1.0, 2)
         c, s = math.cos(angle) / step, math.sin(angle) / step
-        u = _wrapped(c * x_m - s * y_m, shift[0], size)
-        v = _wrapped(s * x_m + c * y_m, shift[1], size)
+        u = _wrap(c * x_m - s * y_m, shift[0], size)
+        v = _wrap(s * x_m + c * y_m, shift[1], size)
         seen: Image = np.asarray(
             cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), dtype=np.float32
         )
         return seen[..., 0], seen[..., 1]
 
 
-def _wrapped(u: Array, shift: float, size: float) -> Image:
+def _wrap(u: Array, shift: float, size: float) -> Image:
     """Coordinates reduced to one tile while they still have all their digits."""
     # Texel centres are at integers, so the border of the tile, where all levels agree, is at -0.5.
     u += shift * size - 0.5
@@ -97,7 +97,7 @@ def _wrapped(u: Array, shift: float, size: float) -> Image:
 
 
 @lru_cache(maxsize=4)
-def _tile_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
+def _make_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
     """Levels (n, n, 2) of cover and light, each half the size of the last, and their means (2,)."""
     tile = _draw_tile(np.random.default_rng([seed, 1]))
     levels = [tile]
@@ -133,13 +133,13 @@ def _draw_tile(rng: np.random.Generator) -> Image:
         window = np.ix_((first[0] + span) % _TILE, (first[1] + span) % _TILE)
         offset = (first - centre)[:, None] + span
         distance = np.hypot(offset[0][:, None], offset[1][None, :])
-        cover, light = _particle(distance, radius, brightness)
+        cover, light = _draw_particle(distance, radius, brightness)
         tile[window] *= 1.0 - cover[..., None]
         tile[window] += np.stack([cover, light], axis=-1)
     return tile
 
 
-def _particle(distance: Array, radius: float, brightness: float) -> tuple[Image, Image]:
+def _draw_particle(distance: Array, radius: float, brightness: float) -> tuple[Image, Image]:
     """A ball as secondary electrons show it: brighter at its rim, its edge two texels wide."""
     cover = np.clip((radius - distance) / 2.0 + 0.5, 0.0, 1.0)
     rim = np.minimum(distance / radius, 1.0) ** 4

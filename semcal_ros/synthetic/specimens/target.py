@@ -42,7 +42,7 @@ class TargetSpecimen:
         return 2
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
-        """See :class:`~semcal_ros.synthetic.specimens.Specimen`."""
+        """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
         # As for the chess grid: a box with the second moment of the sample's parallelogram on each axis of the
         # target.
         box_m = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
@@ -64,35 +64,35 @@ def _paint(seen: Image, target: NestedTarget, level: int, x: Array, y: Array, bo
     inside = (np.abs(x) < half) & (np.abs(y) < half)
     if not np.any(inside):
         return
-    pyramid = _pyramid(target, level)
+    pyramid = _make_pyramid(target, level)
     texels = max(float(np.max(box)) * _CELL, 1.0)
     step = min(math.ceil(math.log2(texels)), len(pyramid) - 1)
     board = pyramid[step]
     per_cell = len(board) / RATIO
-    u = _sharpened((x[inside] + half) * per_cell - 0.5, float(box[0]) * per_cell)
-    v = _sharpened((y[inside] + half) * per_cell - 0.5, float(box[1]) * per_cell)
-    seen[inside] = _in_rows(board, u, v)
+    u = _sharpen((x[inside] + half) * per_cell - 0.5, float(box[0]) * per_cell)
+    v = _sharpen((y[inside] + half) * per_cell - 0.5, float(box[1]) * per_cell)
+    seen[inside] = _remap_in_rows(board, u, v)
 
 
-def _in_rows(board: Image, u: Image, v: Image) -> Image:
+def _remap_in_rows(board: Image, u: Image, v: Image) -> Image:
     """cv2.remap takes no rows beyond 32766 px."""
     width = 16384
     rows = -(-u.size // width)
-    padded = [np.resize(c, rows * width).reshape(rows, width) for c in (u, v)]
-    drawn = cv2.remap(board, *padded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    x, y = (np.resize(c, rows * width).reshape(rows, width) for c in (u, v))
+    drawn = cv2.remap(board, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(drawn, dtype=np.float32).reshape(-1)[: u.size]
 
 
-def _sharpened(u: Array, width: float) -> Image:
+def _sharpen(u: Array, width: float) -> Image:
     """Where linear interpolation gives the mean of sharp texels over a box of that width, at most one texel."""
     edge = np.floor(u) + 0.5
     return (edge + np.clip((u - edge) / max(width, 1e-9), -0.5, 0.5)).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
-def _pyramid(target: NestedTarget, level: int) -> tuple[Image, ...]:
+def _make_pyramid(target: NestedTarget, level: int) -> tuple[Image, ...]:
     """One board with all that lie within, 1 white and 0 black, and the same at half the resolution, and so on."""
-    levels = [_board(target, level)]
+    levels = [_draw_board(target, level)]
     while len(levels[-1]) % 2 == 0 and len(levels[-1]) > 8:
         n = len(levels[-1]) // 2
         levels.append(levels[-1].reshape(n, 2, n, 2).mean(axis=(1, 3), dtype=np.float32))
@@ -102,7 +102,7 @@ def _pyramid(target: NestedTarget, level: int) -> tuple[Image, ...]:
 
 
 @lru_cache(maxsize=64)
-def _board(target: NestedTarget, level: int) -> Image:
+def _draw_board(target: NestedTarget, level: int) -> Image:
     """(3 cells, 3 cells) texels."""
     board = np.ones((RATIO * _CELL, RATIO * _CELL), dtype=np.float32)
     border = (_CELL - MARKER_BITS * _TEXELS_PER_BIT) // 2
@@ -112,7 +112,7 @@ def _board(target: NestedTarget, level: int) -> Image:
         top, left = ((c + 1) * _CELL + border for c in (row, column))
         board[top : top + len(marker), left : left + len(marker)] = marker
     if level + 1 < target.levels:
-        inner = _board(target, level + 1)
+        inner = _draw_board(target, level + 1)
         shrunk = inner.reshape(_CELL, RATIO, _CELL, RATIO).mean(axis=(1, 3), dtype=np.float32)
         board[_CELL : 2 * _CELL, _CELL : 2 * _CELL] = shrunk
     board.setflags(write=False)
