@@ -175,7 +175,7 @@ def _judged(
 ) -> None:
     """Where the target was in the frames since the last change, by the true camera; mixed frames fail."""
     camera = microscope.camera_at(g)
-    rectifier, plane = Rectifier("cubic"), PlaneCamera.of(camera)
+    rectifier, plane = Rectifier("cubic"), PlaneCamera.from_camera(camera)
     for stamp in list(suite.images)[first:]:
         image = suite.images[stamp]
         fit = fit_pose(find_target(rectifier.rectify(image, camera), NestedTarget()), plane)

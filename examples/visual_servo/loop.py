@@ -121,14 +121,14 @@ def servo_run(task: Task, case: Case) -> Run:
             command_s = start_s + period_s
             step = servo.update(
                 view,
-                PlaneCamera.of(camera),
+                PlaneCamera.from_camera(camera),
                 start_s + scope.timing.centre_offset_s,
                 interval_s=period_s,
                 now_s=command_s,
                 shift_m=shift_m,
             )
             scene.set_twist(command_s, (step.twist[0], step.twist[1]), step.twist[2])
-            servo.sent(command_s, step.twist)
+            servo.record_command(command_s, step.twist)
             _record(run, task, g, frame, step)
             start_s = command_s
         run.images[g] = frame.image

@@ -187,7 +187,7 @@ def _echo_result(done: CantileverMeasurement) -> None:
     for one in done.series:
         label = f"{one.measured.magnification:g}x"
         echo_notes(f"{label}: {note}" for note in one.measured.notes)
-        beam = one.measured.rest
+        beam = one.measured.undeformed
         if math.isfinite(beam.length_m):
             length, sigma = 1e6 * beam.length_m, 1e6 * beam.length_sigma_m
             click.echo(f"{label}: {length:.4f} +- {sigma:.4f} um long by the calibration")

@@ -15,6 +15,7 @@ from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,
     Servo,
+    ServoStatus,
     ServoStep,
     choose_projection,
     find_target,
@@ -125,14 +126,14 @@ class VisualServo(SemNode):
     def _halt(self, reason: str) -> None:
         """Stop the stage."""
         self._send(np.zeros(3))
-        self._servo.stopped(reason)
+        self._servo.stop(ServoStatus.NOT_READY, reason)
         self._tell(reason)
 
     def _send(self, twist: np.ndarray[Any, Any]) -> None:
         if self._stage is None:
             return
         self._stage.send(twist)
-        self._servo.sent(self._now_s(), twist)
+        self._servo.record_command(self._now_s(), twist)
         self.statistics.note("servo_speed_m_s", float(np.hypot(twist[0], twist[1])))
 
     def _tell(self, state: str) -> None:
@@ -169,14 +170,14 @@ class VisualServo(SemNode):
 
     def _step_of(self, frame: ServoFrame, before: tuple[int, float] | None) -> ServoStep:
         if before is None or frame.stamp_ns <= before[0]:
-            return self._servo.stopped("waiting for a second frame")
+            return self._servo.stop(ServoStatus.NOT_READY, "waiting for a second frame")
         self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
         try:
             projection = choose_projection(frame.k, frame.projections)
             camera = PlaneCamera.from_projection(projection, self.settings["height_m"])
         except NODE_ERRORS as error:
             self.warn_seldom(str(error))
-            return self._servo.stopped(" ".join(str(error).split()))
+            return self._servo.stop(ServoStatus.NOT_READY, " ".join(str(error).split()))
         view = find_target(frame.image, self._target)
         time_s, now_s = self._times(frame.stamp_ns)
         in_instrument = self.settings["goal_frame"] == "instrument"

@@ -179,7 +179,7 @@ def test_drift_inside_a_frame_shears_it_by_velocity_times_time(averages: int) ->
 
 def test_averaging_is_the_mean_of_the_single_passes() -> None:
     single = preset("jsm820").with_timing(ScanTiming(0.5, 1, 0.1))
-    average_edges = preset("jsm820").with_timing(ScanTiming(0.5, 4, 0.1))
+    averaged = preset("jsm820").with_timing(ScanTiming(0.5, 4, 0.1))
     board, pose, g = ChessGrid(2e-6), Pose.flat(rotation_rad=0.1), 5000.0
     for speed, tolerance in ((2e-6, 1e-5), (4e-9, 0.02)):
         # Fast: every pass is drawn. Slow (0.17 px in all): drawn once, and the smear is left out.
@@ -192,7 +192,7 @@ def test_averaging_is_the_mean_of_the_single_passes() -> None:
             render_reflectivity(single, board, pose, g, start_time_s=0.5 * k, drift=drift)
             for k in range(4)
         ]
-        image = render_reflectivity(average_edges, board, pose, g, drift=drift)
+        image = render_reflectivity(averaged, board, pose, g, drift=drift)
         assert np.abs(image - np.mean(passes, axis=0)).max() < tolerance
 
 

@@ -31,7 +31,7 @@ def found_pose(g: float, pose: PlanePose, detector: Detector, size: int = 512):
     image = render_frame(scope, TargetSpecimen(), flat, g, detector=detector, seed=3)
     camera = scope.camera_at(g)
     view = find_target(Rectifier("cubic").rectify(image, camera), TARGET)
-    return fit_pose(view, PlaneCamera.of(camera)), camera
+    return fit_pose(view, PlaneCamera.from_camera(camera)), camera
 
 
 def test_a_box_of_any_size_sees_its_mean() -> None:

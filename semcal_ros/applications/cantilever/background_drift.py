@@ -52,12 +52,12 @@ class Background:
     ----------
     path
         Drift of all frames.
-    still
+    weight
         (h, w) float32 weights of the raw pixels at zero drift: 1 where nothing moves by itself.
     """
 
     path: DriftPath
-    still: Image
+    weight: Image
 
 
 def follow_background(
@@ -95,14 +95,14 @@ def follow_background(
         beam &= along > first - 0.2 * axis.half_width_m
     rough_px = _estimate_rough_drift(pictures, beam)
     moving = _find_changes(pictures, rough_px, beam)
-    still = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
+    weight = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
     tracker = DriftTracker(history=history)
     for picture, time_s, shift in zip(pictures, times_s, rough_px, strict=True):
-        weight = _shift_image(still, shift)
-        tracker.update(_cover(picture, weight), time_s, plane.camera, plane.timing)
+        shifted = _shift_image(weight, shift)
+        tracker.update(_cover(picture, shifted), time_s, plane.camera, plane.timing)
         on_frame()
-    return Background(history.smooth(), still)
+    return Background(history.smooth(), weight)
 
 
 def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:

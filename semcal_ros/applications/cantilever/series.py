@@ -123,8 +123,8 @@ class Series:
     ----------
     magnification
         Magnification g.
-    rest
-        The beam at rest.
+    undeformed
+        The beam at undeformed.
     frames
         One result for each frame.
     shape
@@ -136,7 +136,7 @@ class Series:
     """
 
     magnification: float
-    rest: UndeformedBeam
+    undeformed: UndeformedBeam
     frames: tuple[Deflection, ...]
     shape: Shape
     drift: DriftPath
@@ -186,12 +186,12 @@ def measure_series(
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
     work = _SeriesMeasurement(images, plane, background.path, settings, rough)
-    rest = measure_undeformed_beam(
-        rough, [work.view(rough, k) for k in reference], settings.length_m, plane.pixel_m
+    undeformed = measure_undeformed_beam(
+        rough, [work.sample(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
-    frames, shape = work.deflections(rest, tuple(reference), on_frame)
-    notes = _collect_notes(rest, frames, background.path, settings)
-    return Series(camera.magnification, rest, tuple(frames), shape, background.path, notes)
+    frames, shape = work.deflections(undeformed, tuple(reference), on_frame)
+    notes = _collect_notes(undeformed, frames, background.path, settings)
+    return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
 
 def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequence[int]) -> None:
@@ -221,16 +221,19 @@ def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
 
 
 def _collect_notes(
-    rest: UndeformedBeam, frames: Sequence[Deflection], path: DriftPath, settings: SeriesSettings
+    undeformed: UndeformedBeam,
+    frames: Sequence[Deflection],
+    path: DriftPath,
+    settings: SeriesSettings,
 ) -> tuple[str, ...]:
-    notes = list(rest.notes)
+    notes = list(undeformed.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
         notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
     if lost := int(np.count_nonzero(~path.trusted)):
         notes.append(f"no drift in {lost} of {len(path)} frames: they rest on the base alone")
-    if abs(rest.length_m / settings.length_m - 1.0) > _WRONG_LENGTH:
+    if abs(undeformed.length_m / settings.length_m - 1.0) > _WRONG_LENGTH:
         notes.append(
-            f"by the calibration the cantilever is {1e6 * rest.length_m:.4g} um long and not "
+            f"by the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long and not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
         )
     return tuple(notes)
@@ -262,23 +265,23 @@ class _SeriesMeasurement:
         near = (np.abs(across) < wide) & (along > first - room) & (along < last + room)
         return np.flatnonzero(near)
 
-    def view(self, axis: Axis, frame: int) -> PixelSamples:
+    def sample(self, axis: Axis, frame: int) -> PixelSamples:
         """Pixels in coordinates of the axis, freed of drift, and their grey levels."""
         x, y = self._plane.specimen(self._pixels, self._path[frame].raster)
         grey = self._images[frame].ravel()[self._pixels].astype(np.float64)
         return (*axis.coordinates(x, y), grey)
 
     def deflections(
-        self, rest: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
+        self, undeformed: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
     ) -> tuple[list[Deflection], Shape]:
         """All frames in the order of time, each begun where the one before was; their shape."""
         edges, free = [], []
         terms = np.zeros(2)
         for frame in range(len(self._images)):
-            view = self.view(rest.axis, frame)
-            terms = np.zeros(2) if frame in reference else self._nearby(view, rest, terms)
-            edges.append(self._edges(view, rest, terms))
-            free.append(self._bending(frame, edges[-1], rest, reference, None))
+            samples = self.sample(undeformed.axis, frame)
+            terms = np.zeros(2) if frame in reference else self._nearby(samples, undeformed, terms)
+            edges.append(self._edges(samples, undeformed, terms))
+            free.append(self._bending(frame, edges[-1], undeformed, reference, None))
             if np.isfinite(free[-1].deflection_m):
                 terms = free[-1].coefficients[2:]
             on_frame()
@@ -287,13 +290,13 @@ class _SeriesMeasurement:
             others = [f for k, f in enumerate(free) if k not in reference]
             own = [free[k].covariance[1, 1] for k in reference]
             shape = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
-        bent = [self._bending(k, fit, rest, reference, shape) for k, fit in enumerate(edges)]
-        return [self._result(k, one, rest) for k, one in enumerate(bent)], shape
+        bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
+        return [self._result(k, one, undeformed) for k, one in enumerate(bent)], shape
 
-    def _nearby(self, view: PixelSamples, rest: UndeformedBeam, terms: Array) -> Array:
+    def _nearby(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> Array:
         """A bending to start from: that with the largest contrast between beam and surroundings."""
-        model, reach = rest.model, self._settings.reach_m
-        along, across, grey = view
+        model, reach = undeformed.model, self._settings.reach_m
+        along, across, grey = samples
         line = evaluate_bending(np.array([1.5, -0.5]), along / self._settings.length_m)
         centres = model.centres_m
         inside = (along > centres[0]) & (along < centres[-1])
@@ -314,30 +317,32 @@ class _SeriesMeasurement:
                 best, found = contrast, float(end)
         return terms if abs(found - now) < step else found * np.array([1.5, -0.5])
 
-    def _edges(self, view: PixelSamples, rest: UndeformedBeam, terms: Array) -> EdgeFit:
+    def _edges(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> EdgeFit:
         """Edges of a frame, looked for again where the first look has found the beam."""
-        length, model = self._settings.length_m, rest.model
+        length, model = self._settings.length_m, undeformed.model
         u = model.centres_m / length
-        fit = fit_edges(*view, model, rest.across_m + evaluate_bending(terms, u)[:, None])
+        fit = fit_edges(*samples, model, undeformed.across_m + evaluate_bending(terms, u)[:, None])
         for _ in range(2):
-            rough = fit_bending(u, fit.across_m - rest.across_m, fit.sigma_m, length, _UNTRACKED_M)
+            rough = fit_bending(
+                u, fit.across_m - undeformed.across_m, fit.sigma_m, length, _UNTRACKED_M
+            )
             if not np.isfinite(rough.deflection_m):
                 break
             r0, r1 = rough.coefficients[:2]
             expected = r0 + r1 * u + rough.curve(u)
-            fit = fit_edges(*view, model, rest.across_m + expected[:, None])
+            fit = fit_edges(*samples, model, undeformed.across_m + expected[:, None])
         return fit
 
     def _bending(
         self,
         frame: int,
         fit: EdgeFit,
-        rest: UndeformedBeam,
+        undeformed: UndeformedBeam,
         reference: tuple[int, ...],
         shape: Shape | None,
     ) -> Bending:
         """Bending against the reference."""
-        length, normal, path = self._settings.length_m, rest.axis.normal, self._path
+        length, normal, path = self._settings.length_m, undeformed.axis.normal, self._path
         covariance = path.covariance[:, :2, :2]
         before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
         offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
@@ -345,26 +350,29 @@ class _SeriesMeasurement:
             offset = max(offset, _UNTRACKED_M)
         # The reference against itself has its own noise only.
         alone = frame in reference and len(reference) == 1
-        noise = fit.sigma_m if alone else np.hypot(fit.sigma_m, rest.sigma_m)
-        ratio = fit.step / np.maximum(rest.step, 1e-12)
-        same = (ratio > _SAME_STEP[0]) & (ratio < _SAME_STEP[1]) & np.isfinite(rest.sigma_m)
+        noise = fit.sigma_m if alone else np.hypot(fit.sigma_m, undeformed.sigma_m)
+        ratio = fit.step / np.maximum(undeformed.step, 1e-12)
+        same = (ratio > _SAME_STEP[0]) & (ratio < _SAME_STEP[1]) & np.isfinite(undeformed.sigma_m)
         noise = np.where(same, noise, np.inf)
-        moved = fit.across_m - rest.across_m
+        moved = fit.across_m - undeformed.across_m
         noise = np.where(find_unchanged_width(moved, noise)[:, None], noise, np.inf)
-        u = rest.model.centres_m / length
+        u = undeformed.model.centres_m / length
         found = fit_bending(u, moved, noise, length, offset, shape)
         if abs(found.deflection_m) > _ABSURD * self._settings.reach_m:
             # Not the beam: as if nothing had been seen.
             return fit_bending(u, moved, np.full_like(noise, np.inf), length, offset, shape)
         return found
 
-    def _result(self, frame: int, bending: Bending, rest: UndeformedBeam) -> Deflection:
-        length, axis, camera = self._settings.length_m, rest.axis, self._plane.camera
+    def _result(self, frame: int, bending: Bending, undeformed: UndeformedBeam) -> Deflection:
+        length, axis, camera = self._settings.length_m, undeformed.axis, self._plane.camera
         value, noise = bending.deflection_m, bending.sigma_m
         known = 0.0 if np.isnan(value) else value
         scale = scale_covariance(camera, known * axis.normal, np.zeros(2))[:2, :2]
         sigma = float(np.sqrt(noise**2 + axis.normal @ scale @ axis.normal))
-        factor, relative = length / rest.length_m, rest.length_sigma_m / rest.length_m
+        factor, relative = (
+            length / undeformed.length_m,
+            undeformed.length_sigma_m / undeformed.length_m,
+        )
         terms = np.nan_to_num(bending.coefficients[2:])
         end = axis.point(np.array([locate_end(terms, length)]), np.array([known]))
         along = np.linspace(*axis.visible_m, _LINE_POINTS)

@@ -74,7 +74,7 @@ class Adjustment:
     _coupling: Array
     _inverse_poses: Array
 
-    def variance_of(self, gradient: Array) -> float:
+    def propagate_variance(self, gradient: Array) -> float:
         """Variance of a function of the points with the (points, 3) gradient, poses' errors included."""
         direct = np.einsum("pi,pij,pj->", gradient, self._inverse_points, gradient, optimize=True)
         moved = np.einsum("pij,pj->pi", self._inverse_points, gradient).ravel()
@@ -127,7 +127,7 @@ class _Problem:
         y = py + scale * moved[:, 1] / a
         return seen.xy - np.stack([x, y], axis=1), turned, moved
 
-    def whitened(self, error: Array) -> Array:
+    def whiten(self, error: Array) -> Array:
         white = np.einsum("nij,nj->ni", self.observed.root, error)
         return np.asarray(white, dtype=np.float64)
 
@@ -139,7 +139,7 @@ class _Problem:
         return np.asarray(state.points @ self.beam / _POINT_SPREAD, dtype=np.float64)
 
     def cost(self, state: _State, sigma: float) -> float:
-        white = self.whitened(self.residuals(state)[0]) / sigma
+        white = self.whiten(self.residuals(state)[0]) / sigma
         priors = np.sum(self.heights(state) ** 2) + np.sum(self.depths(state) ** 2)
         return _compute_loss(white) + 0.5 * float(priors)
 
@@ -157,7 +157,7 @@ class _Problem:
         by_xyz[:, 1, 1] = m / (a * w)
         predicted = seen.xy - error
         by_xyz[:, :, 2] = -(rho / w)[:, None] * (predicted - np.stack([px, py], axis=1))
-        white = self.whitened(error) / sigma
+        white = self.whiten(error) / sigma
         weight = 1.0 / (1.0 + np.sum(white**2, axis=1) / _ROBUST**2)
         root = seen.root * (np.sqrt(weight) / sigma)[:, None, None]
         rows = root @ by_xyz
@@ -300,7 +300,7 @@ def _form_schur_complement(
 
 def _estimate_scale(problem: _Problem, state: _State) -> float:
     """Robust scale of the whitened residuals, corrected for the parameters that they determine."""
-    white = problem.whitened(problem.residuals(state)[0])
+    white = problem.whiten(problem.residuals(state)[0])
     size = 2.0 * len(white)
     spent = 3.0 * len(state.points) + 6.0 * problem.views
     median = float(np.median(np.sum(white**2, axis=1)))
@@ -352,7 +352,7 @@ def _finish(
     each = by_view[np.arange(problem.views), :, np.arange(problem.views), :]
     factor = np.array([1.0, 1.0, 1.0, unit_m, unit_m, unit_m])
     error = problem.residuals(state)[0]
-    white = problem.whitened(error) / sigma
+    white = problem.whiten(error) / sigma
     return Adjustment(
         rotations=state.rotations,
         translations_m=state.translations * unit_m,

@@ -91,7 +91,7 @@ def measure_ball(
         If there is no sphere in the structure.
     """
     sphere = fit_sphere(structure.points_m, structure.normal_sigma_m)
-    variance = structure.adjustment.variance_of(sphere.radius_gradient)
+    variance = structure.adjustment.propagate_variance(sphere.radius_gradient)
     noise = 2.0 * np.sqrt(variance * _count_sharing(structure))
     groups = min(groups, len(structure.cameras) // 4)
     freedom = np.inf
@@ -137,7 +137,7 @@ def _run_jackknife(structure: Structure, sphere: SphereFit, groups: int) -> floa
     diameters = []
     inliers = np.flatnonzero(sphere.inliers)
     for left_out in range(groups):
-        part = seen.chosen(group[seen.view] != left_out)
+        part = seen.select(group[seen.view] != left_out)
         fewer = adjust(
             part,
             structure.cameras,
@@ -170,7 +170,7 @@ def _compute_scale_sigma(structure: Structure, height_sigma_m: float) -> float:
 def _mesh_ball(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
     points = structure.points_m[sphere.inliers]
     radius = max(2.0 * compute_spacing_m(points), 0.12 * sphere.radius_m)
-    surface = fit_local_surface(points, points, radius).facing(points - sphere.centre_m)
+    surface = fit_local_surface(points, points, radius).orient(points - sphere.centre_m)
     return triangulate_cloud(surface.points_m, sphere.centre_m, surface.normals, surface.sigma_m)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["AffineEpipolar", "epipolar_of", "fit_epipolar"]
+__all__ = ["AffineEpipolar", "fit_epipolar"]
 
 
 _LEAST_POINTS = 5
@@ -54,26 +54,10 @@ class AffineEpipolar:
         return np.asarray(joint @ self.normal + self.offset, dtype=np.float64)
 
 
-def epipolar_of(first: Array, second: Array) -> AffineEpipolar:
-    """Epipolar geometry from at least four point pairs (n, 2), all of them trusted.
-
-    Raises
-    ------
-    StructureError
-        For fewer than four pairs.
-    """
-    if len(first) < _LEAST_POINTS - 1:
-        raise StructureError(f"{len(first)} points in two views", expected="at least 4")
-    normal, offset = _fit_plane(np.hstack([second, first]))
-    distance = np.hstack([second, first]) @ normal + offset
-    everything = np.ones(len(first), dtype=bool)
-    return AffineEpipolar(normal, offset, everything, _compute_rms(distance))
-
-
 def fit_epipolar(
     first: Array, second: Array, tolerance: float, *, trials: int = 200, seed: int = 0
 ) -> AffineEpipolar:
-    """Epipolar geometry of pairs (n, 2) of which some are wrong (RANSAC, then refitted).
+    """Fit the epipolar geometry to pairs of which some are wrong, by RANSAC and a refit.
 
     Parameters
     ----------

@@ -167,17 +167,17 @@ class SequenceTracker:
                 f"a frame at {time_s} s after one at {self._last_time_s} s",
                 expected="frames in the order of their times",
             )
-        seen = self._looked_at(image, camera)
+        seen = self._prepare_frame(image, camera)
         picture = convert_for_tracking(seen)
         index, self.frames = self.frames, self.frames + 1
         previous_s, self._last_time_s = self._last_time_s, time_s
         reference = self._reference
         if reference is None:
-            ids, xy = self._detected(seen, np.empty((0, 2)))
+            ids, xy = self._detect(seen, np.empty((0, 2)))
             self._keep(index, time_s, image, camera, picture, ids, xy, None)
             return True
         start = reference.latest_m
-        raw, found = self._tracked(reference, picture, camera)
+        raw, found = self._track(reference, picture, camera)
         now_m = project_to_plane(camera, raw)
         found &= np.all(np.isfinite(now_m), axis=1)
         motion = _fit_affine_motion(start[found], now_m[found], time_s - previous_s)
@@ -189,9 +189,9 @@ class SequenceTracker:
         reference.latest_m = np.where(found[:, None], now_m, start + common)
         if not self._is_new(reference, found, now_m, camera):
             return False
-        good = self._consistent(reference, found, now_m, camera)
+        good = self._check_epipolar(reference, found, now_m, camera)
         kept_ids, kept = reference.frame.ids[good], raw[good]
-        ids, xy = self._detected(seen, kept)
+        ids, xy = self._detect(seen, kept)
         self._keep(
             index,
             time_s,
@@ -206,14 +206,14 @@ class SequenceTracker:
 
     def finish(self) -> list[TrackKeyframe]:
         """All keyframes, each with the movement during its acquisition."""
-        self._settle()
+        self._finish_motions()
         return self.keyframes
 
     # -- tracking ---------------------------------------------------------------------------------
 
-    def _looked_at(self, image: NDArray[Any], camera: ScanCamera) -> Appearance:
+    def _prepare_frame(self, image: NDArray[Any], camera: ScanCamera) -> Appearance:
         """The picture as it is compared; plain grey far from where features are expected, to save time."""
-        box = self._expected(camera)
+        box = self._expect_box(camera)
         seen = prepare_appearance(image[box], smoothing_px=self.settings.smoothing_px)
         if seen.smooth.shape == image.shape:
             return seen
@@ -221,7 +221,7 @@ class SequenceTracker:
         smooth[box], texture[box] = seen.smooth, seen.texture
         return Appearance(smooth, texture, seen.noise, seen.smoothing_px)
 
-    def _expected(self, camera: ScanCamera) -> tuple[slice, slice]:
+    def _expect_box(self, camera: ScanCamera) -> tuple[slice, slice]:
         """Rows and columns of the features of the last frame, with room to move and to find new ones."""
         reference = self._reference
         everything = (slice(0, camera.height), slice(0, camera.width))
@@ -230,7 +230,7 @@ class SequenceTracker:
         raw = _project_from_plane(camera, reference.latest_m[reference.alive])
         return _make_box(raw, camera, self.settings.room_px)[0]
 
-    def _tracked(
+    def _track(
         self, reference: _Reference, picture: NDArray[np.uint8], camera: ScanCamera
     ) -> tuple[Array, Mask]:
         """Raw positions (n, 2) of the reference's features in the new frame, and which were found."""
@@ -272,7 +272,7 @@ class SequenceTracker:
         against = moved - np.median(moved, axis=0)
         return float(np.median(np.linalg.norm(against, axis=1))) > self.settings.parallax_px
 
-    def _consistent(
+    def _check_epipolar(
         self, reference: _Reference, found: Mask, now_m: Array, camera: ScanCamera
     ) -> Mask:
         """Found features that agree with the epipolar geometry of the two keyframes."""
@@ -288,7 +288,7 @@ class SequenceTracker:
 
     # -- features ---------------------------------------------------------------------------------
 
-    def _detected(self, seen: Appearance, taken: Array) -> tuple[Indices, Array]:
+    def _detect(self, seen: Appearance, taken: Array) -> tuple[Indices, Array]:
         """Numbers and places (raw px) of new features away from those that are there."""
         s = self.settings
         response, from_noise = seen.corner_response()
@@ -324,7 +324,7 @@ class SequenceTracker:
         xy: Array,
         motion: Array | None,
     ) -> None:
-        self._settle()
+        self._finish_motions()
         frame = TrackKeyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
         self.keyframes.append(frame)
         latest = project_to_plane(camera, xy)
@@ -332,7 +332,7 @@ class SequenceTracker:
             picture, frame, latest, np.ones(len(ids), dtype=bool), motion, None
         )
 
-    def _settle(self) -> None:
+    def _finish_motions(self) -> None:
         """Give the last keyframe its velocity: the mean of those before and after it."""
         reference = self._reference
         if reference is None:

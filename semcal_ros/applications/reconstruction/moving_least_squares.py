@@ -31,7 +31,7 @@ class LocalSurface:
     points_m
         (n, 3) points moved onto the surface.
     normals
-        (n, 3) unit normals; their sign is arbitrary until :meth:`facing`.
+        (n, 3) unit normals; their sign is arbitrary until :meth:`orient`.
     curvature_1_m
         (n,) mean curvature, 1/m, positive where the surface bends away from the normal (a ball with
         outward normals).
@@ -44,7 +44,7 @@ class LocalSurface:
     curvature_1_m: Array
     sigma_m: Array
 
-    def facing(self, directions: Array) -> LocalSurface:
+    def orient(self, directions: Array) -> LocalSurface:
         """The same with normals that point along the given directions (n, 3)."""
         sign = np.where(np.sum(self.normals * directions, axis=1) < 0.0, -1.0, 1.0)
         return LocalSurface(

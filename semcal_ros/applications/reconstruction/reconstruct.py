@@ -181,17 +181,17 @@ def reconstruct(
         metric.rotations[views],
         metric.translations_m[views],
         metric.points_m[points],
-        Observations.of_tracks(placed, cameras, 0.3),
+        Observations.from_tracks(placed, cameras, 0.3),
     )
     on_step("adjusting")
-    work.first()
+    work.adjust_tracks()
     work.looks = [
         prepare_appearance(frame.image, smoothing_px=chosen.smoothing_px)
         for frame in work.keyframes
     ]
     while not work.settled and work.passes < chosen.most_passes:
         on_step(f"measuring, pass {work.passes + 1}")
-        work.refined()
+        work.refine()
     on_step("uncertainty")
     return work.structure(len(keyframes), tracks.seen.shape[1], metric.condition)
 
@@ -250,13 +250,13 @@ class _Refinement:
         self.passes, self.settled = 0, False
         self.pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in cameras]))
 
-    def first(self) -> None:
+    def adjust_tracks(self) -> None:
         """Adjust the tracks, drop what does not fit, choose between the mirror images."""
         self._prune(self.settings.least_track)
         for _ in range(2):
             self._adjust()
             assert self.adjusted is not None
-            self.seen = self.seen.chosen(self.adjusted.weights > 0.3)
+            self.seen = self.seen.select(self.adjusted.weights > 0.3)
             self._prune(self.settings.least_track, worst_px=4.0 * self.settings.worst_sigma_px)
         self._merge()
         _normals, curvature = self._surface(wide=True)
@@ -265,7 +265,7 @@ class _Refinement:
                 self.rotations, self.translations, self.points
             )
 
-    def refined(self) -> None:
+    def refine(self) -> None:
         """Measure all patches against their templates, and adjust."""
         ids, before = self.ids, self.points
         normals, curvature = self._surface()
@@ -276,14 +276,14 @@ class _Refinement:
         self._prune(self.settings.least_views)
         self._adjust()
         assert self.adjusted is not None
-        self.seen = self.seen.chosen(self.adjusted.weights > 0.25)
+        self.seen = self.seen.select(self.adjusted.weights > 0.25)
         self._prune(self.settings.least_views, worst_px=self.settings.worst_sigma_px)
         self.passes += 1
-        self.settled = self._moved_sigma(before[np.isin(ids, self.ids)]) < (
+        self.settled = self._measure_change_in_sigma(before[np.isin(ids, self.ids)]) < (
             self.settings.settled_sigma
         )
 
-    def _moved_sigma(self, before: Array) -> float:
+    def _measure_change_in_sigma(self, before: Array) -> float:
         """RMS way of the points from where they were, moved and turned to fit, over their RMS 1-sigma."""
         assert self.adjusted is not None
         centred = self.points - self.points.mean(axis=0), before - before.mean(axis=0)
@@ -335,7 +335,7 @@ class _Refinement:
             )
         use = points[self.seen.point] & views[self.seen.view]
         new_point, new_view = np.cumsum(points) - 1, np.cumsum(views) - 1
-        seen = self.seen.chosen(use)
+        seen = self.seen.select(use)
         self.seen = replace(seen, view=new_view[seen.view], point=new_point[seen.point])
         self.points, self.ids = self.points[points], self.ids[points]
         self.rotations, self.translations = self.rotations[views], self.translations[views]
@@ -364,7 +364,7 @@ class _Refinement:
         surface = fit_local_surface(self.points, self.points, radius, steps=1)
         towards = np.zeros((len(self.points), 3))
         np.add.at(towards, self.seen.point, -self.rotations[self.seen.view, 2])
-        surface = surface.facing(towards)
+        surface = surface.orient(towards)
         return surface.normals, surface.curvature_1_m
 
     def structure(self, keyframes: int, tracked: int, condition: float) -> Structure:
@@ -397,7 +397,7 @@ class _Refinement:
             tracked=tracked,
             unplaced=keyframes - len(self.cameras),
             relief_condition=condition,
-            relief_sigma=float(np.sqrt(done.variance_of(gradient))),
+            relief_sigma=float(np.sqrt(done.propagate_variance(gradient))),
             convexity=float(np.mean(bulge > 0.0)),
             mirror_sigma=float(np.sign(preference) * np.sqrt(2.0 * abs(preference))),
             patch_sigma_m=WINDOW * self.settings.patches.half_px * self.pixel_m,

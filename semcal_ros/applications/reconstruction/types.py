@@ -64,12 +64,12 @@ class Observations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def chosen(self, keep: Mask | Indices) -> Observations:
+    def select(self, keep: Mask | Indices) -> Observations:
         """Some of them."""
         return Observations(self.view[keep], self.point[keep], self.xy[keep], self.root[keep])
 
     @staticmethod
-    def of_tracks(
+    def from_tracks(
         tracks: Tracks, cameras: Sequence[ScanCamera], sigma_px: float = 1.0
     ) -> Observations:
         """All that is seen in tracks, with one standard deviation."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from semcal_ros.applications.servoing.axis import AxisObserver
 from semcal_ros.applications.servoing.detection import TargetView, find_target
-from semcal_ros.applications.servoing.law import Servo, ServoStep
+from semcal_ros.applications.servoing.law import Servo, ServoStatus, ServoStep
 from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera, choose_projection
 from semcal_ros.applications.servoing.pose import (
@@ -26,6 +26,7 @@ __all__ = [
     "PoseFit",
     "Servo",
     "ServoSettings",
+    "ServoStatus",
     "ServoStep",
     "TargetView",
     "choose_projection",

@@ -47,7 +47,7 @@ class AxisObserver:
         """1-sigma in the worst direction, px."""
         return float(np.sqrt(max(float(np.linalg.eigvalsh(self.covariance)[-1]), 0.0)))
 
-    def corrected(self, camera: PlaneCamera) -> PlaneCamera:
+    def correct(self, camera: PlaneCamera) -> PlaneCamera:
         """The camera with its axis where it was found."""
         if not np.any(self.offset_px):
             return camera

@@ -52,12 +52,12 @@ class TargetView:
         """Whether the target was found."""
         return not self.reason
 
-    def moved(self, xy: Array) -> TargetView:
+    def with_corners(self, xy: Array) -> TargetView:
         """The same markers with their corners (n, 4, 2) elsewhere."""
         return TargetView(self.ids, self.target_xy_m, xy, self.covariance_px2, self.reason)
 
-    def chosen(self, keep: Mask) -> TargetView:
-        """Some of the markers."""
+    def select(self, keep: Mask) -> TargetView:
+        """Keep some of the markers."""
         return TargetView(
             self.ids[keep],
             self.target_xy_m[keep],

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,9 +30,9 @@ from semcal_ros.applications.servoing.pose import (
 )
 from semcal_ros.applications.servoing.settings import ServoSettings
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, Rejection
 
-__all__ = ["Servo", "ServoStep"]
+__all__ = ["Servo", "ServoStatus", "ServoStep"]
 
 
 # Part of the error that is taken away per frame, at most. With the latency foretold, up to 2 is stable; without any
@@ -45,8 +46,14 @@ _LONGEST_LATENCY_S = 30.0
 _LATE = 0.5
 
 
-def _nothing() -> Array:
-    return np.zeros(3)
+class ServoStatus(Enum):
+    """Why the stage stands still."""
+
+    NOT_READY = "not ready"
+    NO_POSE = "no pose"
+    WRONG_SCALE = "wrong scale"
+    UNCERTAIN = "uncertain"
+    FAULT = "fault"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +63,7 @@ class ServoStep:
     Attributes
     ----------
     twist
-        (3,) commanded velocity in the sem frame: m/s, m/s, rad/s; zero where there is a ``reason``.
+        (3,) commanded velocity in the sem frame: m/s, m/s, rad/s; zero where there is a ``rejection``.
     error
         (3,) target minus goal at the centre of the frame's acquisition: m, m, rad.
     error_covariance
@@ -78,11 +85,11 @@ class ServoStep:
         What limited the speed; empty where nothing did.
     converged
         Whether the goal is reached and has been for some frames.
-    reason
-        Why the stage stands still; empty where it is servoed.
+    rejection
+        Why the stage stands still; None where it is servoed.
     """
 
-    twist: Array = field(default_factory=_nothing)
+    twist: Array = field(default_factory=lambda: np.zeros(3))
     error: Array = field(default_factory=lambda: np.full(3, np.nan))
     error_covariance: Array = field(default_factory=lambda: np.full((3, 3), np.inf))
     error_px: float = float("nan")
@@ -96,7 +103,12 @@ class ServoStep:
     gain_hz: float = 0.0
     limited: str = ""
     converged: bool = False
-    reason: str = ""
+    rejection: Rejection[ServoStatus] | None = None
+
+    @property
+    def reason(self) -> str:
+        """Why the stage stands still, in words; empty where it is servoed."""
+        return "" if self.rejection is None else self.rejection.reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,19 +156,19 @@ class Servo:
         self.fault = ""
         self._last: _PosedFrame | None = None
         self._near = 0
-        self._watch = StageMonitor()
+        self._monitor = StageMonitor()
         self._observer = DisturbanceObserver(
             self.settings.drift_sigma_m_s, self.settings.drift_change_m_s
         )
 
-    def sent(self, time_s: float, twist: ArrayLike) -> None:
+    def record_command(self, time_s: float, twist: ArrayLike) -> None:
         """Tell which velocity (3,) the stage was given and when; stops count, too."""
         self.history.add(time_s, twist)
 
-    def stopped(self, reason: str, fit: PoseFit | None = None) -> ServoStep:
-        """The step of a frame, or of a time without one, in which the stage has to stand still."""
+    def stop(self, status: ServoStatus, reason: str = "", fit: PoseFit | None = None) -> ServoStep:
+        """Make the step of a frame, or of a time without one, in which the stage stands still."""
         self._near = 0
-        return ServoStep(fit=fit, reason=reason)
+        return ServoStep(fit=fit, rejection=Rejection(status, reason))
 
     def update(
         self,
@@ -197,31 +209,36 @@ class Servo:
                 f"a frame at {time_s} s after {interval_s} s", expected="a positive interval"
             )
         if self.fault:
-            return self.stopped(self.fault)
+            return self.stop(ServoStatus.FAULT, self.fault)
         shift = np.asarray(shift_m, dtype=np.float64)
-        corrected = self._axis_observer.corrected(camera)
+        corrected = self._axis_observer.correct(camera)
         fit = fit_pose(_shift_view(view, corrected, shift), corrected)
-        refusal = self._refusal(fit, corrected)
-        if refusal:
-            return self.stopped(refusal, fit)
-        if self._learnt_axis(fit, camera, time_s):
-            corrected = self._axis_observer.corrected(camera)
+        rejection = self._check(fit, corrected)
+        if rejection is not None:
+            return self.stop(rejection.status, rejection.reason, fit)
+        if self._learn_axis(fit, camera, time_s):
+            corrected = self._axis_observer.correct(camera)
             fit = fit_pose(_shift_view(view, corrected, shift), corrected)
         self._learn(fit, camera, time_s)
         if self.fault:
-            return self.stopped(self.fault, fit)
-        return self._commanded(fit, corrected, time_s, interval_s, now_s)
+            return self.stop(ServoStatus.FAULT, self.fault, fit)
+        return self._command(fit, corrected, time_s, interval_s, now_s)
 
-    def _refusal(self, fit: PoseFit, camera: PlaneCamera) -> str:
+    def _check(self, fit: PoseFit, camera: PlaneCamera) -> Rejection[ServoStatus] | None:
         limits = self.settings
         if not fit.accepted:
-            return fit.reason
+            return Rejection(ServoStatus.NO_POSE, fit.reason)
         if abs(fit.scale - 1.0) > limits.scale_tolerance + 3.0 * fit.scale_sigma:
-            return f"the target is {fit.scale:.3f} times as large as the camera of the frame says"
+            return Rejection(
+                ServoStatus.WRONG_SCALE,
+                f"the target is {fit.scale:.3f} times as large as the camera of the frame says",
+            )
         sigma_px = _compute_origin_sigma(fit, camera)[1]
         if not sigma_px <= limits.max_sigma_px:
-            return f"the pose of the target is only known to {sigma_px:.2g} px"
-        return ""
+            return Rejection(
+                ServoStatus.UNCERTAIN, f"the pose of the target is only known to {sigma_px:.2g} px"
+            )
+        return None
 
     # -- what moves ---------------------------------------------------------------------------------
 
@@ -234,7 +251,7 @@ class Servo:
         way[:2] += np.array([(c - 1.0) * arm[0] - s * arm[1], s * arm[0] + (c - 1.0) * arm[1]])
         return way
 
-    def _expected(
+    def _compare_travel(
         self, fit: PoseFit, before: _PosedFrame, time_s: float
     ) -> tuple[Array, Array, Array]:
         """Way (2,) of the target since the frame before as commanded and as seen; variance (2,) of the difference."""
@@ -247,13 +264,13 @@ class Servo:
         late_m = _LATE * (time_s - before.time_s) * float(np.hypot(change[0], change[1]))
         return way[:2], seen[:2], variance + late_m**2
 
-    def _learnt_axis(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> bool:
+    def _learn_axis(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> bool:
         """Where the magnification has changed, see by how much that moved the target; whether the axis moved, too."""
         before = self._last
         if before is None or camera.is_same(before.camera) or time_s <= before.time_s:
             return False
         interval_s = time_s - before.time_s
-        way, seen, variance = self._expected(fit, before, time_s)
+        way, seen, variance = self._compare_travel(fit, before, time_s)
         drift = self._observer.velocity_m_s * interval_s
         variance = variance + self._observer.variance * interval_s**2
         return self._axis_observer.update(
@@ -267,14 +284,14 @@ class Servo:
         # Two cameras do not agree on a place to the noise of a picture; that is no drift.
         if before is None or not camera.is_same(before.camera) or time_s <= before.time_s:
             return
-        way, seen, variance = self._expected(fit, before, time_s)
+        way, seen, variance = self._compare_travel(fit, before, time_s)
         slope = camera.jacobian(fit.pose.values[None, :2])[0]
-        self.fault = self._watch.update(slope @ way, slope @ seen)
+        self.fault = self._monitor.update(slope @ way, slope @ seen)
         self._observer.update(time_s - before.time_s, seen - way, variance)
 
     # -- command ------------------------------------------------------------------------------------
 
-    def _commanded(
+    def _command(
         self,
         fit: PoseFit,
         camera: PlaneCamera,
@@ -290,12 +307,12 @@ class Servo:
         if known:
             way = self._way(time_s, time_s + latency_s, fit.pose)
             dx, dy = way[:2] + drift * latency_s
-            ahead = fit.pose.moved(float(dx), float(dy), float(way[2]))
+            ahead = fit.pose.displace(float(dx), float(dy), float(way[2]))
         most = _MOST_PER_FRAME if known else _MOST_WITHOUT_TIMES
         gain_hz = min(limits.gain_hz, most / interval_s)
         twist = -gain_hz * self._correction(fit, camera, ahead)
         twist[:2] -= drift
-        twist, limited = self._limited(twist, fit, camera, interval_s)
+        twist, limited = self._limit(twist, fit, camera, interval_s)
         sigma_m, sigma_px = _compute_origin_sigma(fit, camera)
         error = fit.pose.minus(self.goal)
         own = fit.view.target_xy_m.reshape(-1, 2)
@@ -342,7 +359,7 @@ class Servo:
         axis: Array = pose.apply(self.rotation_centre_m[None])[0]
         return axis
 
-    def _limited(
+    def _limit(
         self, twist: Array, fit: PoseFit, camera: PlaneCamera, interval_s: float
     ) -> tuple[Array, str]:
         """The twist, slower but in the same direction where it is too fast."""
@@ -369,7 +386,7 @@ def _shift_view(view: TargetView, camera: PlaneCamera, shift_m: Array) -> Target
     if not view.accepted or not np.any(shift_m):
         return view
     moved = camera.project(camera.plane_from_px(view.xy.reshape(-1, 2)) + shift_m)
-    return view.moved(moved.reshape(view.xy.shape))
+    return view.with_corners(moved.reshape(view.xy.shape))
 
 
 def _compute_origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:

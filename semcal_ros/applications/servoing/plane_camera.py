@@ -57,7 +57,7 @@ class PlaneCamera:
         return cls(np.column_stack([p[:, 0], p[:, 1], p[:, 2] * height_m + p[:, 3]]))
 
     @classmethod
-    def of(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
+    def from_camera(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
         """From a camera, in ideal pixels."""
         return cls.from_projection(camera.P_affine, height_m)
 

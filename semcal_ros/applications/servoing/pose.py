@@ -59,7 +59,7 @@ class PlanePose:
         moved: Array = as_points(target_xy_m, 2) @ self.rotation.T + self.values[:2]
         return moved
 
-    def moved(self, dx_m: float, dy_m: float, turn_rad: float = 0.0) -> PlanePose:
+    def displace(self, dx_m: float, dy_m: float, turn_rad: float = 0.0) -> PlanePose:
         """The pose after a displacement and a turn about the target's origin."""
         return PlanePose(self.x_m + dx_m, self.y_m + dy_m, self.angle_rad + turn_rad)
 
@@ -131,7 +131,7 @@ def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
             break
         if len(kept.ids) <= 2 or 2 * (len(kept.ids) - 1) < len(view.ids):
             return _reject(view, "the markers contradict each other")
-        kept = kept.chosen(np.arange(len(kept.ids)) != int(np.argmax(excess)))
+        kept = kept.select(np.arange(len(kept.ids)) != int(np.argmax(excess)))
     return _adjust(kept, camera, start, scale)
 
 
@@ -175,7 +175,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
         # Columns of m and rad differ by seven orders of magnitude.
         size = np.linalg.norm(design, axis=0)
         step = np.linalg.lstsq(design / size, residual, rcond=None)[0] / size
-        pose = pose.moved(*(float(v) for v in step))
+        pose = pose.displace(*(float(v) for v in step))
         if float(np.max(np.abs(slope @ step))) < _SETTLED_PX:
             settled = True
             break

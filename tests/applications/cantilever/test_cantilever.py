@@ -228,8 +228,8 @@ def test_both_ends_in_view_give_two_scales():
     )
     found, truth = measured(plan, reference=(0, 1))
     # The true camera: both scales are the same but for where the ends are, a pixel being 117 nm.
-    assert abs(found.rest.length_m - LENGTH) < 4.0 * found.rest.length_sigma_m + 10e-9
-    assert found.rest.length_sigma_m < 20e-9
+    assert abs(found.undeformed.length_m - LENGTH) < 4.0 * found.undeformed.length_sigma_m + 10e-9
+    assert found.undeformed.length_sigma_m < 20e-9
     for frame, true in zip(found.frames[2:], truth[2:], strict=True):
         for value, sigma in (
             (frame.deflection_m, frame.sigma_m),

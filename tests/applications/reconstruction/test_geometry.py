@@ -14,7 +14,7 @@ from semcal_ros.applications.reconstruction import (
     mirror_structure,
     upgrade_to_metric,
 )
-from semcal_ros.applications.reconstruction.epipolar import epipolar_of, fit_epipolar
+from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
 from semcal_ros.applications.reconstruction.reconstruct import mirror_poses
 from semcal_ros.core.errors import StructureError
 from tests.helpers.structure_scenes import RADIUS_M, aligned_rms_m, ball_scene
@@ -25,7 +25,7 @@ PIXEL_M = 0.12 / 9500.0 / 2048.0
 def recovered(scene, sigma_px=0.2, height_sigma_m=5e-6):
     """Structure from the tracks alone, the mirror image chosen by the truth."""
     metric = upgrade_to_metric(factorize(scene.tracks))
-    seen = Observations.of_tracks(scene.tracks, scene.cameras, sigma_px)
+    seen = Observations.from_tracks(scene.tracks, scene.cameras, sigma_px)
     start = (metric.rotations, metric.translations_m, metric.points_m)
     if aligned_rms_m(metric.points_m, scene.points_m) > aligned_rms_m(
         mirror_structure(metric.rotations, metric.points_m)[1], scene.points_m
@@ -73,7 +73,7 @@ def test_the_uncertainty_of_the_diameter_is_the_scatter_over_recordings():
         # The scene's heights scatter by 0.3 um, those of two views about each other by 0.42 um.
         _, done = recovered(scene, height_sigma_m=0.42e-6)
         sphere = fit_sphere(done.points_m)
-        sigma = 2.0 * np.sqrt(done.variance_of(sphere.radius_gradient))
+        sigma = 2.0 * np.sqrt(done.propagate_variance(sphere.radius_gradient))
         pulls.append((2.0 * sphere.radius_m - 2.0 * RADIUS_M) / sigma)
     # 10 pulls of unit spread have an RMS within 0.45 and 1.6 in 99.8 of 100 cases.
     assert 0.45 < np.sqrt(np.mean(np.square(pulls))) < 1.6
@@ -91,7 +91,7 @@ def test_wrong_tracks_do_not_spoil_the_shape():
 def test_the_mirror_image_explains_parallel_tracks_as_well():
     scene = ball_scene(views=16, points=100)
     _, done = recovered(scene)
-    seen = Observations.of_tracks(scene.tracks, scene.cameras, 0.2)
+    seen = Observations.from_tracks(scene.tracks, scene.cameras, 0.2)
     start = mirror_poses(done.rotations, done.translations_m, done.points_m)
     other = adjust(seen, scene.cameras, *start, reference=done.reference)
     assert other.cost == pytest.approx(done.cost, rel=0.01)
@@ -107,7 +107,7 @@ def test_small_turns_leave_the_relief_uncertain_and_say_so():
         direction = done.rotations[done.reference][2]
         depth = (done.points_m - done.points_m.mean(axis=0)) @ direction
         gradient = np.outer(depth / np.sum(depth**2), direction)
-        depth_sigma.append(np.sqrt(done.variance_of(gradient)))
+        depth_sigma.append(np.sqrt(done.propagate_variance(gradient)))
     # The relief shows with the square of the turn.
     assert depth_sigma[1] > 8.0 * depth_sigma[0]
 
@@ -138,8 +138,8 @@ def test_epipolar_geometry_does_not_depend_on_drift():
     scene = ball_scene(views=6, points=80)
     both = scene.tracks.seen[0] & scene.tracks.seen[3]
     first, second = (scene.tracks.xy_m[v, both] / PIXEL_M for v in (0, 3))
-    still = epipolar_of(first, second)
-    moved = epipolar_of(first, second + np.array([300.0, -40.0]))
+    still = fit_epipolar(first, second, 1.5)
+    moved = fit_epipolar(first, second + np.array([300.0, -40.0]), 1.5)
     assert np.abs(still.normal @ moved.normal) == pytest.approx(1.0, abs=1e-9)
     # RMS distance in joint space is the noise of one coordinate; five parameters of it are spent.
     assert still.rms == pytest.approx(0.2, rel=0.3)

@@ -71,7 +71,7 @@ def test_a_plane_is_no_sphere():
 def test_moving_least_squares_smooths_and_bends():
     noise_m = 5e-9
     points = cap(600, 75.0, noise_m=noise_m)
-    surface = fit_local_surface(points, points, 120e-9).facing(points)
+    surface = fit_local_surface(points, points, 120e-9).orient(points)
     inner = np.arange(600) < 450  # away from the border
     error = np.linalg.norm(surface.points_m, axis=1) - RADIUS_M
     assert np.std(error[inner]) < 0.5 * noise_m

@@ -33,7 +33,7 @@ LATENCY_S = 0.2
 
 
 def camera_at(g: float) -> PlaneCamera:
-    return PlaneCamera.of(SCOPE.camera_at(g))
+    return PlaneCamera.from_camera(SCOPE.camera_at(g))
 
 
 def view_of(
@@ -57,7 +57,7 @@ def view_of(
 @pytest.mark.parametrize("name", ["jsm820", "strong_perspective", "parallel"])
 def test_a_plane_camera_is_the_camera(name: str) -> None:
     camera, height_m = preset(name).camera_at(3000.0), 20e-6
-    plane = PlaneCamera.of(camera, height_m)
+    plane = PlaneCamera.from_camera(camera, height_m)
     xy_m = np.random.default_rng(0).uniform(-15e-6, 15e-6, (20, 2))
     seen = camera.project_ideal(np.column_stack([xy_m, np.full(20, height_m)]))
     np.testing.assert_allclose(plane.project(xy_m), seen, atol=1e-8)
@@ -90,7 +90,7 @@ def test_a_frame_without_k_is_refused_unless_the_projection_is_parallel() -> Non
 @pytest.mark.parametrize("g", [500.0, 5000.0])
 def test_the_interaction_matrix_is_the_numerical_gradient(name: str, g: float) -> None:
     """Central differences of where points are seen, by stage moves about a centre off the axis."""
-    camera = PlaneCamera.of(preset(name).camera_at(g), 30e-6)
+    camera = PlaneCamera.from_camera(preset(name).camera_at(g), 30e-6)
     field_m = 0.12 / g
     rng = np.random.default_rng(1)
     points = rng.uniform(-0.4, 0.4, (12, 2)) * field_m
@@ -130,14 +130,14 @@ def test_a_misread_marker_is_left_out_and_a_contradiction_refused() -> None:
     view = view_of(pose, camera)
     wrong = view.xy.copy()
     wrong[0] += 40.0
-    fit = fit_pose(view.moved(wrong), camera)
+    fit = fit_pose(view.with_corners(wrong), camera)
     assert fit.accepted
     assert len(fit.view.ids) == len(view.ids) - 1
     assert np.hypot(*fit.pose.minus(pose)[:2]) < 1e-12
-    two = view.chosen(np.arange(len(view.ids)) < 2)
+    two = view.select(np.arange(len(view.ids)) < 2)
     apart = two.xy.copy()
     apart[1] += 200.0
-    assert not fit_pose(two.moved(apart), camera).accepted
+    assert not fit_pose(two.with_corners(apart), camera).accepted
 
 
 def test_commands_add_up_to_a_way() -> None:
@@ -175,14 +175,14 @@ class Plant:
 
     def _go(self, duration_s: float) -> None:
         x, y, turn = (self.obeys @ self.twist) * duration_s
-        self.pose = self.pose.moved(float(x), float(y), float(turn))
+        self.pose = self.pose.displace(float(x), float(y), float(turn))
         self.drift = self.drift + self.drift_m_s * duration_s
         self.time_s += duration_s
 
     @property
     def in_sem(self) -> PlanePose:
         """The target as it lies in the sem frame."""
-        return self.pose.moved(float(self.drift[0]), float(self.drift[1]))
+        return self.pose.displace(float(self.drift[0]), float(self.drift[1]))
 
     def step(self, g: float, *, foretold: bool = True) -> ServoStep:
         """Frame, latency, command, and the rest of the period."""
@@ -199,7 +199,7 @@ class Plant:
             now_s=self.time_s if foretold else None,
             shift_m=self.shift,
         )
-        self.servo.sent(self.time_s, step.twist)
+        self.servo.record_command(self.time_s, step.twist)
         # A stage that is late does not say so.
         self._go(self.late_s)
         self.twist = step.twist
@@ -331,7 +331,7 @@ def test_speeds_stay_within_their_limits_and_the_direction_is_kept() -> None:
 @pytest.mark.parametrize(
     "obeys",
     [np.zeros((3, 3)), -np.eye(3), np.diag([1.0, -1.0, 1.0])],
-    ids=["stuck", "reversed", "mirror_structure"],
+    ids=["stuck", "reversed", "mirrored"],
 )
 def test_a_stage_that_does_not_follow_is_stopped(obeys: np.ndarray) -> None:
     plant = Plant(Servo(GOAL, QUICK), obeys=obeys, pose=PlanePose(5e-6, -25e-6, 0.05))
