@@ -15,9 +15,9 @@ from semcal_ros.applications.cantilever import (
     Repeatability,
     Series,
     SeriesSettings,
+    compare_series,
     group_frames,
     measure_series,
-    compare_series,
 )
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
