@@ -19,7 +19,8 @@ from semcal_ros.core.drift.frame_time import (
 )
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.registration.failures import MatchFailure
 from tests.helpers.drift_scenes import DriftingSpecimen, make_drift_update, small_camera
 
 PX_M = 50e-9
@@ -135,7 +136,9 @@ def test_a_few_outliers_do_no_harm() -> None:
 def test_frames_that_are_refused_or_have_no_keyframe_do_not_count() -> None:
     stream = Stream(wandering(1), 0.8, 1)
     before = stream.estimate()
-    bad: dict[int, dict[str, Any]] = {4: {"accepted": False}, 9: {"keyframe_time_s": float("nan")}}
+    refused = Rejection(MatchFailure.OUTLIER, "far from the prediction")
+    bad: dict[int, dict[str, Any]] = {4: {"rejection": refused}}
+    bad[9] = {"keyframe_time_s": float("nan")}
     bad[15] = {"shear_covariance": np.full((2, 2), np.inf)}
     for k, changes in bad.items():
         stream.updates[k] = replace(stream.updates[k], **changes)
