@@ -13,14 +13,14 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["binned"]
+__all__ = ["bin_image"]
 
 
-def binned(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyImage, ScanCamera]:
+def bin_image(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyImage, ScanCamera]:
     """A picture with no side longer than ``largest_px``, and the camera that takes it.
 
-    Square blocks of pixels are averaged. Rows and columns that fill no block, at the bottom and on
-    the right, are left out.
+    Square blocks of pixels are averaged. Rows and columns at the bottom and on the right that do not
+    fill a block are left out.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def binned(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyIma
 
     Returns
     -------
-    The very same image where it is not longer, and the camera for the size of what is returned.
+    The image itself where it is not longer, and the camera for the size of what is returned.
 
     Raises
     ------
@@ -51,6 +51,6 @@ def binned(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyIma
     kept = small[0] * factor, small[1] * factor
     blocks = cast("NDArray[np.uint8]", image[: kept[1], : kept[0]])
     picture = cv2.resize(blocks, small, interpolation=cv2.INTER_AREA)
-    # Left out at the far ends, they move no other pixel.
+    # What is left out at the far ends moves no other pixel.
     cropped = replace(fitted, width=kept[0], height=kept[1])
     return np.asarray(picture), cropped.resized(*small)

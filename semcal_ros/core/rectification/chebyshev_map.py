@@ -1,4 +1,4 @@
-"""Maps of raw positions that are smooth, from a few exact values.
+"""Maps of raw positions, interpolated from a few exact values.
 
 A map is evaluated exactly at Chebyshev nodes only and interpolated by polynomials in x and y
 (Trefethen 2019, doi:10.1137/1.9781611975949), in bands of rows: a small matrix product per band, of
@@ -7,29 +7,28 @@ which only the values at the nodes depend on the frame.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import lru_cache
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32
+from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 
-__all__ = ["RawMap", "SmoothMaps", "keep"]
+__all__ = ["RawMap", "SmoothMaps"]
 
-_Key = TypeVar("_Key")
-_Value = TypeVar("_Value")
-
-_TESTS = 9
+# Test points along each axis, which lie where none of the degrees has a node.
+_TESTS, _TEST_OFFSET = 9, 0.37
 # The last ones are for residual fields, whose splines are less smooth than the distortion.
 _DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
-# The promise is 0.002 px; between the points where the maps are compared they may differ more.
+# The promise is 0.002 px; between the test points the maps may differ by more.
 _MAX_MAP_ERROR_PX = 0.001
-_KEPT = 16
-# Where there is nothing to be seen: such pixels come out as 0.
+# Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
+_MAX_KEPT = 16
+# A raw position outside of every frame, for output pixels without one: they come out as 0.
 _OUTSIDE_PX = -1e4
 
 
@@ -61,7 +60,7 @@ class _Interpolant:
     test_cols: Array
 
 
-def _basis(n_pixels: int, degree: int, at: Array) -> tuple[Array, Array]:
+def _make_basis(n_pixels: int, degree: int, at: Array) -> tuple[Array, Array]:
     """Node positions in px, and the (n_at, degree + 1) matrix that interpolates node values
     (barycentric formula).
     """
@@ -79,16 +78,17 @@ def _basis(n_pixels: int, degree: int, at: Array) -> tuple[Array, Array]:
     return nodes, matrix
 
 
-def _interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
-    """Nodes of one polynomial degree; the test points lie where none of the degrees has a node."""
+@lru_cache(maxsize=_MAX_KEPT)
+def _make_interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
+    """Matrices for one size of image and one degree."""
     tests, bases = [], []
     for n_pixels in size:
         # Denser at the edges, as the nodes are and as the beam settles at the start of a line.
-        angles = np.pi * (np.arange(_TESTS) + 0.37) / _TESTS
+        angles = np.pi * (np.arange(_TESTS) + _TEST_OFFSET) / _TESTS
         test = 0.5 * (n_pixels - 1) * (1.0 - np.cos(angles))
         tests.append(test)
-        nodes, at_pixels = _basis(n_pixels, degree, np.arange(n_pixels, dtype=np.float64))
-        bases.append((nodes, at_pixels, _basis(n_pixels, degree, test)[1]))
+        nodes, at_pixels = _make_basis(n_pixels, degree, np.arange(n_pixels, dtype=np.float64))
+        bases.append((nodes, at_pixels, _make_basis(n_pixels, degree, test)[1]))
     lattices = [np.meshgrid(bases[0][0], bases[1][0]), np.meshgrid(*tests)]
     points = [np.stack([x.ravel(), y.ravel()], axis=1) for x, y in lattices]
     height = size[1]
@@ -106,7 +106,7 @@ def _interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
 
 @dataclass(frozen=True)
 class RawMap:
-    """Raw positions of all output pixels of one frame, to be worked out in bands of rows.
+    """Raw positions of all output pixels of one frame, computed in bands of rows.
 
     Attributes
     ----------
@@ -138,14 +138,13 @@ class SmoothMaps:
 
     The degree of the polynomials is the lowest whose map agrees with the exact one to 0.001 px at
     81 points between the nodes of every single frame. A map that no polynomial follows, or that
-    has holes, is worked out exactly at every pixel, which is slow.
+    has holes, is computed exactly at every pixel, which is slow.
     """
 
     def __init__(self) -> None:
-        self._degrees: OrderedDict[tuple[int, int, bool], int] = OrderedDict()
-        self._interpolants: OrderedDict[tuple[int, int, int], _Interpolant] = OrderedDict()
+        self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
 
-    def of(
+    def make_map(
         self,
         size: tuple[int, int],
         camera: ScanCamera | None,
@@ -156,10 +155,10 @@ class SmoothMaps:
         :func:`~semcal_ros.core.rectification.raw_positions.raw_from_output`.
         """
         exact = camera, drift, timing
-        found = self._departure(size, *exact)
-        if found is None:
+        interpolated = self._sample_departure(size, *exact)
+        if interpolated is None:
             return RawMap(size, None, None, exact)
-        interpolant, departure = found
+        interpolant, departure = interpolated
         width, nodes = size[0], interpolant.nodes
         # What single precision has to carry through the product is the small departure from the
         # identity; the identity comes last, when nothing is added any more.
@@ -170,7 +169,7 @@ class SmoothMaps:
         columns[nodes + 1, width:] = 1.0
         return RawMap(size, interpolant.rows, columns, exact)
 
-    def _departure(
+    def _sample_departure(
         self,
         size: tuple[int, int],
         camera: ScanCamera | None,
@@ -183,10 +182,7 @@ class SmoothMaps:
         # Neighbouring magnifications need the same degree.
         key = (*size, camera is not None and camera.residual is not None)
         for degree in [d for d in _DEGREES if d >= self._degrees.get(key, 0)]:
-            interpolant = self._interpolants.get((*size, degree))
-            if interpolant is None:
-                interpolant = _interpolant(size, degree)
-            keep(self._interpolants, (*size, degree), interpolant, _KEPT)
+            interpolant = _make_interpolant(size, degree)
             points, nodes = interpolant.points_xy, interpolant.nodes
             departure = (raw_from_output(points, size, camera, drift, timing) - points).T
             at_nodes = departure[:, : nodes * nodes].reshape(2, nodes, nodes)
@@ -196,14 +192,6 @@ class SmoothMaps:
             if not np.isfinite(largest):
                 return None
             if largest <= _MAX_MAP_ERROR_PX:
-                keep(self._degrees, key, degree, _KEPT)
+                self._degrees.put(key, degree)
                 return interpolant, at_nodes
         return None
-
-
-def keep(store: OrderedDict[_Key, _Value], key: _Key, value: _Value, at_most: int) -> None:
-    """Store as the latest and forget the oldest beyond ``at_most``."""
-    store[key] = value
-    store.move_to_end(key)
-    while len(store) > at_most:
-        store.popitem(last=False)

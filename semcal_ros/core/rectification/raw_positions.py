@@ -1,7 +1,7 @@
-"""Where in the raw frame each pixel of a rectified one is found, exactly.
+"""Where in the raw frame each pixel of a rectified one was seen, exactly.
 
 The specimen drifts before it is projected and distorted, so an output pixel u, which is an ideal
-pixel of the camera with the specimen at zero drift, is found in the raw frame at
+pixel of the camera with the specimen at zero drift, is seen in the raw frame at
 
     raw = distort(u + J d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
 
@@ -23,8 +23,11 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
 
 
+# Each step shrinks the error by the drift per row time over a row: a drift of half a row per row
+# takes 20 steps, one that needs more than 50 is too fast for the raster.
 _MAX_STEPS = 50
-_SETTLED_PX = 1e-5
+# A hundredth of the accuracy of the maps.
+_CONVERGED_PX = 1e-5
 
 
 @dataclass(frozen=True)
@@ -76,8 +79,8 @@ def raw_from_output(
     raw = at_centre if camera is None else camera.distort(at_centre)
     velocity = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
     acceleration = 0.5 * (jacobian @ np.asarray(drift.acceleration, dtype=np.float64))
-    turns = bool(acceleration.any())
-    if timing is None or not (turns or velocity.any()):
+    is_accelerated = bool(acceleration.any())
+    if timing is None or not (is_accelerated or velocity.any()):
         return raw
     width, height = size
     for _ in range(_MAX_STEPS):
@@ -85,15 +88,15 @@ def raw_from_output(
         offset_s = timing.pixel_offset_s(raw[:, 1], raw[:, 0], height, width)
         since_s = offset_s - timing.centre_offset_s
         moved = at_centre + np.multiply.outer(velocity, since_s).T
-        if turns:
+        if is_accelerated:
             # The mean over the passes of the square of the time.
             square_s2 = since_s**2 + timing.pass_variance_s2
             moved += np.multiply.outer(acceleration, square_s2).T
         new = moved if camera is None else camera.distort(moved)
         change_px = np.abs(new - raw)
         raw = new
-        # What is left after a step is smaller than it by the same factor again.
-        if not (change_px > _SETTLED_PX).any():
+        # The error that remains is smaller than the step by the same factor again.
+        if not (change_px > _CONVERGED_PX).any():
             return raw
     raise InvalidValueError(
         f"drift of {np.hypot(*velocity):.3g} px/s with {timing.frame_time_s} s per pass",

@@ -1,13 +1,13 @@
 """Undo distortion and drift of a frame in one interpolation.
 
-The raw position of every output pixel (:mod:`semcal_ros.core.rectification.raw_positions`) is worked out in bands of
+The raw position of every output pixel (:mod:`semcal_ros.core.rectification.raw_positions`) is computed in bands of
 rows that stay in the processor's cache while the picture is resampled at them
-(:mod:`semcal_ros.core.rectification.chebyshev_map`); a map that comes a second time is kept as a whole.
+(:mod:`semcal_ros.core.rectification.chebyshev_map`); a map that is needed a second time is kept as a whole.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array32, check_image
+from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps, keep
+from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps
 from semcal_ros.core.rectification.raw_positions import (
     RasterDrift,
     camera_key,
@@ -39,7 +40,8 @@ _INTERPOLATIONS = {
 }
 # Both maps of a band fit a second-level cache; OpenCV resamples so few pixels in one thread.
 _BAND_PIXELS = 1 << 15
-_KEPT_MAPS = 2
+# Whole maps that are kept, 8 bytes per pixel each: two magnifications may take turns.
+_MAX_MAPS = 2
 # cv2.remap counts rows and columns in 16 bits.
 _LARGEST_SIDE = 32766
 
@@ -56,7 +58,7 @@ class Rectifier:
     Notes
     -----
     The image keeps its size and type. Pixels that were not scanned come out as 0. Bands of a frame
-    are worked on by as many threads as OpenCV uses (``cv2.setNumThreads``); an instance itself is
+    are resampled by as many threads as OpenCV uses (``cv2.setNumThreads``); an instance itself is
     not meant to be shared between threads.
     """
 
@@ -67,7 +69,7 @@ class Rectifier:
             )
         self._flag = _INTERPOLATIONS[interpolation]
         self._smooth = SmoothMaps()
-        self._kept: OrderedDict[tuple[object, ...], tuple[Array32, Array32]] = OrderedDict()
+        self._maps: LruCache[tuple[object, ...], tuple[Array32, Array32]] = LruCache(_MAX_MAPS)
         self._last: tuple[object, ...] | None = None
         self._scratch: deque[Array32] = deque()
 
@@ -105,7 +107,7 @@ class Rectifier:
             or too fast for the raster.
         """
         _check_image(image)
-        output = np.empty_like(image, order="C") if out is None else _checked_output(out, image)
+        output = np.empty_like(image, order="C") if out is None else _check_output(out, image)
         if camera is None and drift is None:
             np.copyto(output, image)
             return output
@@ -113,12 +115,12 @@ class Rectifier:
         height, width = image.shape[:2]
         fitted = None if camera is None else camera.resized(width, height)
         key = camera_key((width, height), fitted) + drift_key(drift, timing)
-        if key in self._kept or key == self._last:
-            # What came twice is likely to come again.
-            return self._remap(image, *self._whole(key, fitted, drift, timing), output)
+        if key in self._maps or key == self._last:
+            # A map that is needed twice is likely to be needed again.
+            return self._remap(image, *self._whole_maps(key, fitted, drift, timing), output)
         self._last = key
-        raw_map = self._smooth.of((width, height), fitted, drift, timing)
-        self._in_bands(image, raw_map, output)
+        raw_map = self._smooth.make_map((width, height), fitted, drift, timing)
+        self._resample_in_bands(image, raw_map, output)
         return output
 
     def maps(
@@ -134,7 +136,7 @@ class Rectifier:
         check_drift(drift)
         fitted = None if camera is None else camera.resized(*size)
         key = camera_key(size, fitted) + drift_key(drift, timing)
-        return self._whole(key, fitted, drift, timing)
+        return self._whole_maps(key, fitted, drift, timing)
 
     def remapped(self, image: AnyImage, map_x: Array32, map_y: Array32) -> AnyImage:
         """The image at raw positions as :meth:`maps` gives them; 0 outside of it."""
@@ -152,37 +154,44 @@ class Rectifier:
 
     # -- maps -------------------------------------------------------------------------------------
 
-    def _whole(
+    def _whole_maps(
         self,
         key: tuple[object, ...],
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
     ) -> tuple[Array32, Array32]:
-        """Both maps of the size that the key begins with; kept, for they are worth their memory."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
+        """Both maps of the size that the key begins with, kept for the next frame."""
+        return self._maps.get_or_compute(
+            key, lambda: self._compute_maps(key, camera, drift, timing)
+        )
+
+    def _compute_maps(
+        self,
+        key: tuple[object, ...],
+        camera: ScanCamera | None,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> tuple[Array32, Array32]:
         width, height = cast("tuple[int, int]", key[:2])
-        raw_map = self._smooth.of((width, height), camera, drift, timing)
+        raw_map = self._smooth.make_map((width, height), camera, drift, timing)
         both = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
 
         def copy(top: int, bottom: int, band: Array32) -> None:
             both[0][top:bottom], both[1][top:bottom] = band[:, :width], band[:, width:]
 
-        self._each_band(raw_map, copy)
-        keep(self._kept, key, both, _KEPT_MAPS)
+        self._for_each_band(raw_map, copy)
         return both
 
-    def _in_bands(self, image: AnyImage, raw_map: RawMap, output: AnyImage) -> None:
+    def _resample_in_bands(self, image: AnyImage, raw_map: RawMap, output: AnyImage) -> None:
         width = raw_map.size[0]
 
         def resample(top: int, bottom: int, band: Array32) -> None:
             self._remap(image, band[:, :width], band[:, width:], output[top:bottom])
 
-        self._each_band(raw_map, resample)
+        self._for_each_band(raw_map, resample)
 
-    def _each_band(self, raw_map: RawMap, use: Callable[[int, int, Array32], None]) -> None:
+    def _for_each_band(self, raw_map: RawMap, use: Callable[[int, int, Array32], None]) -> None:
         """Call ``use`` with first row, end and maps of all bands, in several threads."""
         width, height = raw_map.size
         rows = max(_BAND_PIXELS // width, 1)
@@ -210,7 +219,7 @@ class Rectifier:
         others = [_helpers().submit(work) for _ in range(helpers)]
         work()
         for other in others:
-            # On a busy machine all is done before another thread has even begun.
+            # On a busy machine all is done before another thread has begun.
             if not other.cancel():
                 other.result()
 
@@ -229,7 +238,7 @@ def _check_image(image: AnyImage) -> None:
         )
 
 
-def _checked_output(out: AnyImage, image: AnyImage) -> AnyImage:
+def _check_output(out: AnyImage, image: AnyImage) -> AnyImage:
     same = out.shape == image.shape and out.dtype == image.dtype
     if not (same and out.flags.c_contiguous and out.flags.writeable):
         raise InvalidValueError(

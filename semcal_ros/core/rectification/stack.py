@@ -21,12 +21,12 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
 
-__all__ = ["Stack", "StackedImage", "scanned"]
+__all__ = ["Stack", "StackedImage", "find_scanned"]
 
 
 # Rows or columns that an interpolation takes beyond the two nearest ones.
 _REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}
-# As accurate as the maps are; a pixel at the very edge must not drop out by rounding.
+# As accurate as the maps are; a pixel at the edge must not drop out by rounding.
 _EDGE_PX = 1e-3
 
 
@@ -55,7 +55,7 @@ class StackedImage:
 
 
 class Stack:
-    """Adds up frames in the coordinates of the first one at zero drift.
+    """Averages frames in the coordinates of the first one at zero drift.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ class Stack:
         self._rectifier = Rectifier(interpolation)
         self._reach = _REACH_PX[interpolation]
         self._size = (width, height)
-        # Sums of single-precision grey levels in double precision: what their squares lose when
-        # they are subtracted from each other is less than what the grey levels do not resolve.
+        # Sums of single-precision grey levels in double precision: the rounding of their
+        # squares is far below the resolution of the grey levels.
         self._sum: Array = np.zeros((height, width))
         self._squares: Array = np.zeros((height, width))
         self._count = np.zeros((height, width), dtype=np.int32)
@@ -90,7 +90,7 @@ class Stack:
         """Number of frames that were added."""
         return self._frames
 
-    def rectified(
+    def rectify(
         self,
         image: NDArray[np.generic],
         camera: ScanCamera | None,
@@ -109,10 +109,12 @@ class Stack:
         InvalidValueError
             If the image has another size than the stack or is not grey, or the drift is not usable.
         """
-        picture = _grey(image, self._size)
+        picture = _check_grey(image, self._size)
         map_x, map_y = self._rectifier.maps(self._size, camera, drift, timing)
-        moved = self._rectifier.remapped(picture, map_x, map_y)
-        return np.asarray(moved, dtype=np.float32), scanned(map_x, map_y, self._size, self._reach)
+        rectified = self._rectifier.remapped(picture, map_x, map_y)
+        return np.asarray(rectified, dtype=np.float32), find_scanned(
+            map_x, map_y, self._size, self._reach
+        )
 
     def add(self, picture: NDArray[np.float32], valid: Mask) -> None:
         """Add a rectified picture.
@@ -158,7 +160,7 @@ class Stack:
         )
 
 
-def scanned(
+def find_scanned(
     map_x: NDArray[np.float32], map_y: NDArray[np.float32], size: tuple[int, int], reach: int = 0
 ) -> Mask:
     """Which output pixels come from scanned pixels only, (h, w) bool.
@@ -180,7 +182,7 @@ def scanned(
     return np.asarray(inside_x & (map_y >= low) & (map_y <= height - 1 - low))
 
 
-def _grey(image: NDArray[np.generic], size: tuple[int, int]) -> NDArray[np.float32]:
+def _check_grey(image: NDArray[np.generic], size: tuple[int, int]) -> NDArray[np.float32]:
     width, height = size
     if image.shape != (height, width) or image.dtype.kind not in "uif":
         raise InvalidValueError(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
-from semcal_ros.core.rectification.binning import binned
+from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.nodes.common.base import NODE_ERRORS
 from semcal_ros.nodes.common.parameters import Setting
@@ -154,7 +154,7 @@ class LiveDrift:
     def _binned(
         self, frame: StreamFrame, camera: ScanCamera
     ) -> tuple[NDArray[np.generic], ScanCamera]:
-        return binned(frame.image, camera, self._node.settings[_DETAIL.name])
+        return bin_image(frame.image, camera, self._node.settings[_DETAIL.name])
 
     def _beside_is_free(self) -> bool:
         rested = self._at_work is None and time.monotonic() >= self._rest_until_s

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.rectification.binning import binned
+from semcal_ros.core.rectification.binning import bin_image
 from tests.helpers.drift_scenes import small_camera
 
 
@@ -19,8 +19,8 @@ def test_the_small_picture_shows_what_its_camera_says(
     """Ramps of grey levels tell which place of the full picture a pixel of the small one shows."""
     camera = small_camera(1000.0, 192).resized(width, height)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    ramp_x, small = binned(x, camera, largest)
-    ramp_y, _ = binned(y, camera, largest)
+    ramp_x, small = bin_image(x, camera, largest)
+    ramp_y, _ = bin_image(y, camera, largest)
     assert max(ramp_x.shape) <= largest
     assert ramp_x.shape == (small.height, small.width)
     rows, cols = np.indices(ramp_x.shape)
@@ -34,7 +34,7 @@ def test_the_small_picture_shows_what_its_camera_says(
 def test_pixels_are_means_of_blocks() -> None:
     rng = np.random.default_rng(1)
     image = rng.integers(0, 65536, (64, 97, 3)).astype(np.uint16)
-    small, camera = binned(image, small_camera(1000.0, 97), 40)
+    small, camera = bin_image(image, small_camera(1000.0, 97), 40)
     blocks = image[:63, :96].astype(float).reshape(21, 3, 32, 3, 3).mean(axis=(1, 3))
     assert small.dtype == np.uint16
     assert (camera.width, camera.height) == (32, 21)
@@ -44,8 +44,8 @@ def test_pixels_are_means_of_blocks() -> None:
 
 def test_a_small_picture_stays_the_same() -> None:
     image = np.zeros((40, 30), np.uint8)
-    small, camera = binned(image, small_camera(1000.0, 192), 40)
+    small, camera = bin_image(image, small_camera(1000.0, 192), 40)
     assert small is image
     assert (camera.width, camera.height) == (30, 40)
     with pytest.raises(InvalidValueError, match="longest side"):
-        binned(image, camera, 0)
+        bin_image(image, camera, 0)

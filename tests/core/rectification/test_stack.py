@@ -8,7 +8,7 @@ import pytest
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
-from semcal_ros.core.rectification.stack import Stack, scanned
+from semcal_ros.core.rectification.stack import Stack, find_scanned
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
 SIZE = 128
@@ -23,7 +23,7 @@ def stacked(pictures: list[np.ndarray], drifts: list[RasterDrift | None], **opti
     height, width = pictures[0].shape
     stack = Stack((width, height), **options)
     for picture, drift in zip(pictures, drifts, strict=True):
-        stack.add(*stack.rectified(picture.astype(np.float32), None, drift))
+        stack.add(*stack.rectify(picture.astype(np.float32), None, drift))
     return stack
 
 
@@ -72,12 +72,12 @@ def test_the_shear_within_a_frame_is_undone():
     for k in range(6):
         drift = RasterDrift(k * velocity, velocity)
         frame = specimen.frame(camera, timing, drift.position, velocity, k, noise=0.0)
-        stack.add(*stack.rectified(frame, camera, drift, timing))
-        frozen.add(*frozen.rectified(frame, camera, at(*drift.position), timing))
+        stack.add(*stack.rectify(frame, camera, drift, timing))
+        frozen.add(*frozen.rectify(frame, camera, at(*drift.position), timing))
     image, sheared = stack.result(), frozen.result()
     seen = image.count == 6
     still = specimen.frame(camera, timing, np.zeros(2), np.zeros(2), 0, noise=0.0)
-    truth, valid = stack.rectified(still, camera, None, timing)
+    truth, valid = stack.rectify(still, camera, None, timing)
     seen &= valid
     errors = [np.sqrt(np.mean((s.mean - truth)[seen] ** 2)) for s in (image, sheared)]
     # Rounding to whole grey levels and two interpolations of a contrast of 40; unsheared by 4.3 px
@@ -133,9 +133,9 @@ def test_small_noise_on_large_grey_levels():
 
 def test_the_reach_of_the_interpolation_is_respected():
     x, y = np.meshgrid(np.arange(8, dtype=np.float32), np.arange(6, dtype=np.float32))
-    assert scanned(x, y, (8, 6)).all()
-    assert not scanned(x + 0.01, y, (8, 6))[:, -1].any()
-    inner = scanned(x, y, (8, 6), reach=1)
+    assert find_scanned(x, y, (8, 6)).all()
+    assert not find_scanned(x + 0.01, y, (8, 6))[:, -1].any()
+    inner = find_scanned(x, y, (8, 6), reach=1)
     assert inner[1:-1, 1:-1].all() and inner.sum() == 6 * 4
     # Every counted pixel of a constant picture keeps its value: nothing from beyond the edge.
     for interpolation in ("linear", "cubic", "lanczos4"):
@@ -147,9 +147,9 @@ def test_what_does_not_fit_is_refused():
     stack = Stack((8, 6))
     valid = np.ones((6, 8), dtype=bool)
     with pytest.raises(InvalidValueError, match="expected"):
-        stack.rectified(np.zeros((8, 6), np.uint8), None)
+        stack.rectify(np.zeros((8, 6), np.uint8), None)
     with pytest.raises(InvalidValueError, match="expected"):
-        stack.rectified(np.zeros((6, 8, 3), np.uint8), None)
+        stack.rectify(np.zeros((6, 8, 3), np.uint8), None)
     with pytest.raises(InvalidValueError, match="expected"):
         stack.add(np.zeros((6, 8), np.float32), valid[:, :4])
     with pytest.raises(InvalidValueError, match="nearest"):
