@@ -256,7 +256,7 @@ def _add_frames(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        picture, valid = summed.rectified(grey, camera, drift, selection.config.scan)
+        picture, valid = summed.rectify(grey, camera, drift, selection.config.scan)
         if used[number]:
             summed.add(picture, valid)
         if film is not None:

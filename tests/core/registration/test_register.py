@@ -296,3 +296,17 @@ def test_every_rejection_has_its_kind() -> None:
         rejection = register_pair(*pair).rejection
         assert rejection is not None
         assert rejection.status is failure
+
+
+def test_pictures_with_less_than_the_least_correlation_are_refused() -> None:
+    # Each picture adds a texture of its own that is as strong as the common one: they correlate by half.
+    own = [40.0 * Texture(k).view((0.0, 0.0), SIZE) for k in (31, 32)]
+    reference, image = (
+        picture + extra for picture, extra in zip(_pair((3.3, -2.1), 4.0), own, strict=True)
+    )
+    rejection = register_pair(reference, image).rejection
+    assert rejection is not None
+    assert rejection.status is MatchFailure.DISSIMILAR
+    lenient = register_pair(reference, image, settings=RegistrationSettings(min_correlation=0.3))
+    assert lenient.rejection is None or lenient.rejection.status is not MatchFailure.DISSIMILAR
+    assert lenient.correlation == pytest.approx(0.5, abs=0.1)
