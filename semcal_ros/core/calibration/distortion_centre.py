@@ -66,7 +66,7 @@ def _radial_fundamental(board: Array, image: Array, from_image: Array) -> Array:
     rows = (x[:, :, None] * b[:, None, :]).reshape(len(b), 9)
     _, vectors = np.linalg.eigh(rows.T @ rows)
     u, s, vt = np.linalg.svd(vectors[:, 0].reshape(3, 3))
-    return np.asarray(u @ np.diag([s[0], s[1], 0.0]) @ vt, dtype=np.float64)
+    return u @ np.diag([s[0], s[1], 0.0]) @ vt
 
 
 def _cubic_basis(image: Array) -> Array:

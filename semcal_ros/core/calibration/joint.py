@@ -161,7 +161,7 @@ def _update_height_sigma(setup: Setup, result: BundleResult) -> Array:
     for group in (flat, ~flat):
         variance[group] = np.mean(square[group]) if np.any(group) else 0.0
     prior = setup.priors.height_sigma_m
-    return np.asarray(np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior))
+    return np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior)
 
 
 def refit_functions(

@@ -147,7 +147,7 @@ def residuals(problem: Problem, state: State) -> Array:
 def whitened_norm(problem: Problem, miss: Array) -> Array:
     """(N,) lengths of residuals (N, 2) in standard deviations."""
     xx, yx, yy = problem.whitening.T
-    return np.asarray(np.hypot(xx * miss[:, 0], yx * miss[:, 0] + yy * miss[:, 1]))
+    return np.hypot(xx * miss[:, 0], yx * miss[:, 0] + yy * miss[:, 1])
 
 
 def _huber(norm: Array) -> tuple[Array, Array]:
@@ -163,7 +163,7 @@ def view_costs(problem: Problem, state: State) -> Array:
     norm = whitened_norm(problem, miss)
     loss = np.where(np.isfinite(norm), _huber(norm)[0], np.inf)
     height = state.translations_m[:, 2] / problem.height_sigma_m
-    return np.asarray(np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * height * height)
+    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * height * height
 
 
 def prior_cost(problem: Problem, state: State) -> float:

@@ -37,7 +37,7 @@ def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Ar
     b = derivatives[order] * weight
     # Column scaling: the derivatives differ by orders of magnitude, and lstsq cuts small singular values.
     scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
-    return np.asarray(-np.linalg.lstsq(a / scale, b, rcond=1e-10)[0] / scale, dtype=np.float64)
+    return -np.linalg.lstsq(a / scale, b, rcond=1e-10)[0] / scale
 
 
 def _fitted(

@@ -89,7 +89,7 @@ class Setup:
 
     def nominal_px_per_m(self, g: Array) -> Array:
         """Scales that the display width alone predicts."""
-        return np.asarray(g * self.image_size[0] / self.display_width_m, dtype=np.float64)
+        return g * self.image_size[0] / self.display_width_m
 
     def change_prior_of(self, name: str) -> float:
         """1-sigma of the change of a camera parameter over the calibrated range."""

@@ -127,7 +127,7 @@ class FieldSystem:
         slices = self.weights @ solution[size:].reshape(self.weights.shape[1], -1)
         z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
         bent = (self.information @ z[:, :, None])[:, :, 0]
-        return np.asarray(np.sum((0.5 * bent - self.right) * z, axis=1), dtype=np.float64)
+        return np.sum((0.5 * bent - self.right) * z, axis=1)
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _without_poses(augmented: Array) -> tuple[Array, Array]:
 
 def _second_differences(count: int) -> Array:
     rows = np.diff(np.eye(count), n=2, axis=0)
-    return np.asarray(rows.T @ rows, dtype=np.float64)
+    return rows.T @ rows
 
 
 def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
@@ -246,7 +246,7 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
     # The two components are the last axis of the coefficients.
     whole = np.kron(steady, np.kron(smooth, np.eye(2)))
     whole += np.kron(np.eye(ng), overlaps.T @ overlaps)
-    return np.asarray(whole, dtype=np.float64)
+    return whole
 
 
 def _folds(system: FieldSystem) -> list[Mask]:

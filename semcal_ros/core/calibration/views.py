@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.arrays import AnyImage, Array, Indices, Mask
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
@@ -200,7 +200,7 @@ class SquareAssignment:
     @property
     def misfits(self) -> Mask:
         """(v,) views whose squares have none of the known sizes at their magnification."""
-        return np.asarray(np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT)
+        return np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT
 
 
 def assign_squares(
@@ -245,14 +245,14 @@ def assign_squares(
     )
 
 
-def _centred_ij(detection: LatticeDetection) -> Array:
+def _centred_ij(detection: LatticeDetection) -> Indices:
     """(n, 2) lattice indices with the origin at the corner nearest to the middle of the image.
 
     The height of a view is that of its origin, and what its prior speaks of is the height of what is looked at.
     """
     middle = 0.5 * (np.array(detection.image_size, dtype=np.float64) - 1.0)
     nearest = np.argmin(np.sum((detection.xy - middle) ** 2, axis=1))
-    return np.asarray(detection.ij - detection.ij[nearest], dtype=np.float64)
+    return detection.ij - detection.ij[nearest]
 
 
 def views_from_detections(

@@ -42,7 +42,7 @@ def _ode_row(value: float, weights: Array) -> Array:
     order = len(weights)
     companion = np.diag(np.ones(order - 1), 1)
     companion[-1] = -weights
-    return np.asarray(expm(companion * value)[0], dtype=np.float64)
+    return expm(companion * value)[0]
 
 
 def _chebyshev_row(value: float, size: int) -> Array:

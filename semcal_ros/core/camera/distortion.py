@@ -64,7 +64,7 @@ def distort_normalised(q: Array, xi_r: Array | float, xi_t: Array | float) -> Ar
     r2 = squares[:, 0] + squares[:, 1]
     _, factor = _radial(r2, np.asarray(xi_r, dtype=np.float64))
     tangential = np.asarray(xi_t, dtype=np.float64)[..., None] * (r2[:, None] + 2.0 * squares)
-    return np.asarray(factor[:, None] * q + tangential, dtype=np.float64)
+    return factor[:, None] * q + tangential
 
 
 def distort_jacobians(

@@ -38,7 +38,7 @@ def rotations_from_vectors(vectors: Array) -> Array:
     k = cross_matrices(vectors)
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + first * k + second * (k @ k), dtype=np.float64)
+    return np.eye(3) + first * k + second * (k @ k)
 
 
 def normalising_similarity(points: Array) -> Array:
@@ -52,7 +52,7 @@ def normalising_similarity(points: Array) -> Array:
 def transform_points(matrix: Array, points: Array) -> Array:
     """(n, 2) points mapped by a (3, 3) homography."""
     homogeneous = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], dtype=np.float64)
+    return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def fit_homography(source: Array, target: Array) -> Array:
@@ -70,7 +70,7 @@ def fit_homography(source: Array, target: Array) -> Array:
     # The normal matrix is 9 x 9 whatever the number of points; normalised, its condition allows it.
     _, vectors = np.linalg.eigh(rows.T @ rows)
     h = np.linalg.solve(from_target, vectors[:, 0].reshape(3, 3)) @ from_source
-    return np.asarray(h / h[2, 2], dtype=np.float64)
+    return h / h[2, 2]
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,10 @@ def rotation_from_affine(matrix: Array, gradient: Array) -> Array:
         third = -third
     columns = np.vstack([block, third])
     u, _, vt = np.linalg.svd(np.column_stack([columns, np.cross(columns[:, 0], columns[:, 1])]))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
 def mirrored_tilt(rotations: Array) -> Array:
     """Rotations (n, 3, 3) with the same view under parallel projection and the opposite tilt."""
     sign = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
-    return np.asarray(rotations * sign, dtype=np.float64)
+    return rotations * sign

@@ -44,7 +44,7 @@ def _clamped(breaks: Array, degree: int) -> Array:
 def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
     """(n, size) values of the basis functions; outside of the knots those of their ends."""
     inside = np.clip(values, knots[0], knots[-1])
-    return np.asarray(BSpline.design_matrix(inside, knots, degree).toarray(), dtype=np.float64)
+    return BSpline.design_matrix(inside, knots, degree).toarray()
 
 
 def _spline_slopes(values: Array, knots: Array) -> Array:
@@ -52,7 +52,7 @@ def _spline_slopes(values: Array, knots: Array) -> Array:
     size = len(knots) - _DEGREE - 1
     inside = (values > knots[0]) & (values < knots[-1])
     slopes = BSpline(knots, np.eye(size), _DEGREE)(np.clip(values, knots[0], knots[-1]), nu=1)
-    return np.asarray(np.where(inside[:, None], slopes, 0.0), dtype=np.float64)
+    return np.where(inside[:, None], slopes, 0.0)
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,10 @@ class ResidualField:
         count = len(self.coefficients)
         low, high = np.log(self.g_range)
         if count == 1 or low == high:
-            return np.asarray(np.eye(count)[0], dtype=np.float64)
-        at = np.clip((np.log(g) - low) / (high - low), 0.0, 1.0)
+            return np.eye(count)[0]
+        at = (np.log(g) - low) / (high - low)
         rows = _spline_rows(np.array([at]), _clamped(np.array([0.0, 1.0]), count - 1), count - 1)
-        return np.asarray(rows[0], dtype=np.float64)
+        return rows[0]
 
     def at(
         self, g: float, covariance: Array | None = None, cross: Array | None = None

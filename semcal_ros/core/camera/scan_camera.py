@@ -175,7 +175,7 @@ class ScanCamera:
             )
         jacobian = self.project_jacobian(xyz_m)
         variance = np.einsum("nip,pq,niq->ni", jacobian, covariance, jacobian, optimize=True)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
+        return np.sqrt(np.maximum(variance, 0.0))
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
         """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field."""

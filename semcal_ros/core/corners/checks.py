@@ -57,7 +57,7 @@ def one_board(fitted: Fitted, keep: Mask) -> Mask:
     while True:
         continuing = [p for p in waiting if _continues(fitted, joined, part == p)]
         if not continuing:
-            return np.asarray(joined, dtype=np.bool_)
+            return joined
         joined |= np.isin(part, continuing)
         waiting = [p for p in waiting if p not in continuing]
 
@@ -156,7 +156,7 @@ def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) ->
         return np.zeros(len(cells), dtype=np.bool_)
     usual = CHI2_MAX * float(np.median(fit.chi2[judged]))
     small = fit.variance.mean(axis=1) < (MISFIT_MAX * fit.contrast) ** 2
-    return np.asarray(judged & ((fit.chi2 < usual) | small), dtype=np.bool_)
+    return judged & ((fit.chi2 < usual) | small)
 
 
 def parity_of(cells: Indices) -> Array:
@@ -179,7 +179,7 @@ def undisturbed(fitted: Fitted) -> Mask:
     significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
     surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
     visible = surplus > (MISFIT_MAX * fit.contrast) ** 2
-    return np.asarray(good & ~(significant & visible) & _alike(fit, good, pooled), dtype=np.bool_)
+    return good & ~(significant & visible) & _alike(fit, good, pooled)
 
 
 def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
@@ -193,7 +193,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
     pull = np.abs(fit.blur_pull)
     # The median of the absolute value is 0.675 standard deviations.
     typical = max(1.0, float(np.median(pull[good])) / 0.675)
-    return np.asarray(~uneven & (pull < BLUR_SIGMAS * typical), dtype=np.bool_)
+    return ~uneven & (pull < BLUR_SIGMAS * typical)
 
 
 def inflation(fit: CornerFit, keep: Mask) -> Array:

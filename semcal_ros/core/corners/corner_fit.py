@@ -279,7 +279,7 @@ def _pull(log_blur: Array, variance: Array, prior: Prior) -> Array:
     deviation = prior.deviation[:, LOG_BLUR]
     # A fit under a prior scatters by the prior's variance less its own.
     spread = np.maximum(deviation**2 - variance, PULL_LEAST * deviation**2)
-    return np.asarray((log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread))
+    return (log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread)
 
 
 def fit_noise(fit: CornerFit) -> NoiseModel:

@@ -173,7 +173,7 @@ def _failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array
     keys, first = np.unique(_keys(cells), return_index=True)
     size = np.array([image.shape[1], image.shape[0]])
     inside = np.all((xy[first] >= 0) & (xy[first] <= size - 1), axis=1)
-    return np.asarray(xy[first][inside & ~np.isin(keys, _keys(passed))])
+    return xy[first][inside & ~np.isin(keys, _keys(passed))]
 
 
 def _result(fitted: Fitted, keep: Mask, quality: float, rejected_xy: Array) -> RefinedCorners:

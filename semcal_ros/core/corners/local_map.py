@@ -48,14 +48,14 @@ class LocalMaps:
     def cell_px2(self) -> Array:
         """(n,) signed area of a square, px^2."""
         along, across = self.axes[:, 0], self.axes[:, 1]
-        return np.asarray(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0])
+        return along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
 
     @property
     def usable(self) -> Mask:
         """Where enough neighbours, not all in a row, determine a regular map."""
         norm = np.linalg.norm(self.axes, axis=2)
         skew = self.cell_px2 / np.maximum(norm[:, 0] * norm[:, 1], 1e-9)
-        return np.asarray((self.support >= SUPPORT_MIN) & (norm.min(axis=1) > 1.0) & (skew > 0.2))
+        return (self.support >= SUPPORT_MIN) & (norm.min(axis=1) > 1.0) & (skew > 0.2)
 
     def select(self, keep: Mask) -> LocalMaps:
         """The maps of the cells where ``keep`` is true."""
@@ -133,7 +133,7 @@ def _solve(solver: Array, which: Indices, xy: Array, member: Indices) -> Array:
     solution = np.stack([coordinate[member] @ solver[common].T for coordinate in xy.T], axis=2)
     other = which != common
     solution[other] = solver[which[other]] @ xy[member[other]]
-    return np.asarray(solution)
+    return solution
 
 
 def _solvers(patterns: Array, basis: Array, ridge: Array) -> Array:

@@ -52,14 +52,14 @@ def _predicted(fitted: Fitted, good: Mask, sigmas: float) -> Mask:
     error = _map_error(fitted, good, covariance, _squared(miss, covariance))
     covariance = covariance + (error**2)[:, None, None] * np.eye(2)
     passed = _squared(miss, covariance) < sigmas**2
-    return np.asarray(passed & (maps.support >= SUPPORT_MIN), dtype=np.bool_)
+    return passed & (maps.support >= SUPPORT_MIN)
 
 
 def _squared(miss: Array, covariance: Array) -> Array:
     """(n,) squared lengths of (n, 2) vectors in standard deviations."""
     x, y = miss.T
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
+    return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
 def _map_error(fitted: Fitted, good: Mask, covariance: Array, squared: Array) -> Array:
@@ -73,7 +73,7 @@ def _map_error(fitted: Fitted, good: Mask, covariance: Array, squared: Array) ->
     seen = np.sqrt(excess * float(np.median(variance[good])))
     spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)
     worst = MAP_ERROR_PX * (spacing / LARGE_SQUARE_PX) ** 3
-    return np.asarray(np.maximum(seen, np.minimum(worst, MAP_ERROR_RATIO * seen)))
+    return np.maximum(seen, np.minimum(worst, MAP_ERROR_RATIO * seen))
 
 
 def _trend(cells: Indices, good: Mask, xy: Array) -> Array:
@@ -89,4 +89,4 @@ def _trend(cells: Indices, good: Mask, xy: Array) -> Array:
     through = basis[good]
     # The ridge is for boards of a few rows, which do not determine all terms.
     normal = through.T @ through + 1e-9 * known * np.eye(basis.shape[1])
-    return np.asarray(basis @ np.linalg.solve(normal, through.T @ xy[good]))
+    return basis @ np.linalg.solve(normal, through.T @ xy[good])

@@ -12,21 +12,12 @@ from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
-
-CALIBRATED = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
-BETWEEN = [170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0]
-NOISE = 0.05
+from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
 
 def _calibrate(name, method="joint", options=None, magnifications=CALIBRATED, views=4):
-    microscope = preset(name)
-    seen = grid_views(microscope.camera_at, magnifications, noise_px=NOISE, views=views)
-    return calibrate_views(
-        seen,
-        image_size=microscope.image_size,
-        display_width_m=microscope.display_width_m,
-        options=CalibrationOptions(method, options or MethodOptions()),
-    )
+    chosen = CalibrationOptions(method, options or MethodOptions())
+    return calibrated(name, chosen, tuple(magnifications), views)
 
 
 def _model_error(result, name, magnifications=BETWEEN):
@@ -71,14 +62,22 @@ def test_joint_scale_is_within_its_own_uncertainty(joint):
 
 
 def test_residuals_are_the_noise(joint):
-    expected = NOISE * np.sqrt(2.0)
+    expected = NOISE_PX * np.sqrt(2.0)
     assert joint.model.statistics["rms_px"] == pytest.approx(expected, rel=0.05)
     assert joint.model.statistics["held_out_rms_px"] == pytest.approx(expected, rel=0.25)
     assert joint.model.statistics["fit"]["variance_factor"] == pytest.approx(1.0, rel=0.1)
 
 
+def test_untilted_views_have_a_spread_of_heights_of_their_own(joint):
+    """Theirs is zero here, and that of the tilted ones 40 um."""
+    priors = joint.model.statistics["priors"]
+    # 21 heights tell their spread to 15 %.
+    assert priors["height_sigma_m"] == pytest.approx(40e-6, rel=0.4)
+    assert priors["least_height_sigma_m"] < 0.5 * priors["height_sigma_m"]
+
+
 def test_held_out_errors_cover_every_magnification(joint):
-    assert sorted(joint.held_out_rms_px) == CALIBRATED
+    assert sorted(joint.held_out_rms_px) == list(CALIBRATED)
     rows = joint.model.statistics["by_magnification"]
     assert [r["held_out_extrapolated"] for r in rows] == [True, *[False] * 5, True]
 
@@ -91,7 +90,7 @@ def test_discrete_is_good_where_it_was_calibrated_and_worse_between(joint):
     assert between < 0.3
     assert between > _model_error(joint, "jsm820")
     separate = result.model.statistics["fit"]["separate"]
-    assert [s["magnification"] for s in separate] == CALIBRATED
+    assert [s["magnification"] for s in separate] == list(CALIBRATED)
     assert separate[0]["distortion"] is True
 
 

@@ -35,6 +35,13 @@ def _camera(field, g=1000.0, **spread):
     return replace(CAMERA, residual=field.at(g, **spread))
 
 
+def test_beyond_the_magnifications_the_field_of_the_nearer_end_holds():
+    field = _field()
+    np.testing.assert_array_equal(field.weights(50.0), field.weights(100.0))
+    np.testing.assert_array_equal(field.weights(40000.0), field.weights(10000.0))
+    assert field.weights(1000.0).sum() == pytest.approx(1.0)
+
+
 def test_a_zero_field_displaces_nothing():
     camera = _camera(zero_field(SIZE, (100.0, 1000.0), 2))
     xy = np.random.default_rng(0).uniform(0, 480, (50, 2))

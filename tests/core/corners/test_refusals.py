@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import InvalidValueError
-from tests.helpers.corner_boards import Board, rejected
+from tests.helpers.corner_boards import Board, detected, rejected
 
 
 def blobs(seed: int) -> NDArray[np.uint8]:
@@ -111,6 +111,19 @@ def test_two_boards_never_give_a_mixed_lattice(square: float, turn: float) -> No
         assert min(miss) < 1.0 < max(miss)
     else:
         assert detection.status is LatticeStatus.TWO_BOARDS
+
+
+def test_corners_of_the_wrong_contrast_do_not_belong_to_the_lattice() -> None:
+    """Beyond a line of the board, light and dark squares are exchanged: the same places, the other sign."""
+    board = Board(30.0)
+    picture = board.clean(4)
+    line = board.corners(0.0)[1]
+    at = np.unique(np.rint(line[:, 0]))[-4] + 15
+    picture[:, int(at) :] = picture.max() + picture.min() - picture[:, int(at) :]
+    detection = detected(np.random.default_rng(5).poisson(80.0 * picture).astype(np.uint8))
+    assert len(detection.xy) > 100
+    # Corners next to the line have no contrast of either sign.
+    assert detection.xy[:, 0].max() < at + 5.0
 
 
 def test_too_few_corners_are_refused() -> None:

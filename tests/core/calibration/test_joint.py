@@ -1,0 +1,48 @@
+"""The adjustment over everything: what its covariance and its priors of the heights hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.bundle_adjustment import refine
+from semcal_ros.core.calibration.joint import JointFit, fit_joint
+from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.problem import build_problem, theta_of, variance_factor
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+MAGNIFICATIONS = [100.0, 400.0, 1500.0, 5000.0, 10000.0]
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    microscope = preset("jsm820")
+    views = grid_views(microscope.camera_at, MAGNIFICATIONS, noise_px=0.05, views=3, seed=1)
+    size, display_m = microscope.image_size, microscope.display_width_m
+    return Setup(tuple(views), np.array(MAGNIFICATIONS), size, display_m, Priors())
+
+
+@pytest.fixture(scope="module")
+def fit(setup: Setup) -> JointFit:
+    return fit_joint(setup)
+
+
+def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_move(
+    setup: Setup, fit: JointFit
+) -> None:
+    adjustment = fit.adjustment
+    start = theta_of(fit.padded)
+    heights = adjustment.problem.height_sigma_m
+    problem = build_problem(setup, fit.padded, setup.views, heights)
+    freed = refine(problem, replace(adjustment.result.state, theta=start))
+    factor = variance_factor(adjustment.problem, adjustment.result)
+    change = np.abs(freed.state.theta - start)
+    sigma = np.sqrt(np.diag(fit.covariance) * factor)
+    added = np.sqrt(np.maximum(np.diag(fit.covariance - freed.covariance) * factor, 0.0))
+    clear = change > 0.6 * sigma
+    assert clear.sum() >= 8
+    # The covariance takes one Gauss-Newton step, the adjustment here goes to its end.
+    np.testing.assert_allclose(added[clear], change[clear], rtol=0.35)

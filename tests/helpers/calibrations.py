@@ -1,0 +1,53 @@
+"""Calibrations of virtual microscopes, each made once however many tests look at it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from semcal_ros.core.calibration.calibrate import (
+    CalibrationOptions,
+    CalibrationResult,
+    calibrate_views,
+)
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
+
+NOISE_PX = 0.05
+CALIBRATED = (100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0)
+DEFAULT = CalibrationOptions()
+#: Magnifications that no calibration has seen.
+BETWEEN = (170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0)
+
+
+def seen_views(
+    name: str, magnifications: tuple[float, ...] = CALIBRATED, views: int = 4, seed: int = 0
+) -> list[GridView]:
+    """Noisy views of a preset."""
+    microscope = preset(name)
+    return grid_views(
+        microscope.camera_at,
+        magnifications,
+        noise_px=NOISE_PX,
+        views=views,
+        seed=seed,
+        project=microscope.project,
+    )
+
+
+@cache
+def calibrated(
+    name: str,
+    options: CalibrationOptions = DEFAULT,
+    magnifications: tuple[float, ...] = CALIBRATED,
+    views: int = 4,
+    seed: int = 0,
+) -> CalibrationResult:
+    """A preset, calibrated from such views."""
+    microscope = preset(name)
+    return calibrate_views(
+        seen_views(name, magnifications, views, seed),
+        image_size=microscope.image_size,
+        display_width_m=microscope.display_width_m,
+        options=options,
+    )
