@@ -222,7 +222,7 @@ class CalibrationServer(StreamNode):
         running.cancel()
         job = running.job
         return (
-            f"cancelled the {job.method} calibration from {len(job.views)} views"
+            f"cancelled the {job.options.method} calibration from {len(job.views)} views"
             f" after {running.elapsed_s:.1f} s"
         )
 

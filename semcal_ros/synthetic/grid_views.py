@@ -32,7 +32,7 @@ def grid_view(
     """
     square_m = square_px / camera.m
     i, j = np.meshgrid(np.arange(-40, 41), np.arange(-40, 41))
-    board = np.column_stack([i.ravel(), j.ravel()]) * square_m
+    board: Array = np.column_stack([i.ravel(), j.ravel()]).astype(float) * square_m
     points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T + translation_m
     xy = (project or camera.project)(points)
     with np.errstate(invalid="ignore"):

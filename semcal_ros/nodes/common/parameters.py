@@ -22,7 +22,7 @@ from semcal_ros.files.confined import AllowedPaths
 
 __all__ = ["CALIBRATION", "CONFIG", "DIRECTORY", "INTERPOLATION", "Setting", "Settings"]
 
-Check = Callable[[Any], None]
+Check = Callable[[Any], object]
 Apply = Callable[[Any], None]
 
 

@@ -43,6 +43,7 @@ class ImageOutput:
         """Publish what was written."""
         self._publisher.publish(self._message)
         self._node.count_published(frame.stamp_ns)
+        assert self._pixels is not None, "memory() comes first"
         self._compressed.publish(self._pixels, frame)
 
     def close(self) -> None:
