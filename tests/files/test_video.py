@@ -17,6 +17,7 @@ from semcal_ros.files.video import open_video
 
 WIDTH, HEIGHT = 160, 120
 TEXT_ROWS = 40  # at the bottom
+BLACK, WHITE = 30.0, 190.0
 
 
 def pictures(count: int) -> list[np.ndarray]:
@@ -30,7 +31,7 @@ def pictures(count: int) -> list[np.ndarray]:
 
 def write(path: Path, frames: list[np.ndarray], expected: int | None = None) -> None:
     count = len(frames) if expected is None else expected
-    with open_video(path, (WIDTH, HEIGHT), count, 12.5, (0.0, 200.0)) as video:
+    with open_video(path, (WIDTH, HEIGHT), count, 12.5, (BLACK, WHITE)) as video:
         assert video is not None
         for number, frame in enumerate(frames):
             video.write(frame, f"frame {number}")
@@ -52,9 +53,9 @@ def test_frames_come_back(tmp_path: Path, suffix: str, codec: str) -> None:
     found = read(path)
     assert len(found) == len(frames)
     for before, after in zip(frames, found, strict=True):
-        shown = np.clip(before[:-TEXT_ROWS] * 255.0 / 200.0, 0.0, 255.0)
+        shown = np.clip((before[:-TEXT_ROWS] - BLACK) * 255.0 / (WHITE - BLACK), 0.0, 255.0)
         error = after[:-TEXT_ROWS] - shown
-        # The codec smooths away noise of 3.8 levels at most; a wrong range of levels (16 to 235
+        # The codec smooths away noise of 4.8 levels at most; a wrong range of levels (16 to 235
         # instead of 0 to 255) would be off by 10 on the average.
         assert np.sqrt(np.mean(error**2)) < 5.0
         assert abs(np.mean(error)) < 1.0

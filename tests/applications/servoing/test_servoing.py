@@ -16,6 +16,7 @@ from semcal_ros.applications.servoing import (
     PlanePose,
     Servo,
     ServoSettings,
+    ServoStatus,
     ServoStep,
     TargetView,
     choose_projection,
@@ -356,6 +357,15 @@ def test_a_lost_target_and_a_foreign_scale_stop_the_stage() -> None:
     plant.knows = lambda _g: camera_at(560.0)
     step = plant.step(500.0)
     assert "times as large" in step.reason
+    assert not np.any(step.twist)
+
+
+def test_a_pose_that_is_too_uncertain_stops_the_stage() -> None:
+    # The corners have a noise of some hundredths of a pixel: the pose cannot be known to a millionth.
+    plant = Plant(Servo(GOAL, replace(QUICK, max_sigma_px=1e-6)))
+    step = plant.step(500.0)
+    assert step.rejection is not None
+    assert step.rejection.status is ServoStatus.UNCERTAIN
     assert not np.any(step.twist)
 
 
