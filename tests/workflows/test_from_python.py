@@ -1,0 +1,245 @@
+"""The workflows as a notebook calls them: images in memory, results as values."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+import tifffile
+
+import semcal_ros
+from semcal_ros import measure_cantilever, rectify, stack, track_drift
+from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.files.recordings import open_recording
+from semcal_ros.synthetic import Drift, drift_plan, preset
+from semcal_ros.synthetic.cantilever import cantilever_plan
+from semcal_ros.workflows.evaluate import evaluate
+from tests.helpers.node_scenes import make_calibration, texture
+
+G, SIZE, COUNT = 20000.0, 96, 5
+PLAN = drift_plan(
+    preset("ideal").with_image_size(SIZE, SIZE),
+    magnification=G,
+    frames=COUNT,
+    interval_s=1.0,
+    drift=Drift(velocity_m_s=(20e-9, -10e-9)),
+)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[tuple[np.ndarray, float, float]]:
+    return [(PLAN.render(k), G, float(k)) for k in range(COUNT)]
+
+
+def test_every_agreed_name_is_there():
+    names = ("calibrate", "measure_cantilever", "reconstruct", "rectify", "stack", "track_drift")
+    for name in names:
+        assert callable(getattr(semcal_ros, name))
+        assert name in semcal_ros.__all__ and name in dir(semcal_ros)
+        assert "Examples\n" in getattr(semcal_ros, name).__doc__
+    with pytest.raises(AttributeError):
+        semcal_ros.measure_everything  # noqa: B018
+
+
+def test_drift_of_images_in_memory(frames, tmp_path):
+    seen = []
+    track = track_drift(frames, config="virtual_sem", on_progress=lambda *a: seen.append(a))
+    assert seen[0] == ("drift", 0, COUNT) and seen[-1] == ("drift", COUNT, COUNT)
+    assert track.stamps_ns == tuple(k * 10**9 for k in range(COUNT))
+    assert track.states == {"tracked": COUNT - 1, "keyframe": 1}
+    assert track.notes == ()
+    velocity = np.array([20e-9, -10e-9])
+    error = track.path.drift_m - velocity * np.arange(COUNT)[:, None]
+    pixel_m = 0.12 / G / SIZE
+    # Frames of 96 px without much structure: some hundredths of a px.
+    assert np.abs(error).max() < 0.1 * pixel_m
+    assert track.forecast(2.0).drift_m == pytest.approx(
+        velocity * (COUNT + 1.0), abs=4e-9 + 4 * np.sqrt(track.forecast(2.0).covariance[0, 0])
+    )
+    track.save_csv(tmp_path / "d.csv")
+    with (tmp_path / "d.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["dx_m"]) for r in rows] == track.path.drift_m[:, 0].tolist()
+    assert [int(r["stamp_ns"]) for r in rows] == list(track.stamps_ns)
+    with pytest.raises(FrozenInstanceError):
+        track.notes = ("no",)
+
+
+def test_live_drift_is_without_hindsight(frames):
+    live = track_drift(frames, config="virtual_sem", live=True).path
+    smooth = track_drift(frames, config="virtual_sem").path
+    assert np.all(smooth.sigma_m[1:-1] <= live.sigma_m[1:-1])
+    assert not np.array_equal(smooth.drift_m, live.drift_m)
+
+
+def test_an_average_says_what_is_in_it(frames, tmp_path):
+    blank = (np.full((SIZE, SIZE), 9, np.uint8), G, 2.5)
+    other = (frames[0][0][:50], G, 2.6)
+    result = stack(
+        [*frames[:3], blank, other, *frames[3:]],
+        config="virtual_sem",
+        output=tmp_path / "m.png",
+        sigma=tmp_path / "s.tif",
+    )
+    assert result.used.tolist() == [True, True, True, False, True, True]
+    assert len(result.stamps_ns) == COUNT + 1 and result.other_kind == 1
+    assert result.image.frames == COUNT
+    assert result.dtype == np.uint8 and result.lost == 0
+    assert result.typical_error == pytest.approx(np.nanmedian(result.image.standard_error))
+    result.save(tmp_path / "m.tif")
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "m.tif"), result.image.mean)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "s.tif"), result.image.standard_error)
+    assert (tmp_path / "m.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_average_without_drift_is_the_mean(frames):
+    result = stack(frames, drift=False)
+    assert result.path is None and result.states == {}
+    np.testing.assert_allclose(
+        result.image.mean[1:-1, 1:-1],
+        np.mean([image for image, *_ in frames], axis=0)[1:-1, 1:-1],
+        atol=1e-3,
+    )
+
+
+def test_of_several_magnifications_one_is_chosen(frames):
+    both = [*frames[:2], (texture(), 5000.0, 2.0)]
+    with pytest.raises(BagError, match="2 magnifications: 5000, 20000"):
+        stack(both, drift=False)
+    assert stack(both, drift=False, at=5000.0).image.frames == 1
+    with pytest.raises(BagError, match="one of 5000, 20000"):
+        stack(both, drift=False, at=7.0)
+    with pytest.raises(BagError, match="order of time"):
+        stack(frames[::-1], drift=False)
+
+
+def test_outputs_are_refused_before_any_work(frames, tmp_path):
+    floats = [(image.astype(np.float32), g, t) for image, g, t in frames]
+    stages = []
+    with pytest.raises(InvalidValueError, match="32FC1"):
+        stack(floats, output=tmp_path / "m.png", on_progress=lambda *a: stages.append(a))
+    assert stages[-1][1] <= 1 and not list(tmp_path.iterdir())
+
+
+def test_rectified_frames_in_memory_are_those_of_the_bag(frames, tmp_path):
+    calibration = make_calibration()
+    done = rectify(frames, calibration=calibration, config="virtual_sem")
+    assert done.output is None and done.frame_count == COUNT
+    assert done.extrapolated == COUNT  # 20 000x, calibrated up to 8000x
+    assert [f.stamp_ns for f in done.frames] == [k * 10**9 for k in range(COUNT)]
+    assert all(f.drift is not None for f in done.frames)
+    assert sum(done.states.values()) == COUNT
+    written = rectify(
+        frames, tmp_path / "bag", calibration=calibration, config="virtual_sem", namespace="/a/"
+    )
+    assert written.frames == () and written.output == tmp_path / "bag"
+    with open_recording(tmp_path / "bag") as bag:
+        assert {topic.name for topic in bag.topics} >= {"/a/image_rect", "/a/camera_info"}
+        images = [frame.image for frame in bag.frames()]
+    np.testing.assert_array_equal(images, done.images)
+
+
+def test_without_drift_only_distortion_is_undone(frames):
+    calibration = make_calibration()
+    done = rectify(frames[:2], calibration=calibration, drift=False)
+    assert done.states == {} and done.frames[0].drift is None
+    for (image, g, _), flat in zip(frames, done.images, strict=False):
+        np.testing.assert_array_equal(flat, calibration.rectify(image, g))
+
+
+def test_the_pixel_size_is_that_of_the_calibration(frames, tmp_path):
+    calibration = make_calibration()
+    calibration.save(tmp_path / "cal.yaml")
+    for given in (calibration, tmp_path / "cal.yaml", str(tmp_path / "cal.yaml")):
+        result = stack(frames, calibration=given, drift=False)
+        assert result.camera.pixel_size_m == calibration.at(G).pixel_size_m
+
+
+@pytest.mark.parametrize(
+    ("entry", "reason"),
+    [
+        ((texture(),), "magnification"),
+        ((texture(), 0.0), "greater than 0"),
+        ((np.zeros((4, 4), bool), 1.0), "bool"),
+        ((np.zeros((4, 4, 3), np.uint16), 1.0), "uint16"),
+        ((np.zeros((0, 4), np.uint8), 1.0), "shape"),
+        ((texture(), 1.0, float("nan")), "finite time"),
+    ],
+)
+def test_images_that_cannot_be_used_are_named(entry, reason):
+    with pytest.raises(InvalidValueError, match=reason):
+        track_drift([entry])
+
+
+def test_grey_levels_of_any_type_and_colours_are_taken():
+    grey = texture()
+    for image in (grey.astype(float), grey.astype(np.int32), np.dstack([grey] * 3)):
+        mean = stack([(image, 1000.0)], drift=False).image.mean
+        np.testing.assert_allclose(mean[1:-1, 1:-1], grey[1:-1, 1:-1], atol=1e-3)
+    with pytest.raises(BagError, match="usable"):
+        stack([], drift=False)
+    with pytest.raises(InvalidValueError, match="one beside each"):
+        stack([(grey, 1000.0)], magnification=1000.0)
+
+
+SCOPE = preset("ideal").with_image_size(256, 256)
+
+
+def test_bending_of_a_cantilever_in_memory(tmp_path):
+    plan = cantilever_plan(
+        SCOPE,
+        pushes=(0.0, 1.0),
+        magnifications=(6450.0,),
+        view="end",
+        drift=Drift(velocity_m_s=(8e-9, -5e-9)),
+        seed=7,
+    )
+    images = [
+        (plan.render(k), f.magnification, 1e-9 * f.stamp_ns if hasattr(f, "stamp_ns") else float(k))
+        for k, f in enumerate(plan.frames)
+    ]
+    calibration = _ideal_calibration()
+    done = measure_cantilever(
+        images, calibration=calibration, length_m=35e-6, config="virtual_sem", poses=2
+    )
+    (one,) = done.series
+    assert one.poses == (1, 2) and one.recording == "memory"
+    deflection = one.measured.frames[1]
+    assert abs(deflection.deflection_m - 250e-9) < 4.0 * deflection.sigma_m
+    assert done.repeatability.deflection_m.shape == (1, 2)
+    done.save_csv(tmp_path / "d.csv")
+    with (tmp_path / "d.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[1]["deflection_m"]) == deflection.deflection_m
+    with pytest.raises(InvalidValueError, match="1 bases and 0 tips"):
+        measure_cantilever(images, calibration=calibration, length_m=35e-6, bases=[(1.0, 2.0)])
+    with pytest.raises(InvalidValueError, match="one or the other"):
+        measure_cantilever(["a", images[0]], calibration=calibration, length_m=35e-6)
+
+
+def _ideal_calibration():
+    from semcal_ros import Calibration
+    from semcal_ros.core.camera.continuous_function import ContinuousFunction
+
+    camera = SCOPE.camera_at(7000.0)
+    values = {name: getattr(camera, name) for name in ("aspect", "skew", "px", "py", "rho")}
+    values |= {"scale": 1.0, "xi_r": 0.0, "xi_t": 0.0, "ex": camera.ex, "ey": camera.ey}
+    return Calibration(
+        functions={
+            name: ContinuousFunction("chebyshev_log", np.array([value]), (1000.0, 10000.0))
+            for name, value in values.items()
+        },
+        covariance=1e-6 * np.eye(len(values)),
+        image_width=256,
+        image_height=256,
+        display_width_m=SCOPE.display_width_m,
+        magnifications=(1000.0, 10000.0),
+        method="joint",
+    )
+
+
+def test_an_evaluation_needs_a_grid(frames):
+    with pytest.raises(semcal_ros.SemcalError, match="no usable view"):
+        evaluate(make_calibration(), frames)
