@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy.linalg import expm
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
@@ -40,6 +39,9 @@ def _hat_row(value: float, knots: Array) -> Array:
 def _ode_row(value: float, weights: Array) -> Array:
     """First row of the transition matrix of D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x over ``value``."""
     order = len(weights)
+    # Here, so that programs that ask another kind of calibration start without scipy.
+    from scipy.linalg import expm
+
     companion = np.diag(np.ones(order - 1), 1)
     companion[-1] = -weights
     return expm(companion * value)[0]

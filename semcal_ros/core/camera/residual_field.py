@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
@@ -43,12 +42,17 @@ def _clamped(breaks: Array, degree: int) -> Array:
 
 def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
     """(n, size) values of the basis functions; outside of the knots those of their ends."""
+    # Here, so that programs that ask a calibration without a residual field start without scipy.
+    from scipy.interpolate import BSpline
+
     inside = np.clip(values, knots[0], knots[-1])
     return BSpline.design_matrix(inside, knots, degree).toarray()
 
 
 def _spline_slopes(values: Array, knots: Array) -> Array:
     """(n, size) derivatives of the basis functions; outside of the knots there are none."""
+    from scipy.interpolate import BSpline
+
     size = len(knots) - _DEGREE - 1
     inside = (values > knots[0]) & (values < knots[-1])
     slopes = BSpline(knots, np.eye(size), _DEGREE)(np.clip(values, knots[0], knots[-1]), nu=1)
