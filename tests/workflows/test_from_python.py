@@ -14,7 +14,7 @@ from semcal_ros import measure_cantilever, rectify, stack, track_drift
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import Drift, drift_plan, preset
-from semcal_ros.synthetic.cantilever import cantilever_plan
+from semcal_ros.synthetic.specimens.cantilever import cantilever_plan
 from semcal_ros.workflows.evaluate import evaluate
 from tests.helpers.node_scenes import make_calibration, texture
 
