@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import AnyImage, Array, Indices, Mask
+from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
@@ -245,14 +245,14 @@ def assign_squares(
     )
 
 
-def _centred_ij(detection: LatticeDetection) -> Indices:
+def _centre_lattice(detection: LatticeDetection) -> Array:
     """(n, 2) lattice indices with the origin at the corner nearest to the middle of the image.
 
     The height of a view is that of its origin, and what its prior speaks of is the height of what is looked at.
     """
     middle = 0.5 * (np.array(detection.image_size, dtype=np.float64) - 1.0)
     nearest = np.argmin(np.sum((detection.xy - middle) ** 2, axis=1))
-    return detection.ij - detection.ij[nearest]
+    return np.asarray(detection.ij - detection.ij[nearest], dtype=np.float64)
 
 
 def views_from_detections(
@@ -295,7 +295,7 @@ def views_from_detections(
     views = tuple(
         GridView(
             float(g),
-            _centred_ij(d) * float(square),
+            _centre_lattice(d) * float(square),
             d.xy,
             d.sigma_px,
             label,
