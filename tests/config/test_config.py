@@ -244,7 +244,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing() -> None:
 
 def test_the_unit_is_not_a_truth_value() -> None:
     text = "{name: a, display_width_m: 1, magnification: {quantity: magnification, unit: true}}"
-    with pytest.raises(ConfigError, match="key magnification.unit is True"):
+    with pytest.raises(ConfigError, match=r"key magnification.unit is True"):
         parse_config(text)
 
 
