@@ -85,7 +85,7 @@ class KnownDrift:
             FrameDrift(d.position, d.velocity, covariance, d, update, True) for d in drifts(camera)
         )
 
-    def of(self, _frame: Any, _camera: Any) -> Any:
+    def estimate(self, _frame: Any, _camera: Any) -> Any:
         return next(self._made)
 
     def reset(self) -> None:
@@ -155,13 +155,13 @@ def node_actions(
     def turn(node: Any, magnification: float) -> None:
         clock["ns"] += 1_000_000
         message = Float64(data=float(magnification))
-        node._input._magnification._on_message(message, info())
+        node.frames._magnification._on_message(message, info())
 
     def frame(node: Any) -> None:
         clock["ns"] += 100_000_000
         message = next(frames)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(clock["ns"], 10**9)
-        node._input._on_image(message, info())
+        node.frames._on_image(message, info())
 
     def both() -> None:
         turn(corrector, next(knob))
@@ -178,7 +178,7 @@ def node_actions(
         clock["ns"] += 100_000_000
         message = next(frames)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(clock["ns"], 10**9)
-        given = corrector._input._frame(message, info(), 1.0)
+        given = corrector.frames._frame(message, info(), 1.0)
         tracker.of(given, camera)
 
     return {

@@ -17,10 +17,9 @@ from semcal_ros.core.errors import BagError, ConfigError, SemcalError
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.parameters import Setting
-from semcal_ros.nodes.common.qos import overridable, stream_output, value_input
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.qos import overridable, service_queue, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.common.services import service_queue
 
 __all__ = ["BagPlayer", "main"]
 
@@ -61,25 +60,38 @@ class _Pacer:
         return min(max(target_ns - self.position_ns, 0) * 1e-9 / self.rate, at_most_s)
 
 
-_SETTINGS = (
-    Setting("bag", "", "Recording: a rosbag2 folder, or an .mcap or .db3 file.", fixed=True),
-    Setting("rate", 1.0, "Speed of the replay.", "s of recording per s", 0.001, 1000.0),
-    Setting("loop", False, "Begin again at the end."),
-    Setting("clock", False, "Publish the time of the recording on /clock.", fixed=True),
-    Setting("start_paused", False, "Wait for ~/pause to be called with false.", fixed=True),
-    Setting(
+_PARAMETERS = (
+    ParameterDeclaration(
+        "bag", "", "Recording: a rosbag2 folder, or an .mcap or .db3 file.", fixed=True
+    ),
+    ParameterDeclaration(
+        "rate", 1.0, "Speed of the replay.", "s of recording per s", 0.001, 1000.0
+    ),
+    ParameterDeclaration("loop", False, "Begin again at the end."),
+    ParameterDeclaration(
+        "clock", False, "Publish the time of the recording on /clock.", fixed=True
+    ),
+    ParameterDeclaration(
+        "start_paused", False, "Wait for ~/pause to be called with false.", fixed=True
+    ),
+    ParameterDeclaration(
         "wait_for_subscribers",
         0,
-        "Start when images and magnification (all topics, where there are none) have so many subscribers each.",
+        "Start once images and magnification (all topics, if there are none) have this many subscribers each.",
         low=0,
         high=100,
         fixed=True,
     ),
 )
+# Between two values of /clock, s: finer than the interval between frames that live tracking keeps up with.
 _TICK_S = 0.02
-# Parts of a message that were lost are sent again every three seconds.
+# Fast DDS sends lost parts of a message again every three seconds: three chances.
 _ACK_S = 10.0
-_HEARD_S = 10.0
+# Discovery takes a second, and several on a busy machine; afterwards the replay begins in any case.
+_DISCOVERY_S = 10.0
+# The replay's thread looks at its end every _TICK_S; longer only a read of the disk can take.
+_END_S = 5.0
+# Of each topic: a burst of messages with nearly the same log time goes out at once.
 _DEPTH = 10
 
 
@@ -87,33 +99,33 @@ class BagPlayer(SemNode):
     """Publishes the stored bytes of a recording; the node ends with the recording unless it loops."""
 
     def __init__(self) -> None:
-        # The middleware may end a node that is still being made.
-        self._changed = threading.Condition()
-        self._ended = False
-        self._thread: threading.Thread | None = None
-        super().__init__("bag_player", _SETTINGS)
-        if not self.settings["bag"]:
+        super().__init__("bag_player", _PARAMETERS)
+        if not self.parameters["bag"]:
             raise ConfigError(
                 "no recording", expected="the parameter bag", do="give --ros-args -p bag:=PATH"
             )
         self.exit_status = 0
-        self._bag = open_bag(self.settings["bag"])
+        self._bag = open_bag(self.parameters["bag"])
+        self.closing.callback(self._bag.close)
         # Topics whose last message reaches those who come later.
-        self._lasting: set[str] = set()
-        self._unheard = self.settings["wait_for_subscribers"] > 0
+        self._latched: set[str] = set()
+        self._undiscovered = self.parameters["wait_for_subscribers"] > 0
         self._publishers_by_topic = self._make_publishers()
         self._clock_publisher = (
-            self.create_publisher(ClockMessage, "/clock", 10) if self.settings["clock"] else None
+            self.create_publisher(ClockMessage, "/clock", 10) if self.parameters["clock"] else None
         )
-        self._pacer = _Pacer(self.settings["rate"], paused=self.settings["start_paused"])
+        self._pacer = _Pacer(self.parameters["rate"], paused=self.parameters["start_paused"])
         # Shutting the context down from the replay's own thread would make that thread wait for itself.
         self._end = self.create_guard_condition(self._leave)
-        self.settings.on_change("rate", self._set_rate)
+        self.parameters.on_change("rate", self._set_rate)
         self._service = self.create_service(
             SetBool, "~/pause", self._on_pause, qos_profile=service_queue()
         )
+        self._changed = threading.Condition()
+        self._ended = False
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
         self._thread.start()
+        self.closing.callback(self._end_replay)
 
     def idle(self) -> bool:
         """A replay takes no frames in."""
@@ -123,15 +135,11 @@ class BagPlayer(SemNode):
         """As in the base class; also whether the replay is paused."""
         return super().conditions() + ["paused"] * self._pacer.paused
 
-    def destroy_node(self) -> None:
-        """Stop the replay first."""
+    def _end_replay(self) -> None:
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-            self._bag.close()
-        super().destroy_node()
+        self._thread.join(timeout=_END_S)
 
     # -- topics ------------------------------------------------------------------------------------
 
@@ -143,7 +151,7 @@ class BagPlayer(SemNode):
                 publishers[topic.name] = publisher
         if not publishers:
             raise BagError(
-                f"{self.settings['bag']} has no topic that can be published",
+                f"{self.parameters['bag']} has no topic that can be published",
                 expected="at least one topic of an installed message type",
             )
         return publishers
@@ -153,13 +161,13 @@ class BagPlayer(SemNode):
         try:
             message_type = message_class(topic.type)
         except ConfigError as error:
-            self.reject(error)
+            self.reporter.reject(error)
             return None
-        # A magnification stays valid: who comes later must learn it.
-        lasting = topic.latched or self._is_magnification(topic)
-        if lasting:
-            self._lasting.add(topic.name)
-        profile = value_input(1) if lasting else stream_output(_DEPTH)
+        # A magnification stays valid, so a node that is started later must receive it.
+        is_latched = topic.latched or self._is_magnification(topic)
+        if is_latched:
+            self._latched.add(topic.name)
+        profile = value_input(1) if is_latched else stream_output(_DEPTH)
         return self.create_publisher(
             message_type, topic.name, profile, qos_overriding_options=overridable()
         )
@@ -191,7 +199,7 @@ class BagPlayer(SemNode):
         try:
             self._wait_for_subscribers()
             self._play_once()
-            while self.settings["loop"] and not self._ended:
+            while self.parameters["loop"] and not self._ended:
                 self._play_once()
             self._flush()
         except SemcalError as error:
@@ -209,7 +217,7 @@ class BagPlayer(SemNode):
         raise ExternalShutdownException
 
     def _wait_for_subscribers(self) -> None:
-        wanted = self.settings["wait_for_subscribers"]
+        wanted = self.parameters["wait_for_subscribers"]
         images = self.config.image.type
         streams = [t for t in self._bag.topics if t.type == images or self._is_magnification(t)]
         names = {t.name for t in streams} & set(self._publishers_by_topic)
@@ -234,16 +242,17 @@ class BagPlayer(SemNode):
             self._publish_clock(message.log_time_ns)
             publisher = self._publishers_by_topic[message.topic]
             publisher.publish(bytes(message.data))
-            self.count_published(None)
-            if self._unheard and message.topic in self._lasting:
-                self._be_heard(publisher, message.log_time_ns)
+            self.reporter.count_published(None)
+            if self._undiscovered and message.topic in self._latched:
+                self._wait_for_discovery(publisher, message.log_time_ns)
 
-    def _be_heard(self, publisher: Any, position_ns: int) -> None:
-        """Wait until subscribers have found this node, too: that it knows of them does not say so. They get a lasting
-        message however late they find it, and only then answer.
+    def _wait_for_discovery(self, publisher: Any, position_ns: int) -> None:
+        """Wait until the subscribers have discovered this node as well, which its knowing of them does not prove.
+
+        A latched message reaches them however late they discover it, and only then do they acknowledge it.
         """
-        self._unheard = False
-        publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
+        self._undiscovered = False
+        publisher.wait_for_all_acked(Duration(seconds=_DISCOVERY_S))
         with self._changed:
             self._pacer.seek(position_ns)
 

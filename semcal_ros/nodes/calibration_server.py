@@ -21,12 +21,11 @@ from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, Calib
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
-from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.calibration_input import calibration_digest
 from semcal_ros.nodes.frames.overlay import corner_overlay
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode
+from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,
     CalibrationProcess,
@@ -36,18 +35,18 @@ from semcal_ros.nodes.workers.calibration_worker import (
 
 __all__ = ["CalibrationServer", "main"]
 
-_SETTINGS = (
-    Setting("method", "joint", "Calibration method.", choices=tuple(METHODS)),
-    Setting(
+_PARAMETERS = (
+    ParameterDeclaration("method", "joint", "Calibration method.", choices=tuple(METHODS)),
+    ParameterDeclaration(
         "residual",
         "auto",
         "Field for what the distortion parameters cannot describe (joint).",
         choices=tuple(RESIDUAL_MODES),
     ),
-    Setting("output", "", "File that ~/save writes.", confined=True),
-    Setting("allow_writing", True, "Whether ~/save may write files.", fixed=True),
+    ParameterDeclaration("output", "", "File that ~/save writes.", confined=True),
+    ParameterDeclaration("allow_writing", True, "Whether ~/save may write files.", fixed=True),
 )
-# Frames, the report, parameters, views, a calibration, and those who want to cancel it.
+# Frames, the report, parameters, views, a calibration, and a call that cancels it.
 _THREADS = 6
 
 
@@ -58,7 +57,7 @@ class CalibrationServer(StreamNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("calibration_server", _SETTINGS)
+        super().__init__("calibration_server", _PARAMETERS)
         self._lock = threading.Lock()
         self._newest: StreamFrame | None = None
         self._added: StreamFrame | None = None
@@ -66,32 +65,31 @@ class CalibrationServer(StreamNode):
         self._calibration: Calibration | None = None
         self._running: CalibrationProcess | None = None
         self._stage: Stage | None = None
-        self._text = self.latched_publisher(String, "calibration")
-        self._progress = self.latched_publisher(DiagnosticStatus, "~/progress")
-        self._overlay = self.stream_publisher(Image, "~/overlay")
-        self._input = FrameInput(self, self._on_frame, group=MutuallyExclusiveCallbackGroup())
+        self._text = self.endpoints.latched_publisher(String, "calibration")
+        self._progress = self.endpoints.latched_publisher(DiagnosticStatus, "~/progress")
+        self._overlay = self.endpoints.stream_publisher(Image, "~/overlay")
+        self.receive_frames(self._on_frame, group=MutuallyExclusiveCallbackGroup())
         quick = MutuallyExclusiveCallbackGroup()
         handlers = (
             ("add_view", self._add_view, quick),
             ("save", self._save, quick),
             ("clear", self._clear, quick),
-            # Who calls while a calibration runs is refused at once, and not queued.
+            # A call during a calibration is refused at once instead of waiting for its end.
             ("calibrate", self._calibrate, ReentrantCallbackGroup()),
             ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
         )
         self._answers = [
-            trigger_service(self, f"~/{name}", handler, group, self._report_answer)
+            self.endpoints.trigger_service(f"~/{name}", handler, group, self._report_answer)
             for name, handler, group in handlers
         ]
+        self.closing.callback(self._end_calibration)
         self._report_progress("no views yet")
 
-    def destroy_node(self) -> None:
-        """End a running calibration first."""
+    def _end_calibration(self) -> None:
         with self._lock:
             running = self._running
         if running is not None:
             running.cancel()
-        super().destroy_node()
 
     def _report_answer(self, success: bool, text: str) -> None:
         self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
@@ -148,7 +146,7 @@ class CalibrationServer(StreamNode):
             self._views.append(view)
             self._added = frame
             count = len(self._views)
-        self.count_published(frame.stamp_ns)
+        self.reporter.count_published(frame.stamp_ns)
         return f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners"
 
     def _clear(self) -> str:
@@ -176,7 +174,7 @@ class CalibrationServer(StreamNode):
         message = String()
         fill_calibration_text(message, text)
         self._text.publish(message)
-        self.statistics.note("calibration_digest", calibration_digest(text))
+        self.reporter.note("calibration_digest", calibration_digest(text))
         return result.summary
 
     def _begin(self) -> CalibrationProcess:
@@ -188,7 +186,7 @@ class CalibrationServer(StreamNode):
             if not self._views:
                 raise CalibrationError("no usable view yet", do="call ~/add_view first")
             views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
-            config, values = self.config, self.settings
+            config, values = self.config, self.parameters
             job = CalibrationJob(
                 views,
                 config.display_width_m,
@@ -199,7 +197,7 @@ class CalibrationServer(StreamNode):
             return self._running
 
     def _finish(self, running: CalibrationProcess, *, done: bool) -> bool:
-        """Make way for the next one; False if somebody has cancelled this one."""
+        """Allow the next one; False if this one was cancelled."""
         with self._lock:
             wanted = self._running is running
             if wanted:
@@ -227,18 +225,18 @@ class CalibrationServer(StreamNode):
         )
 
     def _save(self) -> str:
-        if not self.settings["allow_writing"]:
+        if not self.parameters["allow_writing"]:
             raise InvalidValueError(
                 "writing files is switched off", do="start the node with allow_writing true"
             )
         with self._lock:
             calibration = self._calibration
-        path = self.settings["output"]
+        path = self.parameters["output"]
         if calibration is None:
             raise InvalidValueError("no calibration to save", do="call ~/calibrate first")
         if not path:
             raise InvalidValueError("no file to save to", do="set the parameter output")
-        calibration.save(self.settings.allowed_path(path))
+        calibration.save(self.parameters.allowed_path(path))
         return f"saved to {path}"
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.frames.compressed import compressed_settings
-from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.frames.compressed import compressed_parameters
+from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, LiveDrift
 from semcal_ros.nodes.frames.outputs import DriftOutput, ImageOutput
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode, nominal_camera
+from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode, nominal_camera
 
 __all__ = ["DriftCompensator", "main"]
 
@@ -24,17 +24,19 @@ class DriftCompensator(StreamNode):
     def __init__(self) -> None:
         super().__init__(
             "drift_compensator",
-            (INTERPOLATION, *DRIFT_SETTINGS, *compressed_settings("image_stabilized")),
+            (INTERPOLATION, *DRIFT_PARAMETERS, *compressed_parameters("image_stabilized")),
         )
-        self._rectifier = Rectifier(self.settings["interpolation"])
-        self.settings.on_change("interpolation", self._set_interpolation)
-        # Ended the other way round: the last compressed image comes out.
-        self._images = ImageOutput(self, "image_stabilized")
+        self._rectifier = Rectifier(self.parameters["interpolation"])
+        self.parameters.on_change("interpolation", self._set_interpolation)
+        # Closed in the reverse order, so that the last compressed image is published.
+        self._images = ImageOutput(
+            self.parameters, self.endpoints, self.reporter, "image_stabilized"
+        )
         self.closing.callback(self._images.close)
-        self._drift = LiveDrift(self)
+        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
         self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self)
-        self._input = FrameInput(self, self._on_frame)
+        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self.receive_frames(self._on_frame)
 
     def _set_interpolation(self, value: str) -> None:
         self._rectifier = Rectifier(value)
@@ -44,7 +46,7 @@ class DriftCompensator(StreamNode):
         if g is None:
             return
         camera = nominal_camera(g, *frame.size, self.config.display_width_m)
-        drift = None if frame.mixed else self._drift.of(frame, camera)
+        drift = None if frame.mixed else self._drift.estimate(frame, camera)
         raster = None if drift is None else drift.raster
         memory = self._images.memory(frame)
         self._rectifier.rectify(frame.image, camera, raster, self.config.scan, out=memory)

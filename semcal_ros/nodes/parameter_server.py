@@ -18,23 +18,22 @@ from semcal_ros.bridge.parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.parameters import CALIBRATION, Setting
+from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 
 __all__ = ["ParameterServer", "main"]
 
 _SIZE = (
-    Setting(
+    ParameterDeclaration(
         "image_width", 0, "Width of the live frames; 0: that of the calibration.", "px", 0, 65536
     ),
-    Setting(
+    ParameterDeclaration(
         "image_height", 0, "Height of the live frames; 0: that of the calibration.", "px", 0, 65536
     ),
 )
-# For finding who else publishes a calibration, and for what they have to say once they are found.
+# To discover other publishers of a calibration, and to receive theirs once one is discovered.
 _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
 _TICK_S = 0.5
 
@@ -46,18 +45,25 @@ class ParameterServer(SemNode):
     """
 
     def __init__(self) -> None:
-        self._calibration: CalibrationInput | None = None
         super().__init__("parameter_server", (CALIBRATION, *_SIZE))
         self._reading: MagnificationReading | None = None
         self._published_g: float | None = None
-        self._text = self.latched_publisher(String, "calibration")
-        self._info = self.latched_publisher(CameraInfo, "camera_info")
-        self._projection = self.latched_publisher(Float64MultiArray, "projection")
-        self._calibration = CalibrationInput(self, on_change=self._on_calibration)
+        self._text = self.endpoints.latched_publisher(String, "calibration")
+        self._info = self.endpoints.latched_publisher(CameraInfo, "camera_info")
+        self._projection = self.endpoints.latched_publisher(Float64MultiArray, "projection")
+        self._calibration = CalibrationInput(
+            self.config,
+            self.parameters,
+            self.endpoints,
+            self.reporter,
+            on_change=self._on_calibration,
+        )
         for setting in _SIZE:
-            self.settings.on_change(setting.name, lambda _value: self._refresh())
-        self._magnification = MagnificationInput(self, self._on_reading)
-        self._reload = trigger_service(self, "~/reload", self._on_reload)
+            self.parameters.on_change(setting.name, lambda _value: self._refresh())
+        self._magnification = MagnificationInput(
+            self.config, self.endpoints, self.reporter, self._on_reading
+        )
+        self._reload = self.endpoints.trigger_service("~/reload", self._on_reload)
         # A server that is started again must not set everybody back to its file while another node, such as
         # calibration_server, still holds what has come into force since.
         self._listened_s = 0.0
@@ -71,26 +77,24 @@ class ParameterServer(SemNode):
 
     def conditions(self) -> list[str]:
         """As in the base class; also whether there is no calibration."""
-        missing = self._calibration is None or self._calibration.current is None
+        missing = self._calibration.current is None
         return super().conditions() + ["uncalibrated"] * missing
 
     # -- topics ------------------------------------------------------------------------------------
 
     def _on_calibration(self) -> None:
-        # The file given at start is read before there is somebody to tell; it has to wait.
-        if self._calibration is not None:
-            self._calibration.publish(self._text)
+        self._calibration.publish(self._text)
         self._refresh()
 
     def _publish_start(self) -> None:
-        """Publish the file given at start once it is clear that nothing else has come into force."""
+        """Publish the file given at start once it is clear that no other calibration is in force."""
         self._listened_s += _TICK_S
         others = self.count_publishers(self._text.topic_name) > 1
-        published = self._calibration is None or self._calibration.has_published
+        published = self._calibration.has_published
         if not published and self._listened_s < (_LISTEN_AT_MOST_S if others else _LISTEN_FIRST_S):
             return
         self._listening.cancel()
-        if self._calibration is not None and not published:
+        if not published:
             self._calibration.publish(self._text)
             self._refresh()
 
@@ -105,12 +109,12 @@ class ParameterServer(SemNode):
     def _update(self) -> None:
         """Publish camera and projection if the magnification is another one than last time."""
         source = self._calibration
-        if source is None or source.current is None or self._reading is None:
+        if source.current is None or self._reading is None:
             return
         if not source.has_published:
             return  # the file given at start has to wait
-        width = self.settings["image_width"] or source.current.image_width
-        height = self.settings["image_height"] or source.current.image_height
+        width = self.parameters["image_width"] or source.current.image_width
+        height = self.parameters["image_height"] or source.current.image_height
         try:
             reading = MagnificationReading(
                 self._reading.value, self._reading.stamp_ns, source.config
@@ -121,17 +125,17 @@ class ParameterServer(SemNode):
             camera = source.current.at(g).resized(width, height)
             self._publish(camera, width, height)
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
             return
         self._published_g = g
-        self.statistics.note("magnification", g)
-        self.statistics.note("in_calibrated_range", camera.in_range)
+        self.reporter.note("magnification", g)
+        self.reporter.note("in_calibrated_range", camera.in_range)
 
     def _publish(self, camera: Any, width: int, height: int) -> None:
         projection = Float64MultiArray()
         fill_projection(projection, camera)
         self._projection.publish(projection)
-        self.count_published(None)
+        self.reporter.count_published(None)
         # A node that describes every single image knows better; two sources would break its pairs.
         if self.count_publishers(self._info.topic_name) > 1:
             return
@@ -143,8 +147,8 @@ class ParameterServer(SemNode):
     # -- services ----------------------------------------------------------------------------------
 
     def _on_reload(self) -> str:
-        path = self.settings["calibration"]
-        if not path or self._calibration is None:
+        path = self.parameters["calibration"]
+        if not path:
             raise InvalidValueError(
                 "no calibration file to read again",
                 expected="the parameter calibration to be set",
@@ -152,7 +156,7 @@ class ParameterServer(SemNode):
         try:
             self._calibration.load(path)
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
             raise
         return f"read {path}"
 
@@ -161,14 +165,14 @@ class ParameterServer(SemNode):
     def _continuous(self, name: str) -> Parameter:
         """Value of ``kind@magnification``; not set, with a warning that says why, where there is none."""
         try:
-            if self._calibration is None or self._calibration.current is None:
+            if self._calibration.current is None:
                 raise InvalidValueError(
                     f"parameter {name} without a calibration",
                     expected="the parameter calibration to name a file",
                 )
             value = read_parameter(name, self._calibration.current)
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
             return Parameter(name, Parameter.Type.NOT_SET, None)
         return Parameter(name, Parameter.Type.DOUBLE_ARRAY, value)
 

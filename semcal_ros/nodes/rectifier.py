@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame
+from semcal_ros.nodes.frames.stream import StreamFrame
 
 __all__ = ["RectifierNode", "main"]
 
-_INPUT = Setting(
+_INPUT = ParameterDeclaration(
     "input",
     "raw",
     "Which images to rectify: those of the microscope, or image_stabilized of drift_compensator.",
@@ -25,9 +25,8 @@ class RectifierNode(CalibratedStreamNode):
 
     def __init__(self) -> None:
         super().__init__("rectifier", (_INPUT,))
-        stabilized = self.settings["input"] == "stabilized"
-        self._input = FrameInput(
-            self,
+        stabilized = self.parameters["input"] == "stabilized"
+        self.receive_frames(
             self._on_frame,
             topic="image_stabilized" if stabilized else None,
             # The stabilised image has no data bar any more.

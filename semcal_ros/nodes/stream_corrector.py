@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.live_drift import DRIFT_SETTINGS, LiveDrift
+from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, LiveDrift
 from semcal_ros.nodes.frames.outputs import DriftOutput
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, nominal_camera
+from semcal_ros.nodes.frames.stream import StreamFrame, nominal_camera
 
 __all__ = ["StreamCorrector", "main"]
 
@@ -20,26 +20,24 @@ class StreamCorrector(CalibratedStreamNode):
     """
 
     def __init__(self) -> None:
-        self._drift: LiveDrift | None = None
-        super().__init__("stream_corrector", DRIFT_SETTINGS)
-        self._drift = LiveDrift(self)
+        super().__init__("stream_corrector", DRIFT_PARAMETERS)
+        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
         self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self)
-        self._input = FrameInput(self, self._on_frame)
+        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self.receive_frames(self._on_frame)
 
     def on_calibration(self) -> None:
         """A keyframe in the coordinates of the old calibration is of no use."""
-        if self._drift is not None:
-            self._drift.reset()
+        self._drift.reset()
 
     def _on_frame(self, frame: StreamFrame) -> None:
         g = self.known_magnification(frame)
-        if g is None or self._drift is None:
+        if g is None:
             return
         camera = self.camera(frame, g)
-        width_m = self.effective_config.display_width_m
+        width_m = self.calibration.config.display_width_m
         used = camera or nominal_camera(g, *frame.size, width_m)
-        drift = None if frame.mixed else self._drift.of(frame, used)
+        drift = None if frame.mixed else self._drift.estimate(frame, used)
         raster = None if drift is None else drift.raster
         memory = self.output.memory(frame)
         self.rectifier.rectify(frame.image, used, raster, self.config.scan, out=memory)

@@ -17,7 +17,7 @@ from semcal_ros.bridge.magnification import check_magnification
 from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.parameters import CONFIG, Setting
+from semcal_ros.nodes.common.parameters import CONFIG, ParameterDeclaration
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.synthetic import (
@@ -34,23 +34,37 @@ from semcal_ros.synthetic import (
 
 __all__ = ["VirtualSem", "main"]
 
-_SETTINGS = (
+_PARAMETERS = (
     replace(CONFIG, default="virtual_sem"),
-    Setting("preset", "jsm820", "Microscope.", choices=tuple(PRESETS), fixed=True),
-    Setting("specimen", "grid", "Specimen.", choices=tuple(SPECIMEN_KINDS), fixed=True),
-    Setting("drift", "none", "Drift of the specimen.", choices=tuple(DRIFTS), fixed=True),
-    Setting("width", 512, "Image width.", "px", 32, 8192, fixed=True),
-    Setting("height", 512, "Image height.", "px", 32, 8192, fixed=True),
-    Setting("seed", 0, "Seed of specimen and noise.", low=0, high=2**31 - 1, fixed=True),
-    Setting("rate", 0.0, "Frames per second; 0: as fast as they are scanned.", "Hz", 0.0, 200.0),
-    Setting("bits", 8, "Depth of the pixels, 8 or 16.", low=8, high=16),
-    Setting("magnification", 1000.0, "Magnification at the start.", "", 1.0, 1e6, fixed=True),
-    Setting("tilt_deg", 0.0, "Tilt of the stage.", "degrees", -60.0, 60.0),
-    Setting(
+    ParameterDeclaration("preset", "jsm820", "Microscope.", choices=tuple(PRESETS), fixed=True),
+    ParameterDeclaration(
+        "specimen", "grid", "Specimen.", choices=tuple(SPECIMEN_KINDS), fixed=True
+    ),
+    ParameterDeclaration(
+        "drift", "none", "Drift of the specimen.", choices=tuple(DRIFTS), fixed=True
+    ),
+    ParameterDeclaration("width", 512, "Image width.", "px", 32, 8192, fixed=True),
+    ParameterDeclaration("height", 512, "Image height.", "px", 32, 8192, fixed=True),
+    ParameterDeclaration(
+        "seed", 0, "Seed of specimen and noise.", low=0, high=2**31 - 1, fixed=True
+    ),
+    ParameterDeclaration(
+        "rate", 0.0, "Frames per second; 0: as fast as they are scanned.", "Hz", 0.0, 200.0
+    ),
+    ParameterDeclaration("bits", 8, "Depth of the pixels, 8 or 16.", low=8, high=16),
+    ParameterDeclaration(
+        "magnification", 1000.0, "Magnification at the start.", "", 1.0, 1e6, fixed=True
+    ),
+    ParameterDeclaration("tilt_deg", 0.0, "Tilt of the stage.", "degrees", -60.0, 60.0),
+    ParameterDeclaration(
         "tilt_axis_deg", 0.0, "Direction of the tilt axis in the image.", "degrees", -360.0, 360.0
     ),
-    Setting("rotation_deg", 0.0, "Rotation of the specimen.", "degrees", -360.0, 360.0),
-    Setting("height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3),
+    ParameterDeclaration(
+        "rotation_deg", 0.0, "Rotation of the specimen.", "degrees", -360.0, 360.0
+    ),
+    ParameterDeclaration(
+        "height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3
+    ),
 )
 _POSE = ("tilt_deg", "tilt_axis_deg", "rotation_deg", "height_m")
 _ENCODINGS = {8: "mono8", 16: "mono16"}
@@ -63,24 +77,24 @@ class VirtualSem(SemNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("virtual_sem", _SETTINGS)
+        super().__init__("virtual_sem", _PARAMETERS)
         self._start_ns = self.get_clock().now().nanoseconds
         self._scene = LiveScene(
             self._microscope(),
-            self.settings["specimen"],
-            magnification=self.settings["magnification"],
+            self.parameters["specimen"],
+            magnification=self.parameters["magnification"],
             pose=self._pose(),
-            drift=drift_preset(self.settings["drift"]),
-            detector=self._detector(self.settings["bits"]),
-            seed=self.settings["seed"],
+            drift=drift_preset(self.parameters["drift"]),
+            detector=self._detector(self.parameters["bits"]),
+            seed=self.parameters["seed"],
         )
         for name in _POSE:
-            self.settings.on_change(name, self._set_pose)
-        self.settings.on_change("bits", self._set_bits, self._detector)
-        self.settings.on_change("rate", self._set_rate)
+            self.parameters.on_change(name, self._set_pose)
+        self.parameters.on_change("bits", self._set_bits, self._detector)
+        self.parameters.on_change("rate", self._set_rate)
         source = self._checked_source()
-        self._images = self.stream_publisher(Image, self.config.image.topic)
-        self._magnification = self.latched_publisher(Float64, source)
+        self._images = self.endpoints.stream_publisher(Image, self.config.image.topic)
+        self._magnification = self.endpoints.latched_publisher(Float64, source)
         self._announced: float | None = None
         self._announce()
         self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
@@ -116,21 +130,21 @@ class VirtualSem(SemNode):
         return source.topic
 
     def _microscope(self) -> VirtualMicroscope:
-        microscope = preset(self.settings["preset"])
+        microscope = preset(self.parameters["preset"])
         microscope = replace(microscope, display_width_m=self.config.display_width_m)
         if self.config.scan is not None:
             microscope = microscope.with_timing(self.config.scan)
-        return microscope.with_image_size(self.settings["width"], self.settings["height"])
+        return microscope.with_image_size(self.parameters["width"], self.parameters["height"])
 
     def _detector(self, bits: int) -> Detector:
         return Detector(bits=bits, databar_rows=self.config.image.databar_rows)
 
     def _pose(self) -> Pose:
-        tilt, axis, rotation = (math.radians(self.settings[name]) for name in _POSE[:3])
-        return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, self.settings["height_m"]))
+        tilt, axis, rotation = (math.radians(self.parameters[name]) for name in _POSE[:3])
+        return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, self.parameters["height_m"]))
 
     def _period_s(self) -> float:
-        rate = self.settings["rate"]
+        rate = self.parameters["rate"]
         return 1.0 / rate if rate > 0.0 else self._scene.microscope.timing.acquisition_time_s
 
     # -- control -----------------------------------------------------------------------------------
@@ -150,14 +164,14 @@ class VirtualSem(SemNode):
                 self._now_s(), (message.linear.x, message.linear.y), message.angular.z
             )
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
 
     def _on_magnification(self, message: Any) -> None:
         try:
             self._scene.set_magnification(check_magnification(message.data), self._now_s())
             self._announce()
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -169,7 +183,7 @@ class VirtualSem(SemNode):
         if self._scene.magnification != self._announced:
             self._announced = self._scene.magnification
             self._magnification.publish(Float64(data=self._announced))
-            self.statistics.note("magnification", self._announced)
+            self.reporter.note("magnification", self._announced)
 
     def _take_frame(self) -> None:
         # The frame that has just been completed: what the stamp means is when its first pixel was scanned.
@@ -181,9 +195,9 @@ class VirtualSem(SemNode):
             fill_header(header, stamp_ns, self.config.frame_id)
             fill_image(message, frame.image, _ENCODINGS[8 * frame.image.dtype.itemsize], header)
             self._images.publish(message)
-            self.count_published(stamp_ns)
+            self.reporter.count_published(stamp_ns)
         except SemcalError as error:
-            self.reject(error)
+            self.reporter.reject(error)
 
 
 def main(args: Sequence[str] | None = None) -> int:

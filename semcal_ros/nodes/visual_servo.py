@@ -21,22 +21,23 @@ from semcal_ros.applications.servoing import (
     find_target,
 )
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import DeferredSignals, run_node
-from semcal_ros.nodes.common.services import trigger_service
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
 from semcal_ros.nodes.servo.output import ErrorOutput, StageOutput
-from semcal_ros.nodes.servo.settings import SERVO_SETTINGS, goal_of, servo_settings_of
+from semcal_ros.nodes.servo.settings import SERVO_PARAMETERS, read_goal, read_servo_settings
 
 __all__ = ["VisualServo", "main"]
 
 _TICK_S = 0.1
-# Without a frame for so many intervals, and at least so long, the stage stops.
+# The stage stops after this many intervals, and at least this time, without a frame: one lost frame is no reason.
 _SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
-# Stamps that are further away than this are of another clock.
+# Stamps further away than this are from another clock: no frame takes that long to arrive.
 _OTHER_CLOCK_S = 30.0
-# A target that is not found may lie outside of the picture for a drift of this part of its width.
+# A target that is not found may have left the picture if the drift is more than this part of its width: more than
+# markers at the edge can hide.
 _HIDDEN = 0.03
 _RESET_AGAIN_S = 2.0
 
@@ -50,15 +51,13 @@ class VisualServo(SemNode):
     """
 
     def __init__(self) -> None:
-        # The middleware may end a node that is still being made.
-        self._stage: StageOutput | None = None
-        super().__init__("visual_servo", SERVO_SETTINGS)
+        super().__init__("visual_servo", SERVO_PARAMETERS)
         self._end = DeferredSignals()
-        values = self.settings
+        values = self.parameters
         self._target = NestedTarget(values["target_cell_m"])
         centre = values["rotation_centre_x_m"], values["rotation_centre_y_m"]
-        self._servo = Servo(goal_of(values), servo_settings_of(values), centre)
-        for setting in SERVO_SETTINGS:
+        self._servo = Servo(read_goal(values), read_servo_settings(values), centre)
+        for setting in SERVO_PARAMETERS:
             if not setting.fixed:
                 values.on_change(setting.name, self._apply)
         self._active = bool(values["start"])
@@ -68,34 +67,39 @@ class VisualServo(SemNode):
         self._magnification_value: float | None = None
         self._resets = 0
         self._reset_s = -_RESET_AGAIN_S
-        self._stage = StageOutput(self, values["stage"])
-        self._errors = ErrorOutput(self)
+        self._stage = StageOutput(self.endpoints, values["stage"])
+        self.closing.callback(self._stop_stage)
+        self._errors = ErrorOutput(self.endpoints)
         self._reset = None
         if values["reset_service"] and values["goal_frame"] == "instrument":
             self._reset = self.create_client(Trigger, values["reset_service"])
-        self._magnification = MagnificationInput(self, self._on_magnification)
+        self._magnification = MagnificationInput(
+            self.config, self.endpoints, self.reporter, self._on_magnification
+        )
         self._input = ServoInput(
-            self, self._on_frame, self._halt, with_drift=bool(values["with_drift"])
+            self.endpoints,
+            self.reporter,
+            self._on_frame,
+            self._halt,
+            with_drift=bool(values["with_drift"]),
         )
         self._triggers = [
-            trigger_service(self, "~/start", self._on_start),
-            trigger_service(self, "~/stop", self._on_stop),
+            self.endpoints.trigger_service("~/start", self._on_start),
+            self.endpoints.trigger_service("~/stop", self._on_stop),
         ]
         # A simulated clock may stand still; the stage must not go on for that.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog = self.create_timer(_TICK_S, self._watch, clock=steady)
 
-    def destroy_node(self) -> None:
-        """As in the base class, after the stage was told to stop."""
-        if self._stage is not None and self.context.ok():
+    def _stop_stage(self) -> None:
+        if self.context.ok():
             self._stage.close()
-        super().destroy_node()
 
     # -- control -----------------------------------------------------------------------------------
 
     def _apply(self, _value: Any) -> None:
-        self._servo.goal = goal_of(self.settings)
-        self._servo.settings = servo_settings_of(self.settings)
+        self._servo.goal = read_goal(self.parameters)
+        self._servo.settings = read_servo_settings(self.parameters)
 
     def _on_start(self) -> str:
         self._servo.restart()
@@ -116,7 +120,7 @@ class VisualServo(SemNode):
 
     def _watch(self) -> None:
         self._end.follow()
-        if self._last is None or self._stage is None or not self._stage.is_moving:
+        if self._last is None or not self._stage.is_moving:
             return
         silent_s = time.monotonic() - self._last[1]
         if silent_s > max(_SILENCE * self._interval_s, _SHORTEST_SILENCE_S):
@@ -127,18 +131,16 @@ class VisualServo(SemNode):
         """Stop the stage."""
         self._send(np.zeros(3))
         self._servo.stop(ServoStatus.NOT_READY, reason)
-        self._tell(reason)
+        self._set_state(reason)
 
     def _send(self, twist: np.ndarray[Any, Any]) -> None:
-        if self._stage is None:
-            return
         self._stage.send(twist)
         self._servo.record_command(self._now_s(), twist)
-        self.statistics.note("servo_speed_m_s", float(np.hypot(twist[0], twist[1])))
+        self.reporter.note("servo_speed_m_s", float(np.hypot(twist[0], twist[1])))
 
-    def _tell(self, state: str) -> None:
+    def _set_state(self, state: str) -> None:
         self._state = state
-        self.statistics.note("servo_state", state)
+        self.reporter.note("servo_state", state)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -158,29 +160,29 @@ class VisualServo(SemNode):
 
     def _on_frame(self, frame: ServoFrame) -> None:
         before, self._last = self._last, (frame.stamp_ns, time.monotonic())
-        step = self._step_of(frame, before)
+        step = self._step(frame, before)
         self._keep_in_view(frame, step)
         moves = self._active and not step.reason
         self._send(step.twist if moves else np.zeros(3))
         self._errors.publish(step, frame.header)
         self._note(step)
         if self._active:
-            self._tell(step.reason or ("converged" if step.converged else "servoing"))
-        self.count_published(frame.stamp_ns)
+            self._set_state(step.reason or ("converged" if step.converged else "servoing"))
+        self.reporter.count_published(frame.stamp_ns)
 
-    def _step_of(self, frame: ServoFrame, before: tuple[int, float] | None) -> ServoStep:
+    def _step(self, frame: ServoFrame, before: tuple[int, float] | None) -> ServoStep:
         if before is None or frame.stamp_ns <= before[0]:
             return self._servo.stop(ServoStatus.NOT_READY, "waiting for a second frame")
         self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
         try:
             projection = choose_projection(frame.k, frame.projections)
-            camera = PlaneCamera.from_projection(projection, self.settings["height_m"])
+            camera = PlaneCamera.from_projection(projection, self.parameters["height_m"])
         except NODE_ERRORS as error:
-            self.warn_seldom(str(error))
+            self.reporter.warn_seldom(str(error))
             return self._servo.stop(ServoStatus.NOT_READY, " ".join(str(error).split()))
         view = find_target(frame.image, self._target)
         time_s, now_s = self._times(frame.stamp_ns)
-        in_instrument = self.settings["goal_frame"] == "instrument"
+        in_instrument = self.parameters["goal_frame"] == "instrument"
         return self._servo.update(
             view,
             camera,
@@ -198,7 +200,7 @@ class VisualServo(SemNode):
         moved = px_per_m * float(np.hypot(*frame.drift_m)) / frame.image.shape[1]
         lost = step.fit is None or not step.fit.view.accepted
         now_s = time.monotonic()
-        if moved <= (_HIDDEN if lost else self.settings["reset_beyond"]):
+        if moved <= (_HIDDEN if lost else self.parameters["reset_beyond"]):
             return
         if now_s - self._reset_s < _RESET_AGAIN_S * (not lost) + 2.0 * self._interval_s:
             return
@@ -209,7 +211,7 @@ class VisualServo(SemNode):
     # -- diagnostics -------------------------------------------------------------------------------
 
     def _note(self, step: ServoStep) -> None:
-        note = self.statistics.note
+        note = self.reporter.note
         note("servo_error_px", step.error_px)
         note("servo_error_m", step.error_m)
         note("servo_sigma_px", step.sigma_px)

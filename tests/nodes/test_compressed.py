@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,13 +14,10 @@ from rcl_interfaces.msg import ParameterType, ParameterValue
 from sensor_msgs.msg import CompressedImage, Image
 
 from semcal_ros.bridge.compressed import fill_compressed, image_from_compressed
-from semcal_ros.bridge.diagnostics import StreamStatistics
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, load_config
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.frames.compressed import CompressedOutput, compressed_settings
 from tests.helpers.node_scenes import image_message, stamp_of, texture
-from tests.helpers.ros_process import PATIENT, RELIABLE, TIMEOUT_S, NodeProcess, Peer, running
+from tests.helpers.ros_process import PATIENT, RELIABLE, NodeProcess, Peer, running
 
 NODE = "/sem/rectifier"
 TOPIC = "image_rect/compressed"
@@ -190,111 +185,3 @@ def test_what_goes_in_may_be_compressed(peer: Peer, tmp_path: Path) -> None:
         send(texture(), "mono8", 3)
         peer.wait_for(lambda: len(images) == 2, "the next good image")
         np.testing.assert_array_equal(image_from_message(images[1]), texture())
-
-
-# -- the order of things, without the middleware -------------------------------------------------------
-
-
-class Stub:
-    """As much of a node as a compressed output touches; publishing waits for ``may_publish``."""
-
-    def __init__(self) -> None:
-        settings = compressed_settings("image_rect")
-        self.settings = {setting.name: setting.default for setting in settings}
-        self.statistics = StreamStatistics()
-        self.rejected: list[Exception] = []
-        self.reject = self.rejected.append
-        self.may_publish = threading.Event()
-        self.is_publishing = threading.Event()
-        self.published: list[Any] = []
-        self.subscribers = 1
-        self.results: Callable[[], None] = lambda: None
-        self.results_waiting = threading.Semaphore(0)
-
-    def stream_publisher(self, message_type: Any, topic: str) -> Any:
-        assert (message_type, topic) == (CompressedImage, TOPIC)
-        return SimpleNamespace(
-            publish=self._publish, get_subscription_count=lambda: self.subscribers
-        )
-
-    def create_guard_condition(self, callback: Callable[[], None]) -> Any:
-        self.results = callback
-        return SimpleNamespace(trigger=self.results_waiting.release)
-
-    def _publish(self, message: Any) -> None:
-        self.is_publishing.set()
-        assert self.may_publish.wait(TIMEOUT_S)
-        self.published.append(message)
-
-    def hand_over(self, count: int) -> None:
-        """Wait for so many results and handle them, as an executor would."""
-        for _ in range(count):
-            assert self.results_waiting.acquire(timeout=TIMEOUT_S)
-        self.results()
-
-    def notes(self) -> dict[str, str]:
-        return dict(self.statistics.summary(0.0).values)
-
-
-def submit(output: CompressedOutput, image: Any, stamp_s: float, encoding: str = "mono8") -> None:
-    header = image_message(texture(), stamp_s).header
-    output.publish(image, SimpleNamespace(encoding=encoding, header=header))
-
-
-def test_the_newest_waits_and_has_pixels_of_its_own() -> None:
-    stub = Stub()
-    output = CompressedOutput(stub, "image_rect")
-    memory = texture().copy()
-    for stamp_s in (1, 2, 3, 4):
-        memory[:] = stamp_s
-        submit(output, memory, stamp_s)
-        # The first is in hand before the others come.
-        assert stub.is_publishing.wait(TIMEOUT_S)
-    memory[:] = 99
-    stub.may_publish.set()
-    stub.hand_over(2)
-    assert [stamp_of(message)[0] for message in stub.published] == [1, 4]
-    for message, value in zip(stub.published, (1, 4), strict=True):
-        assert (image_from_compressed(message)[0] == value).all()
-    notes = stub.notes()
-    assert (notes[f"compressed.{TOPIC}"], notes[f"skipped.{TOPIC}"]) == ("2", "2")
-
-
-def test_without_subscribers_not_even_the_pixels_are_copied() -> None:
-    stub = Stub()
-    stub.subscribers = 0
-    output = CompressedOutput(stub, "image_rect")
-    output.publish(None, None)
-    assert not stub.published
-    assert f"compressed.{TOPIC}" not in stub.notes()
-
-
-def test_closing_waits_for_the_image_in_hand_and_is_the_last_of_it() -> None:
-    stub = Stub()
-    output = CompressedOutput(stub, "image_rect")
-    submit(output, texture(), 1)
-    assert stub.is_publishing.wait(TIMEOUT_S)
-    closing = threading.Thread(target=output.close)
-    closing.start()
-    closing.join(0.2)
-    assert closing.is_alive()
-    stub.may_publish.set()
-    closing.join(TIMEOUT_S)
-    assert not closing.is_alive()
-    submit(output, texture(), 2)
-    stub.hand_over(2)
-    assert [stamp_of(message)[0] for message in stub.published] == [1]
-
-
-def test_errors_come_back_to_the_executor() -> None:
-    stub = Stub()
-    output = CompressedOutput(stub, "image_rect")
-    submit(output, texture().astype(np.float32), 1, "32FC1")
-    stub.hand_over(1)
-    (error,) = stub.rejected
-    assert isinstance(error, InvalidValueError)
-    assert "32FC1 image as png" in str(error)
-    # What nobody foresaw must not be lost in a thread.
-    output.publish(texture(), SimpleNamespace(encoding="mono8", header=None))
-    with pytest.raises(AttributeError):
-        stub.hand_over(1)

@@ -22,7 +22,7 @@ with warnings.catch_warnings():
 
 from semcal_ros.bridge.parameters import PARAMETER_KINDS
 from semcal_ros.nodes.common import base
-from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.project import NODES, ROOT
 
@@ -137,18 +137,18 @@ class _Captured(Exception):
     """Ends the construction of a node once its parameters are known."""
 
 
-def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Setting]:
+def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, ParameterDeclaration]:
     """What a node declares, without ROS at work."""
     module = importlib.import_module(f"semcal_ros.nodes.{node}")
     (kind,) = (name for name in module.__all__ if name != "main")
-    captured: dict[str, Setting] = {}
+    captured: dict[str, ParameterDeclaration] = {}
 
-    def capture(_node: Any, settings: Iterable[Setting]) -> None:
-        captured.update({setting.name: setting for setting in settings})
+    def capture(_node: Any, declarations: Iterable[ParameterDeclaration]) -> None:
+        captured.update({declaration.name: declaration for declaration in declarations})
         raise _Captured
 
     monkeypatch.setattr(Node, "__init__", lambda *_args, **_kwargs: None)
-    monkeypatch.setattr(base, "Settings", capture)
+    monkeypatch.setattr(base, "Parameters", capture)
     with pytest.raises(_Captured):
         getattr(module, kind)()
     return captured

@@ -269,19 +269,19 @@ class _Declared(Exception):
 
 
 def _settings(executable: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The settings that a node declares, by name; the node itself is not started."""
+    """The parameters that a node declares, by name; the node itself is not started."""
     from semcal_ros.nodes.common import base
 
     found: dict[str, Any] = {}
 
-    def record(_node: Any, settings: Any) -> None:
-        found.update({setting.name: setting for setting in settings})
+    def record(_node: Any, declarations: Any) -> None:
+        found.update({declaration.name: declaration for declaration in declarations})
         raise _Declared
 
     module = importlib.import_module(f"semcal_ros.nodes.{executable}")
     with monkeypatch.context() as patch:
         patch.setattr(base.Node, "__init__", lambda *_args, **_options: None)
-        patch.setattr(base, "Settings", record)
+        patch.setattr(base, "Parameters", record)
         patch.setattr(module, "run_node", lambda factory, _args=None, threads=1: factory())
         with pytest.raises(_Declared):
             module.main([])

@@ -6,9 +6,7 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
-
-from rclpy.node import Node
+from typing import Any, Generic, Protocol, TypeVar
 
 __all__ = ["LatestWorker"]
 
@@ -16,15 +14,20 @@ Item = TypeVar("Item", bound=Any)
 Result = TypeVar("Result")
 
 
-class LatestWorker(Generic[Item, Result]):
-    """Works on the newest of what was submitted; older ones that have not begun are left out.
+class _Guard(Protocol):
+    def trigger(self) -> None: ...
 
-    Items are compared: the newer one is the greater one.
+
+class LatestWorker(Generic[Item, Result]):
+    """Works on the newest item that was submitted; older ones that have not begun are skipped.
+
+    Items are compared: the newer one is the greater.
 
     Parameters
     ----------
-    node
-        The node whose executor runs ``on_result``.
+    make_guard
+        Makes a condition that any thread may trigger, and whose callback the executor of a node runs, such as
+        :meth:`~semcal_ros.nodes.common.endpoints.Endpoints.guard`.
     work
         Runs in a thread of its own; must not raise.
     on_result
@@ -32,7 +35,10 @@ class LatestWorker(Generic[Item, Result]):
     """
 
     def __init__(
-        self, node: Node, work: Callable[[Item], Result], on_result: Callable[[Result], None]
+        self,
+        make_guard: Callable[[Callable[[], None]], _Guard],
+        work: Callable[[Item], Result],
+        on_result: Callable[[Result], None],
     ) -> None:
         self._work = work
         self._on_result = on_result
@@ -40,16 +46,16 @@ class LatestWorker(Generic[Item, Result]):
         self._waiting: Item | None = None
         self._results: deque[Result] = deque()
         self._busy = False
-        self._guard = node.create_guard_condition(self._hand_over)
+        self._guard = make_guard(self._hand_over)
 
     def submit(self, item: Item) -> None:
-        """Have it worked on unless something newer is waiting or comes before that begins."""
+        """Work on the item, unless a newer one is waiting or comes before the work begins."""
         with self._lock:
             self._waiting = item if self._waiting is None else max(self._waiting, item)
             if self._busy:
                 return
             self._busy = True
-        # Nobody waits for it at the end: it holds nothing that must be finished.
+        # A daemon: it holds nothing that must be finished before the process ends.
         threading.Thread(target=self._run, name="background", daemon=True).start()
 
     def _next(self) -> Item | None:

@@ -20,14 +20,21 @@ from rclpy.parameter import Parameter
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.confined import AllowedPaths
 
-__all__ = ["CALIBRATION", "CONFIG", "DIRECTORY", "INTERPOLATION", "Setting", "Settings"]
+__all__ = [
+    "CALIBRATION",
+    "CONFIG",
+    "DIRECTORY",
+    "INTERPOLATION",
+    "ParameterDeclaration",
+    "Parameters",
+]
 
 Check = Callable[[Any], object]
 Apply = Callable[[Any], None]
 
 
 @dataclass(frozen=True)
-class Setting:
+class ParameterDeclaration:
     """One parameter.
 
     Attributes
@@ -39,11 +46,11 @@ class Setting:
     low, high
         Range of a number, both ends included.
     choices
-        The accepted strings; any without.
+        The accepted strings; empty accepts any.
     fixed
         Only read when the node starts.
     confined
-        The name of a file, which once the node runs must lie inside of :data:`DIRECTORY`.
+        Names a file, which must lie inside of :data:`DIRECTORY` once the node runs.
     """
 
     name: str
@@ -87,8 +94,8 @@ class Setting:
                 descriptor.integer_range = [whole]
         return descriptor
 
-    def checked(self, value: Any) -> Any:
-        """``value`` in the type of the setting, or :class:`InvalidValueError`."""
+    def convert(self, value: Any) -> Any:
+        """``value`` in the type of the parameter; raises :class:`InvalidValueError` if it is not accepted."""
         wanted = type(self.default)
         if self.is_float and type(value) is int:
             value = float(value)
@@ -104,25 +111,25 @@ class Setting:
         return value
 
 
-CONFIG = Setting(
+CONFIG = ParameterDeclaration(
     "config",
     "generic",
     "Description of the microscope's topics: a msg_configs file or the name of one that is shipped.",
     fixed=True,
 )
-DIRECTORY = Setting(
+DIRECTORY = ParameterDeclaration(
     "directory",
     "",
-    "Folder in which files lie that are named while the node runs; empty: that of the file given at start.",
+    "Folder of the files that are named while the node runs; empty: that of the file given at start.",
     fixed=True,
 )
-CALIBRATION = Setting(
+CALIBRATION = ParameterDeclaration(
     "calibration",
     "",
     "Calibration file; empty to wait for one on the topic `calibration`.",
     confined=True,
 )
-INTERPOLATION = Setting(
+INTERPOLATION = ParameterDeclaration(
     "interpolation",
     "linear",
     "Interpolation between raw pixels.",
@@ -130,14 +137,14 @@ INTERPOLATION = Setting(
 )
 
 
-class Settings:
+class Parameters:
     """The declared parameters of one node, by name.
 
     Parameters
     ----------
     node
         The node that declares them.
-    settings
+    declarations
         What to declare.
 
     Raises
@@ -146,19 +153,21 @@ class Settings:
         A value given at start is refused.
     """
 
-    def __init__(self, node: Node, settings: Iterable[Setting]) -> None:
+    def __init__(self, node: Node, declarations: Iterable[ParameterDeclaration]) -> None:
         # The last one of a name counts: a node may change a default.
-        self._known = {setting.name: setting for setting in settings}
+        self._declared = {declaration.name: declaration for declaration in declarations}
         self._values: dict[str, Any] = {}
         self._checks: dict[str, Check] = {}
         self._applies: dict[str, Apply] = {}
-        confined = [name for name, setting in self._known.items() if setting.confined]
+        confined = [name for name, declaration in self._declared.items() if declaration.confined]
         if confined:
-            self._known.setdefault(DIRECTORY.name, DIRECTORY)
-        for setting in self._known.values():
-            given = node.declare_parameter(setting.name, setting.default, setting.descriptor())
-            self._values[setting.name] = setting.checked(given.value)
-        # Who starts the node is trusted with its files; who calls a service is not.
+            self._declared.setdefault(DIRECTORY.name, DIRECTORY)
+        for declaration in self._declared.values():
+            given = node.declare_parameter(
+                declaration.name, declaration.default, declaration.descriptor()
+            )
+            self._values[declaration.name] = declaration.convert(given.value)
+        # Files named at start are trusted: whoever starts the node has its rights. Callers of services are not.
         trusted = [self._values[name] for name in confined if self._values[name]]
         self._allowed = AllowedPaths(self._values.get(DIRECTORY.name, ""), trusted)
         node.add_on_set_parameters_callback(self._on_set)
@@ -180,11 +189,11 @@ class Settings:
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             for parameter in parameters:
-                setting = self._known.get(parameter.name)
-                if setting is None:
+                declaration = self._declared.get(parameter.name)
+                if declaration is None:
                     continue
-                value = setting.checked(parameter.value)
-                if setting.confined and value:
+                value = declaration.convert(parameter.value)
+                if declaration.confined and value:
                     self.allowed_path(value)
                 if parameter.name in self._checks:
                     self._checks[parameter.name](value)
@@ -194,9 +203,9 @@ class Settings:
 
     def _after_set(self, parameters: list[Parameter]) -> None:
         for parameter in parameters:
-            setting = self._known.get(parameter.name)
-            if setting is None:
+            declaration = self._declared.get(parameter.name)
+            if declaration is None:
                 continue
-            self._values[parameter.name] = setting.checked(parameter.value)
+            self._values[parameter.name] = declaration.convert(parameter.value)
             if parameter.name in self._applies:
                 self._applies[parameter.name](self._values[parameter.name])

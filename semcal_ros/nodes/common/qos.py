@@ -12,9 +12,20 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-__all__ = ["image_input", "latched", "overridable", "relaxed", "stream_output", "value_input"]
+__all__ = [
+    "image_input",
+    "latched",
+    "overridable",
+    "relaxed",
+    "service_queue",
+    "stream_output",
+    "value_input",
+]
 
+# Of the middleware, which counts in signed integers of 32 bit.
 _LARGEST_DEPTH = 2**31 - 1
+# As many as parameter services keep: of the usual ten, requests of busy clients would be lost and never answered.
+_WAITING_REQUESTS = 1000
 
 
 def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
@@ -49,6 +60,11 @@ def latched() -> QoSProfile:
     return _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def service_queue() -> QoSProfile:
+    """Quality of a service that keeps all requests of busy clients."""
+    return QoSProfile(depth=_WAITING_REQUESTS)
+
+
 def overridable() -> QoSOverridingOptions:
     """Options that declare ``qos_overrides.<topic>.<publisher|subscription>.<policy>`` parameters."""
     kinds = (
@@ -57,10 +73,10 @@ def overridable() -> QoSOverridingOptions:
         QoSPolicyKind.RELIABILITY,
         QoSPolicyKind.DURABILITY,
     )
-    return QoSOverridingOptions(kinds, callback=_checked)
+    return QoSOverridingOptions(kinds, callback=_check_depth)
 
 
-def _checked(profile: QoSProfile) -> SetParametersResult:
+def _check_depth(profile: QoSProfile) -> SetParametersResult:
     good = 0 <= profile.depth <= _LARGEST_DEPTH
     reason = "" if good else f"a depth of {profile.depth}; expected 0 to {_LARGEST_DEPTH}"
     return SetParametersResult(successful=good, reason=reason)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import rclpy
+import rclpy.utilities
 from rclpy.exceptions import (
     InvalidNamespaceException,
     InvalidNodeNameException,
@@ -95,7 +95,7 @@ def run_node(
             check_security()
             with _refusals():
                 rclpy.init(args=None if args is None else [sys.argv[0], *args])
-            node = _made(factory)
+            node = _make(factory)
         except _START_ERRORS as error:
             print(" ".join(str(error).split()), file=sys.stderr)
             return 2
@@ -104,22 +104,22 @@ def run_node(
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     finally:
-        rclpy.try_shutdown()
+        rclpy.utilities.try_shutdown()
 
 
 @contextmanager
 def _refusals() -> Iterator[None]:
     """Turn what ROS refuses at the start, such as a process without its enclave, into an error of the suite."""
-    was_up = rclpy.ok()
+    was_up = rclpy.utilities.ok()
     try:
         yield
     except RuntimeError as error:
-        if was_up and not rclpy.ok():
+        if was_up and not rclpy.utilities.ok():
             raise  # a signal has shut the middleware down
         raise ConfigError(f"ROS refuses to start: {error}") from error
 
 
-def _made(factory: Callable[[], Node]) -> Node | None:
+def _make(factory: Callable[[], Node]) -> Node | None:
     """The node, or None where a signal has shut the middleware down while it was being made."""
     try:
         with _refusals():
@@ -141,7 +141,7 @@ def _spin(node: Node, threads: int) -> int:
         pass
     except RuntimeError:
         # A signal can shut the middleware down at any moment.
-        if rclpy.ok():
+        if rclpy.utilities.ok():
             raise
     finally:
         if executor is not None:

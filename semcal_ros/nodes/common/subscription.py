@@ -1,4 +1,4 @@
-"""A subscription that does not stay deaf when a publisher offers less than it asks for."""
+"""A subscription that asks for less when a publisher does not offer what it asks for."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["AdaptiveSubscription", "MessageInfo", "published_ns"]
 MessageInfo = Mapping[str, Any]
 Callback = Callable[[Any, MessageInfo], None]
 
-# What a middleware reports that does not number its messages.
+# Reported by a middleware that does not number its messages.
 _NO_NUMBER = 2**64 - 1
 
 
 def published_ns(info: MessageInfo) -> int:
-    """When the message was published, ns; when it was received where the middleware does not tell."""
+    """When the message was published, ns; when it was received if the middleware does not say."""
     return int(info["source_timestamp"] or info["received_timestamp"])
 
 
 class AdaptiveSubscription:
-    """Subscribes as wished, then again with less when the incompatible-QoS event tells that nothing would arrive.
+    """Subscribes as wished, then again with less after the incompatible-QoS event, without which nothing would arrive.
 
-    When the last publisher is gone, :meth:`tend` returns to the wished quality.
+    When the last publisher is gone, :meth:`check_publishers` returns to the wished quality.
 
     Parameters
     ----------
@@ -90,11 +90,13 @@ class AdaptiveSubscription:
     def _subscribe(self, options: Any = None) -> Any:
         self._last_number = None
         self._publishers = 0
+        # rclpy passes the information too, which its annotations do not say.
+        callback: Any = self._on_message
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         return self._node.create_subscription(
             self._type,
             self.topic,
-            self._on_message,
+            callback,
             self._profile,
             callback_group=self._group,
             event_callbacks=events,
@@ -160,14 +162,14 @@ class AdaptiveSubscription:
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe()
             self._node.get_logger().warning(
-                f"a publisher on {self.topic} does not offer the wished {refused.name.lower()};"
+                f"a publisher on {self.topic} does not offer {refused.name.lower()} as wished;"
                 f" subscribed again without ({self.downgraded})"
             )
 
-    def tend(self) -> None:
-        """Look at who publishes; to be called now and then.
+    def check_publishers(self) -> None:
+        """See who publishes; to be called now and then.
 
-        Warns of publishers of another type, which the middleware leaves out silently, and returns to the wished
+        Warns of publishers of another type, which the middleware ignores silently, and returns to the wished
         quality once nobody publishes any more.
         """
         publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.nodes.common.parameters import CALIBRATION, INTERPOLATION, Setting
+from semcal_ros.nodes.common.parameters import CALIBRATION, INTERPOLATION, ParameterDeclaration
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
-from semcal_ros.nodes.frames.compressed import compressed_settings
+from semcal_ros.nodes.frames.compressed import compressed_parameters
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 
@@ -19,14 +19,20 @@ __all__ = ["CalibratedStreamNode"]
 class CalibratedStreamNode(StreamNode):
     """A stream node with a calibration, a rectifier, and the outputs ``image_rect`` and ``camera_info``."""
 
-    def __init__(self, name: str, settings: Iterable[Setting] = ()) -> None:
+    def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(
-            name, (CALIBRATION, INTERPOLATION, *compressed_settings("image_rect"), *settings)
+            name, (CALIBRATION, INTERPOLATION, *compressed_parameters("image_rect"), *declarations)
         )
-        self.rectifier = Rectifier(self.settings["interpolation"])
-        self.settings.on_change("interpolation", self._set_interpolation)
-        self.calibration = CalibrationInput(self, on_change=self.on_calibration)
-        self.output = RectifiedOutput(self)
+        self.rectifier = Rectifier(self.parameters["interpolation"])
+        self.parameters.on_change("interpolation", self._set_interpolation)
+        self.calibration = CalibrationInput(
+            self.config,
+            self.parameters,
+            self.endpoints,
+            self.reporter,
+            on_change=self.on_calibration,
+        )
+        self.output = RectifiedOutput(self.parameters, self.endpoints, self.reporter)
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._out_of_range = False
@@ -34,15 +40,16 @@ class CalibratedStreamNode(StreamNode):
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
 
     def on_calibration(self) -> None:
-        """Called when another calibration is in force."""
+        """Called when another calibration has come into force, but not for the one given at start."""
+
+    def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
+        """As in the base class, with magnifications on the scale of the calibration in force."""
+        super().receive_frames(
+            on_frame, magnification_config=lambda: self.calibration.config, **options
+        )
 
     def _set_interpolation(self, value: str) -> None:
         self.rectifier = Rectifier(value)
-
-    @property
-    def effective_config(self) -> MicroscopeConfig:
-        """The configuration with the display width of the calibration in force."""
-        return self.calibration.config
 
     def camera(self, frame: StreamFrame, magnification: float) -> ScanCamera | None:
         """Calibrated camera of a frame, or None while there is no calibration."""
@@ -51,7 +58,7 @@ class CalibratedStreamNode(StreamNode):
             self._camera = current, seen_at, self.calibration.camera(*seen_at)
         camera = self._camera[2]
         self._out_of_range = camera is not None and not camera.in_range
-        self.statistics.note("in_calibrated_range", camera is not None and camera.in_range)
+        self.reporter.note("in_calibrated_range", camera is not None and camera.in_range)
         return camera
 
     def conditions(self) -> list[str]:

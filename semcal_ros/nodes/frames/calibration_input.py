@@ -1,4 +1,4 @@
-"""The calibration in force: of all that files and the topic have brought, the one that came last."""
+"""The calibration in force: the latest of all that came from files and from the topic."""
 
 from __future__ import annotations
 
@@ -21,19 +21,22 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import read_calibration_text
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.latest_worker import LatestWorker
+from semcal_ros.nodes.common.parameters import CALIBRATION, Parameters
 from semcal_ros.nodes.common.qos import value_input
+from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["CalibrationInput", "calibration_digest"]
 
 _TOPIC = "topic"
-# Of the clock that the middleware stamps with, beside that of this process.
+# How far the clock that the middleware stamps with may be from that of this process.
 _CLOCK_STEP_NS = 1_000_000
-_KEPT_WORDS = 16
-# Several nodes publish calibrations, one of them perhaps this one: with a depth of 1, the own words that come back
-# would push out another's that has not been taken yet.
+# More than can be on their way at once.
+_KEPT_DIGESTS = 16
+# Several nodes publish calibrations, one of them perhaps this one: with a depth of 1, the own message that comes back
+# would push out one of another node that has not been taken yet.
 _QUEUE = 10
 
 
@@ -44,7 +47,7 @@ def calibration_digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A calibration with its text, where it is from, and when it came into force, ns; 0 if it only fills in."""
+    """A calibration with its text, its source, and when it came into force, ns; 0 for the file given at start."""
 
     calibration: Calibration
     text: str
@@ -60,13 +63,13 @@ class _Arrived:
     text: str
 
 
-def _loaded(text: str, name: str, source: str, since_ns: int) -> _Loaded:
+def _load(text: str, name: str, source: str, since_ns: int) -> _Loaded:
     return _Loaded(Calibration.loads(text, source=name), text, source, since_ns)
 
 
-def _parsed(arrived: _Arrived) -> _Loaded | SemcalError:
+def _parse(arrived: _Arrived) -> _Loaded | SemcalError:
     try:
-        return _loaded(arrived.text, "topic calibration", _TOPIC, arrived.since_ns)
+        return _load(arrived.text, "topic calibration", _TOPIC, arrived.since_ns)
     except SemcalError as error:
         return error
     except (MemoryError, RecursionError) as error:
@@ -76,18 +79,21 @@ def _parsed(arrived: _Arrived) -> _Loaded | SemcalError:
 class CalibrationInput:
     """Holds the last good calibration; a bad one is refused, counted, and leaves the old one in force.
 
-    What came into force last wins: a message counts from when it was published, a file from when it was named or
-    reloaded. The file given at start only fills in: it is older than anything on the topic, so that a node that is
-    started again finds its way back.
+    The latest wins: a message counts from when it was published, a file from when it was named or reloaded. The file
+    given at start is older than anything on the topic, so that a node that is started again finds its way back.
 
     Texts are parsed beside the stream, and take effect between two frames.
 
     Parameters
     ----------
-    node
-        A node that declares the parameter ``calibration``.
+    config
+        The configuration of the node.
+    parameters
+        Parameters among which is :data:`~semcal_ros.nodes.common.parameters.CALIBRATION`.
+    endpoints, reporter
+        Where to subscribe, and what logs and counts.
     on_change
-        Called after each change.
+        Called after each change; not for the file given at start.
 
     Raises
     ------
@@ -95,19 +101,28 @@ class CalibrationInput:
         The file given at start cannot be used.
     """
 
-    def __init__(self, node: SemNode, *, on_change: Callable[[], None] | None = None) -> None:
-        self._node = node
+    def __init__(
+        self,
+        config: MicroscopeConfig,
+        parameters: Parameters,
+        endpoints: Endpoints,
+        reporter: Reporter,
+        *,
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._parameters = parameters
+        self._reporter = reporter
         self._on_change = on_change
         self._checked: tuple[str, _Loaded] | None = None
         self._loaded: _Loaded | None = None
-        self._config = node.config
-        self._own_words: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_WORDS)
-        self._parser = LatestWorker(node, _parsed, self._on_parsed)
-        path = node.settings["calibration"]
+        self._node_config = self._config = config
+        self._published_digests: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_DIGESTS)
+        self._parser = LatestWorker(endpoints.guard, _parse, self._on_parsed)
+        path = parameters[CALIBRATION.name]
         if path:
-            self._install(replace(self._read(path), since_ns=0))
-        node.settings.on_change("calibration", self._apply_file, self._check_file)
-        node.listen(String, "calibration", self._on_message, value_input(_QUEUE))
+            self._take_over(replace(self._read(path), since_ns=0))
+        parameters.on_change(CALIBRATION.name, self._apply_file, self._check_file)
+        endpoints.subscribe(String, "calibration", self._on_message, value_input(_QUEUE))
 
     @property
     def current(self) -> Calibration | None:
@@ -122,7 +137,7 @@ class CalibrationInput:
     @property
     def has_published(self) -> bool:
         """Whether :meth:`publish` has published anything."""
-        return bool(self._own_words)
+        return bool(self._published_digests)
 
     def camera(self, magnification: float, width: int, height: int) -> ScanCamera | None:
         """Camera for frames of that size, or None while there is no calibration; raises as ``Calibration.at``."""
@@ -139,7 +154,9 @@ class CalibrationInput:
         started_ns = time.time_ns() - _CLOCK_STEP_NS
         publisher.publish(message)
         ended_ns = time.time_ns() + _CLOCK_STEP_NS
-        self._own_words.append((started_ns, ended_ns, calibration_digest(self._loaded.text)))
+        self._published_digests.append(
+            (started_ns, ended_ns, calibration_digest(self._loaded.text))
+        )
 
     # -- files -------------------------------------------------------------------------------------
 
@@ -148,8 +165,8 @@ class CalibrationInput:
         self._install(self._read(path))
 
     def _read(self, path: str) -> _Loaded:
-        text = read_calibration_text(self._node.settings.allowed_path(path), MAX_TEXT_BYTES)
-        return _loaded(text, path, path, time.time_ns())
+        text = read_calibration_text(self._parameters.allowed_path(path), MAX_TEXT_BYTES)
+        return _load(text, path, path, time.time_ns())
 
     def _check_file(self, path: str) -> None:
         self._checked = (path, self._read(path)) if path else None
@@ -167,14 +184,14 @@ class CalibrationInput:
 
     def _is_own(self, text: str, since_ns: int) -> bool:
         # A node that publishes what it takes over must not take over what it publishes: with two calibrations
-        # under way it would never come to rest.
+        # on their way it would publish them in turns for ever.
         return any(
             start <= since_ns <= end and calibration_digest(text) == digest
-            for start, end, digest in self._own_words
+            for start, end, digest in self._published_digests
         )
 
     def _is_same(self, text: str, since_ns: int) -> bool:
-        """Whether the text is in force already, from then on; no reason to start drift anew."""
+        """Whether the text is in force already, which then counts from now on; no reason to start the drift again."""
         if self._loaded is None or text != self._loaded.text:
             return False
         self._loaded = replace(self._loaded, since_ns=since_ns)
@@ -185,7 +202,7 @@ class CalibrationInput:
         try:
             text = calibration_text_from_message(message)
         except SemcalError as error:
-            self._node.reject(error)
+            self._reporter.reject(error)
             return
         if self._is_older(since_ns) or self._is_own(text, since_ns):
             return
@@ -194,20 +211,22 @@ class CalibrationInput:
 
     def _on_parsed(self, result: _Loaded | SemcalError) -> None:
         if isinstance(result, SemcalError):
-            self._node.reject(result)
+            self._reporter.reject(result)
         elif not (self._is_older(result.since_ns) or self._is_same(result.text, result.since_ns)):
             self._install(result)
 
     def _install(self, loaded: _Loaded) -> None:
+        self._take_over(loaded)
+        self._on_change()
+
+    def _take_over(self, loaded: _Loaded) -> None:
         calibration, source = loaded.calibration, loaded.source
         self._loaded = loaded
-        self._config = replace(self._node.config, display_width_m=calibration.display_width_m)
+        self._config = replace(self._node_config, display_width_m=calibration.display_width_m)
         low, high = calibration.magnification_range
         digest = calibration_digest(loaded.text)
-        self._node.get_logger().info(
+        self._reporter.info(
             f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}"
         )
-        self._node.statistics.note("calibration", source)
-        self._node.statistics.note("calibration_digest", digest)
-        if self._on_change is not None:
-            self._on_change()
+        self._reporter.note("calibration", source)
+        self._reporter.note("calibration_digest", digest)

@@ -15,25 +15,28 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage
 
 from semcal_ros.bridge.compressed import CODECS, fill_compressed
-from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import Setting
+from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.frames.stream import StreamFrame
 
-__all__ = ["CompressedOutput", "compressed_settings"]
+__all__ = ["CompressedOutput", "compressed_parameters"]
 
 
-def compressed_settings(topic: str) -> tuple[Setting, ...]:
+def compressed_parameters(topic: str) -> tuple[ParameterDeclaration, ...]:
     """Parameters of the compressed images of ``topic``, for a node to declare."""
     return (
-        Setting(
+        ParameterDeclaration(
             f"{topic}.compressed.format",
             "png",
             "How to compress. png is exact; jpeg is smaller and faster, and for 8 bit only.",
             choices=tuple(CODECS),
         ),
-        Setting(f"{topic}.compressed.jpeg_quality", 95, "Quality of jpeg.", low=1, high=100),
-        Setting(
+        ParameterDeclaration(
+            f"{topic}.compressed.jpeg_quality", 95, "Quality of jpeg.", low=1, high=100
+        ),
+        ParameterDeclaration(
             f"{topic}.compressed.png_level",
             3,
             "0 stores the pixels, which is fast; 1 to 9 compress, all alike for noisy frames.",
@@ -64,44 +67,53 @@ class CompressedOutput:
     """Publishes ``<topic>/compressed`` while somebody subscribes to it.
 
     A thread of its own compresses, so that the images themselves do not wait; it takes the newest image and skips those
-    that came in between. Of the node, the thread touches nothing but the publisher, which may be used from any thread;
-    what there is to count or to complain about comes back to the executor.
+    that came in between. The thread touches nothing of the node but the publisher, which may be used from any thread;
+    counts and errors come back to the executor.
 
     Parameters
     ----------
-    node
-        A node that declares :func:`compressed_settings` of the topic, and calls :meth:`close` before it is destroyed.
+    parameters
+        Parameters among which are :func:`compressed_parameters` of the topic.
+    endpoints, reporter
+        Where to publish, and what counts.
     topic
         Topic of the images as they are.
+
+    Notes
+    -----
+    :meth:`close` must be called before the node is destroyed.
     """
 
-    def __init__(self, node: SemNode, topic: str) -> None:
-        self._node = node
+    def __init__(
+        self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter, topic: str
+    ) -> None:
+        self._parameters = parameters
+        self._reporter = reporter
         self._topic = f"{topic}/compressed"
         self._prefix = f"{topic}.compressed"
-        self._publisher = node.stream_publisher(CompressedImage, self._topic)
+        self._publisher = endpoints.stream_publisher(CompressedImage, self._topic)
         self._in_hand = threading.Lock()
         self._ended = False
         self._submitted = 0
         self._done = 0
-        self._work = LatestWorker[_Job, _Done](node, self._compress, self._report)
+        self._work = LatestWorker[_Job, _Done](endpoints.guard, self._compress, self._report)
 
     def publish(self, image: NDArray[Any], frame: StreamFrame) -> None:
-        """Have an image compressed that was made from ``frame``; its memory may be used again afterwards."""
+        """Compress an image that was made from ``frame`` beside the stream; its memory may be used again afterwards."""
         if self._publisher.get_subscription_count() == 0:
             return
         self._submitted += 1
-        codec = self._setting("format")
-        options = {name: self._setting(name) for name in ("jpeg_quality", "png_level")}
+        codec = self._parameter("format")
+        options = {name: self._parameter(name) for name in ("jpeg_quality", "png_level")}
         self._work.submit(
             _Job(self._submitted, image.copy(), frame.encoding, frame.header, codec, options)
         )
 
-    def _setting(self, name: str) -> Any:
-        return self._node.settings[f"{self._prefix}.{name}"]
+    def _parameter(self, name: str) -> Any:
+        return self._parameters[f"{self._prefix}.{name}"]
 
     def close(self) -> None:
-        """Wait for the image in hand; no further one goes out."""
+        """Wait for the image that is being compressed; none goes out after it."""
         with self._in_hand:
             self._ended = True
 
@@ -121,10 +133,10 @@ class CompressedOutput:
 
     def _report(self, done: _Done) -> None:
         self._done += 1
-        self._node.statistics.note(f"compressed.{self._topic}", self._done)
-        self._node.statistics.note(f"skipped.{self._topic}", done.number - self._done)
+        self._reporter.note(f"compressed.{self._topic}", self._done)
+        self._reporter.note(f"skipped.{self._topic}", done.number - self._done)
         if done.error is None:
             return
         if not isinstance(done.error, NODE_ERRORS):
             raise done.error
-        self._node.reject(done.error)
+        self._reporter.reject(done.error)

@@ -9,23 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
-from semcal_ros.nodes.common.base import NODE_ERRORS
-from semcal_ros.nodes.common.parameters import Setting
-from semcal_ros.nodes.common.services import trigger_service
+from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor
-from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
+from semcal_ros.nodes.frames.stream import StreamFrame
 from semcal_ros.nodes.workers.child_process import ChildProcessEnded
 from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measured, measured
 
-__all__ = ["DRIFT_SETTINGS", "FrameDrift", "LiveDrift"]
+__all__ = ["DRIFT_PARAMETERS", "FrameDrift", "LiveDrift"]
 
 _RESTARTING = (
-    Setting(
+    ParameterDeclaration(
         "keyframe_overlap",
         0.6,
         "A new keyframe is taken when less than this fraction of the picture overlaps with the last one."
@@ -33,7 +34,7 @@ _RESTARTING = (
         low=0.1,
         high=0.95,
     ),
-    Setting(
+    ParameterDeclaration(
         "max_jump",
         0.25,
         "A shift between frames beyond this fraction of the field counts as a move of the stage."
@@ -42,7 +43,7 @@ _RESTARTING = (
         high=1.0,
     ),
 )
-_DETAIL = Setting(
+_DETAIL = ParameterDeclaration(
     "drift_detail",
     1536,
     "Pictures with a longer side than this are averaged down by a whole factor before their drift is"
@@ -52,19 +53,20 @@ _DETAIL = Setting(
     low=64,
     high=32766,
 )
-_MODE = Setting(
+_MODE = ParameterDeclaration(
     "drift_tracking",
     "auto",
-    "Which frames wait for their own drift to be measured. every_frame: all, however late they get."
-    " forecast: none; each is corrected by what the frames before it foretell, and as many as can be"
+    "Which frames wait until their own drift is measured. every_frame: all, however late they get."
+    " forecast: none; each is corrected by a forecast from earlier frames, and as many as possible"
     " are measured beside the stream. auto: every frame as long as the stream leaves the time.",
     choices=("auto", "every_frame", "forecast"),
 )
-DRIFT_SETTINGS = (*_RESTARTING, _DETAIL, _MODE)
+DRIFT_PARAMETERS = (*_RESTARTING, _DETAIL, _MODE)
 
-# A forecast of over so many turns is none.
+# Turns (see LoadMonitor.turn_s) over which a forecast may reach: a few are normal, since measurements beside the
+# stream rest twice as long as they take; many more are a leap of the clock or a pause.
 _FAR = 20.0
-# Between measurements beside the stream, in times of one.
+# Rest between measurements beside the stream, in times of one: they take a third of a processor at most.
 _REST = 2.0
 
 
@@ -77,7 +79,7 @@ class FrameDrift:
     estimate
         The drift at the centre of the frame.
     measured
-        The latest frame whose drift was measured: this one, or one before it.
+        The latest frame whose drift was measured: this one or an earlier one.
     """
 
     estimate: DriftEstimate
@@ -95,17 +97,39 @@ class FrameDrift:
 
 
 class LiveDrift:
-    """The tracker of one node, with the service ``~/reset``."""
+    """The tracker of one node, with the service ``~/reset``.
 
-    def __init__(self, node: StreamNode) -> None:
-        self._node = node
-        self._pace = LoadMonitor()
+    Parameters
+    ----------
+    config
+        What the stamps mean, and the raster timing.
+    parameters
+        Parameters among which are :data:`DRIFT_PARAMETERS`.
+    endpoints, reporter
+        Where to serve ``~/reset``, and what counts and logs.
+
+    Notes
+    -----
+    :meth:`close` must be called before the node is destroyed.
+    """
+
+    def __init__(
+        self,
+        config: MicroscopeConfig,
+        parameters: Parameters,
+        endpoints: Endpoints,
+        reporter: Reporter,
+    ) -> None:
+        self._config = config
+        self._parameters = parameters
+        self._reporter = reporter
+        self._load = LoadMonitor()
         self._failed = 0
         self._beside = DriftProcess()
         for setting in (*_RESTARTING, _DETAIL):
-            node.settings.on_change(setting.name, lambda _value: self.reset())
+            parameters.on_change(setting.name, lambda _value: self.reset())
         self.reset()
-        self._service = trigger_service(node, "~/reset", self._on_reset)
+        self._service = endpoints.trigger_service("~/reset", self._on_reset)
 
     def _on_reset(self) -> str:
         self.reset()
@@ -113,12 +137,12 @@ class LiveDrift:
 
     def reset(self) -> None:
         """The next frame has zero drift."""
-        values = self._node.settings
+        values = self._parameters
         # A new one: the old one may be at work beside the stream.
         self._tracker = DriftTracker(
             DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
         )
-        self._is_away = False
+        self._is_beside = False
         self._origin_ns: int | None = None
         self._known: Measured | None = None
         self._at_work: Future[Measured] | None = None
@@ -128,24 +152,24 @@ class LiveDrift:
         """End what runs beside the stream."""
         self._beside.close()
 
-    def of(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
+    def estimate(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
         """Drift at a frame; raises as :meth:`DriftTracker.update`."""
         if frame.interval_s is not None:
-            self._pace.frame(frame.interval_s)
+            self._load.frame(frame.interval_s)
         time_s, centre_s = self._times(frame)
         if self._known is not None and centre_s < self._known.outlook.time_s:
             self.reset()
             time_s, centre_s = self._times(frame)
         waits = self._waits or self._is_far(centre_s)
         self._collect(wait=waits)
-        scan = self._node.config.scan
+        scan = self._config.scan
         if self._known is None or waits:
             self._fetch()
             time_s, centre_s = self._times(frame)
             self._keep(measured(self._tracker, *self._binned(frame, camera), time_s, scan))
         elif self._beside_is_free():
-            tracker = None if self._is_away else self._tracker
-            self._is_away = True
+            tracker = None if self._is_beside else self._tracker
+            self._is_beside = True
             small = self._binned(frame, camera)
             self._at_work = self._beside.measure(tracker, *small, time_s, scan)
         assert self._known is not None
@@ -154,31 +178,31 @@ class LiveDrift:
     def _binned(
         self, frame: StreamFrame, camera: ScanCamera
     ) -> tuple[NDArray[np.generic], ScanCamera]:
-        return bin_image(frame.image, camera, self._node.settings[_DETAIL.name])
+        return bin_image(frame.image, camera, self._parameters[_DETAIL.name])
 
     def _beside_is_free(self) -> bool:
         rested = self._at_work is None and time.monotonic() >= self._rest_until_s
         return rested and self._beside.is_ready()
 
     def _is_far(self, centre_s: float) -> bool:
-        """Whether a forecast would look over a leap of the clock or a pause, which it knows nothing of."""
+        """Whether a forecast would reach over a leap of the clock or a pause, of which the filter knows nothing."""
         known = self._known
-        return known is not None and centre_s - known.outlook.time_s > _FAR * self._pace.turn_s
+        return known is not None and centre_s - known.outlook.time_s > _FAR * self._load.turn_s
 
     def _times(self, frame: StreamFrame) -> tuple[float, float]:
         """Start and centre of a frame's acquisition, in s since the first one."""
         if self._origin_ns is None:
             # Seconds since 1970 in a float are only good to 0.2 us.
             self._origin_ns = frame.stamp_ns
-            self._node.statistics.note("drift_since", f"{frame.stamp_ns * 1e-9:.9f}")
-        config = self._node.config
-        time_s = (frame.stamp_ns - self._origin_ns) * 1e-9 + config.start_offset_s
-        return time_s, time_s + (0.0 if config.scan is None else config.scan.centre_offset_s)
+            self._reporter.note("drift_since", f"{frame.stamp_ns * 1e-9:.9f}")
+        scan = self._config.scan
+        time_s = (frame.stamp_ns - self._origin_ns) * 1e-9 + self._config.start_offset_s
+        return time_s, time_s + (0.0 if scan is None else scan.centre_offset_s)
 
     @property
     def _waits(self) -> bool:
-        mode = self._node.settings["drift_tracking"]
-        return mode == "every_frame" or (mode == "auto" and self._pace.keeps_up)
+        mode = self._parameters["drift_tracking"]
+        return mode == "every_frame" or (mode == "auto" and self._load.keeps_up)
 
     def _collect(self, *, wait: bool) -> None:
         """Take in what was measured beside the stream, once it is ready."""
@@ -188,7 +212,7 @@ class LiveDrift:
         try:
             self._keep(done.result())
             # The rest of the time is for other nodes.
-            self._rest_until_s = time.monotonic() + _REST * self._pace.cost_s
+            self._rest_until_s = time.monotonic() + _REST * self._load.cost_s
         except NODE_ERRORS as error:
             self._complain(str(error))
         except ChildProcessEnded as error:
@@ -196,12 +220,12 @@ class LiveDrift:
             self.reset()
 
     def _fetch(self) -> None:
-        """Have the tracker here."""
-        if not self._is_away:
+        """Get the tracker back into this process."""
+        if not self._is_beside:
             return
         try:
             self._tracker = self._beside.fetch().result()
-            self._is_away = False
+            self._is_beside = False
         except ChildProcessEnded as error:
             self._complain(f"the process that measures it {error}")
             self.reset()
@@ -209,13 +233,13 @@ class LiveDrift:
     def _complain(self, reason: str) -> None:
         # Its frame has gone out: it does not count as rejected.
         self._failed += 1
-        self._node.statistics.note("drift_frames_failed", self._failed)
-        self._node.warn_seldom(f"drift: {reason}")
+        self._reporter.note("drift_frames_failed", self._failed)
+        self._reporter.warn_seldom(f"drift: {reason}")
 
     def _keep(self, known: Measured) -> None:
         self._known = known
-        self._pace.measured(known.cost_s)
-        self._node.statistics.note("drift_ms", 1e3 * self._pace.cost_s)
+        self._load.measured(known.cost_s)
+        self._reporter.note("drift_ms", 1e3 * self._load.cost_s)
 
 
 def _at(known: Measured, centre_s: float) -> FrameDrift:

@@ -8,24 +8,27 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["LoadMonitor"]
 
+# Of the newest value in a running mean: it follows a change within about ten frames and hides a single slow one.
 _WEIGHT = 0.1
+# Intervals after which their mean counts; the first one may hold the start of the publisher.
 _SETTLED = 2
-# Leave at the first, come back at the second; in between it stays as it is.
+# Parts of the interval: rectifying and publishing need the rest. Not measured every frame any more above the first,
+# again below the second; the gap between them keeps a stream at the limit from switching with every frame.
 _TOO_MUCH, _LITTLE_ENOUGH = 0.6, 0.4
 
 
 class LoadMonitor:
     """Compares the time that a measurement takes with the interval between frames.
 
-    Both are running means. As long as little has been seen there is time enough.
+    Both are running means. Before there are enough frames to tell, every one is measured.
 
     Examples
     --------
-    >>> pace = LoadMonitor()
+    >>> load = LoadMonitor()
     >>> for _ in range(20):
-    ...     pace.frame(0.005)
-    ...     pace.measured(0.010)
-    >>> pace.keeps_up
+    ...     load.frame(0.005)
+    ...     load.measured(0.010)
+    >>> load.keeps_up
     False
     """
 

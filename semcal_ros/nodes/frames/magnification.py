@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
 
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
@@ -13,14 +16,16 @@ from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import value_input
+from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["MagnificationInput"]
 
+# More changes than a frame can be late for: minutes of a knob that is turned all the time, in 100 KB.
 _KEPT = 4096
-# Smaller steps back are frames that came late.
+# Smaller steps back are frames that came late; a replay that starts again steps back by more.
 _CLOCK_STEP_NS = 1_000_000_000
 # Fast DDS offers a latched value once more every 3 s, should the first offer have come before the match.
 _PATIENCE_S = 4.0
@@ -36,20 +41,32 @@ class MagnificationInput:
 
     Parameters
     ----------
-    node
-        The node; its configuration says what the topic carries.
+    config
+        What the topic carries.
+    endpoints, reporter
+        Where to subscribe, and what counts unusable messages.
     on_reading
         Called with each good reading.
+    group
+        Callback group of the subscription.
     """
 
-    def __init__(self, node: SemNode, on_reading: Any = None, group: Any = None) -> None:
-        source = node.config.magnification
-        self._node = node
+    def __init__(
+        self,
+        config: MicroscopeConfig,
+        endpoints: Endpoints,
+        reporter: Reporter,
+        on_reading: Callable[[MagnificationReading], None] | None = None,
+        group: CallbackGroup | None = None,
+    ) -> None:
+        source = config.magnification
+        self._config = config
+        self._reporter = reporter
         self._on_reading = on_reading
         self._history: ZeroOrderHold[MagnificationReading | None] = ZeroOrderHold(_KEPT)
         message_type = message_class(source.type)
         self._has_stamp = optional_stamp_ns(message_type()) is not None
-        self._subscription = node.listen(
+        self._subscription = endpoints.subscribe(
             message_type, source.topic, self._on_message, value_input(), group
         )
         self.received = 0
@@ -65,9 +82,9 @@ class MagnificationInput:
         try:
             if self._has_stamp:
                 key_ns = optional_stamp_ns(message) or 0
-            reading = read_magnification(message, self._node.config)
+            reading = read_magnification(message, self._config)
         except SemcalError as error:
-            self._node.reject(error)
+            self._reporter.reject(error)
         self._history.insert(key_ns, reading)
         if reading is not None and self._on_reading is not None:
             self._on_reading(reading)
@@ -100,8 +117,8 @@ class MagnificationInput:
         return replace(reading, config=config).magnification(image_width_px)
 
     def doubt(self, since_ns: int) -> None:
-        """The microscope was started again after ``since_ns``: its magnification may be another one, of which it will
-        soon tell. Without a word from it, the old one holds on.
+        """The microscope was started again after ``since_ns`` and may have another magnification, which it will soon
+        publish. If it does not, the old one stays valid.
         """
         self._doubted = time.monotonic() + _PATIENCE_S, since_ns
 
@@ -114,7 +131,7 @@ class MagnificationInput:
         return self._doubted is not None
 
     def _forget_if_back(self, stamp_ns: int) -> None:
-        """The clock went back, but no magnification has come yet: what is known is of another time."""
+        """The clock went back, but no magnification has come yet: the history is from another time."""
         newest_ns = self._history.newest_ns
         went_back = stamp_ns < self._last_ns - _CLOCK_STEP_NS
         if went_back and newest_ns is not None and newest_ns > stamp_ns + _CLOCK_STEP_NS:
@@ -126,7 +143,7 @@ class MagnificationInput:
         arguments are those of :meth:`at`, after which this is to be called.
         """
         sent = None if self._has_stamp else sent_ns
-        interval = scan_interval_ns(stamp_ns, sent, self._node.config)
+        interval = scan_interval_ns(stamp_ns, sent, self._config)
         if interval is None:
             return False
         values = [self._history.at(interval[0]), *self._history.between(*interval)]

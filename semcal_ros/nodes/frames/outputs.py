@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
@@ -13,7 +14,9 @@ from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.parameters import Parameters
+from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.live_drift import FrameDrift
 from semcal_ros.nodes.frames.stream import StreamFrame
@@ -24,15 +27,17 @@ __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 class ImageOutput:
     """Publishes images on one topic, from memory that is used again for each, and compressed beside it.
 
-    The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_settings`.
+    The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
     """
 
-    def __init__(self, node: SemNode, topic: str) -> None:
-        self._node = node
+    def __init__(
+        self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter, topic: str
+    ) -> None:
+        self._reporter = reporter
         self._message = Image()
-        self._publisher = node.stream_publisher(Image, topic)
-        self._compressed = CompressedOutput(node, topic)
-        self._pixels: NDArray[Any] | None = None
+        self._publisher = endpoints.stream_publisher(Image, topic)
+        self._compressed = CompressedOutput(parameters, endpoints, reporter, topic)
+        self._pixels: NDArray[Any] = np.empty(0)
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """Where to write the pixels of the image made from ``frame``."""
@@ -42,8 +47,7 @@ class ImageOutput:
     def publish(self, frame: StreamFrame) -> None:
         """Publish what was written."""
         self._publisher.publish(self._message)
-        self._node.count_published(frame.stamp_ns)
-        assert self._pixels is not None, "memory() comes first"
+        self._reporter.count_published(frame.stamp_ns)
         self._compressed.publish(self._pixels, frame)
 
     def close(self) -> None:
@@ -54,9 +58,9 @@ class ImageOutput:
 class RectifiedOutput:
     """Publishes ``image_rect`` and ``camera_info`` in pairs."""
 
-    def __init__(self, node: SemNode) -> None:
-        self._image = ImageOutput(node, "image_rect")
-        self._info = node.stream_publisher(CameraInfo, "camera_info")
+    def __init__(self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter) -> None:
+        self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
+        self._info = endpoints.stream_publisher(CameraInfo, "camera_info")
         self._message = CameraInfo()
         # What the message describes, but for its header.
         self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
@@ -88,10 +92,10 @@ class RectifiedOutput:
 class DriftOutput:
     """Publishes ``drift`` and ``drift_velocity``, and notes how the tracking goes."""
 
-    def __init__(self, node: SemNode) -> None:
-        self._node = node
-        self._drift = node.stream_publisher(PoseWithCovarianceStamped, "drift")
-        self._velocity = node.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
+    def __init__(self, endpoints: Endpoints, reporter: Reporter) -> None:
+        self._reporter = reporter
+        self._drift = endpoints.stream_publisher(PoseWithCovarianceStamped, "drift")
+        self._velocity = endpoints.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
         self._messages = PoseWithCovarianceStamped(), TwistWithCovarianceStamped()
         self._coasting = 0
         self._forecast = 0
@@ -121,4 +125,4 @@ class DriftOutput:
             ("drift_frames_forecast", self._forecast),
         )
         for key, value in notes:
-            self._node.statistics.note(key, value)
+            self._reporter.note(key, value)

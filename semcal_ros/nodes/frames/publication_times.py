@@ -7,12 +7,13 @@ from collections import OrderedDict
 
 from semcal_ros.config.config import ImageConfig
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["SourceTimestamps"]
 
+# Frames: seconds of any stream, longer than another node holds one.
 _KEPT = 256
 # Encapsulation, and the stamp with which std_msgs/Header and so every image begins.
 _ENCAPSULATION = 4
@@ -28,18 +29,18 @@ class SourceTimestamps:
 
     Parameters
     ----------
-    node
-        The node.
+    endpoints
+        Where to subscribe.
     source
         The originals, whose type begins with a header; None where the frames are the originals.
     """
 
-    def __init__(self, node: SemNode, source: ImageConfig | None) -> None:
+    def __init__(self, endpoints: Endpoints, source: ImageConfig | None) -> None:
         self._times: OrderedDict[int, int] = OrderedDict()
         self._originals = (
             None
             if source is None
-            else node.listen(
+            else endpoints.subscribe(
                 message_class(source.type),
                 source.topic,
                 self._on_original,
@@ -55,8 +56,8 @@ class SourceTimestamps:
         while len(self._times) > _KEPT:
             self._times.popitem(last=False)
 
-    def of(self, stamp_ns: int, info: MessageInfo) -> int:
-        """When the original of a frame was published, ns; of the frame itself if the original was not seen."""
+    def published_ns(self, stamp_ns: int, info: MessageInfo) -> int:
+        """When the original of a frame was published, ns; when the frame itself was, if the original did not come."""
         if self._originals is not None:
             # The frame may be handled before originals that arrived ahead of it.
             self._originals.take_waiting()

@@ -18,8 +18,9 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.projection import projection_from_message
 from semcal_ros.core.arrays import Array
-from semcal_ros.nodes.common.base import NODE_ERRORS, SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
+from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo
 
 __all__ = ["ServoFrame", "ServoInput"]
@@ -61,8 +62,8 @@ class ServoInput:
 
     Parameters
     ----------
-    node
-        The node.
+    endpoints, reporter
+        Where to subscribe, and what counts.
     on_frame
         Called with each frame; what it raises of :data:`NODE_ERRORS` is counted, and then ``on_error`` called.
     on_error
@@ -73,43 +74,44 @@ class ServoInput:
 
     def __init__(
         self,
-        node: SemNode,
+        endpoints: Endpoints,
+        reporter: Reporter,
         on_frame: Callable[[ServoFrame], None],
         on_error: Callable[[str], None],
         *,
         with_drift: bool,
     ) -> None:
-        self._node = node
+        self._reporter = reporter
         self._on_frame = on_frame
         self._on_error = on_error
         self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
         self._projections: deque[Array] = deque(maxlen=_PROJECTIONS)
         self._draining = False
-        node.listen(Float64MultiArray, "projection", self._on_projection, value_input())
+        endpoints.subscribe(Float64MultiArray, "projection", self._on_projection, value_input())
         self._inputs = [
-            node.listen(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
-            node.listen(Image, "image_rect", self._keeps("image"), image_input()),
+            endpoints.subscribe(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
+            endpoints.subscribe(Image, "image_rect", self._keeps("image"), image_input()),
         ]
         if with_drift:
             self._parts["drift"] = {}
             drift = self._keeps("drift")
             kind = PoseWithCovarianceStamped
-            self._inputs.append(node.listen(kind, "drift", drift, stream_output()))
+            self._inputs.append(endpoints.subscribe(kind, "drift", drift, stream_output()))
 
     def _on_projection(self, message: Any, _info: MessageInfo) -> None:
         try:
             self._projections.append(projection_from_message(message))
         except NODE_ERRORS as error:
-            self._node.reject(error)
+            self._reporter.reject(error)
 
     def _keeps(self, part: str) -> Callable[[Any, MessageInfo], None]:
         def keep(message: Any, _info: MessageInfo) -> None:
             if part == "image":
-                self._node.statistics.receive(time.monotonic())
+                self._reporter.count_received()
             try:
                 self._insert(part, stamp_ns_from_msg(message), message)
             except NODE_ERRORS as error:
-                self._node.reject(error)
+                self._reporter.reject(error)
                 self._on_error(" ".join(str(error).split()))
             if not self._draining:
                 self._drain()
@@ -136,7 +138,7 @@ class ServoInput:
             return
         newest = [stamp for stamp in self._parts["image"] if stamp in complete][-1]
         parts = {name: waiting[newest] for name, waiting in self._parts.items()}
-        self._node.statistics.drop(list(self._parts["image"]).index(newest))
+        self._reporter.statistics.drop(list(self._parts["image"]).index(newest))
         for waiting in self._parts.values():
             for stamp in list(waiting)[: list(waiting).index(newest) + 1]:
                 del waiting[stamp]
@@ -156,6 +158,6 @@ class ServoInput:
                 ServoFrame(grey, k, drift_m, tuple(self._projections), image.header, stamp_ns)
             )
         except NODE_ERRORS as error:
-            self._node.reject(error)
+            self._reporter.reject(error)
             self._on_error(" ".join(str(error).split()))
-        self._node.statistics.note("processing_ms", 1e3 * (time.monotonic() - started_s))
+        self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))

@@ -13,7 +13,7 @@ from semcal_ros.applications.servoing import ServoStep
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.core.arrays import Array
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 
 __all__ = ["ErrorOutput", "StageOutput"]
 
@@ -21,16 +21,16 @@ _LAST_WORD_S = 1.0
 
 
 class StageOutput:
-    """Publishes velocities of the stage, and sees to it that the last one is zero.
+    """Publishes velocities of the stage; the last one is zero.
 
     Parameters
     ----------
-    node, topic
-        Where.
+    endpoints, topic
+        Where to publish.
     """
 
-    def __init__(self, node: SemNode, topic: str) -> None:
-        self._publisher = node.stream_publisher(Twist, topic)
+    def __init__(self, endpoints: Endpoints, topic: str) -> None:
+        self._publisher = endpoints.stream_publisher(Twist, topic)
         self.twist = np.zeros(3)
 
     @property
@@ -46,7 +46,7 @@ class StageOutput:
         self.twist = np.array(twist)
 
     def close(self) -> None:
-        """Stop the stage and wait until it has been told."""
+        """Stop the stage and wait until it has received that."""
         self.send(np.zeros(3))
         self._publisher.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
 
@@ -54,8 +54,8 @@ class StageOutput:
 class ErrorOutput:
     """Publishes ``~/error``: target minus goal, in the sem frame, at the centre of a frame."""
 
-    def __init__(self, node: SemNode) -> None:
-        self._publisher = node.stream_publisher(PoseWithCovarianceStamped, "~/error")
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._publisher = endpoints.stream_publisher(PoseWithCovarianceStamped, "~/error")
 
     def publish(self, step: ServoStep, header: Any) -> None:
         """Publish what was measured; nothing where nothing was."""

@@ -5,20 +5,32 @@ from __future__ import annotations
 import math
 
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
-from semcal_ros.nodes.common.parameters import Setting, Settings
+from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
-__all__ = ["SERVO_SETTINGS", "goal_of", "servo_settings_of"]
+__all__ = ["SERVO_PARAMETERS", "read_goal", "read_servo_settings"]
 
 _GOAL = (
-    Setting("goal_x_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3),
-    Setting("goal_y_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3),
-    Setting("goal_rotation_deg", 0.0, "And how it shall be turned.", "degrees", -180.0, 180.0),
+    ParameterDeclaration(
+        "goal_x_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3
+    ),
+    ParameterDeclaration(
+        "goal_y_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3
+    ),
+    ParameterDeclaration(
+        "goal_rotation_deg", 0.0, "And how it shall be turned.", "degrees", -180.0, 180.0
+    ),
 )
 _LAW = (
-    Setting("gain", 1.0, "Part of the error that is taken away per second.", "1/s", 0.001, 100.0),
-    Setting("speed_limit_um_s", 50.0, "Largest speed of the stage.", "um/s", 1e-3, 1e4),
-    Setting("turn_limit_deg_s", 5.0, "Largest speed of its rotation.", "degrees/s", 1e-3, 360.0),
-    Setting(
+    ParameterDeclaration(
+        "gain", 1.0, "Part of the error that is taken away per second.", "1/s", 0.001, 100.0
+    ),
+    ParameterDeclaration(
+        "speed_limit_um_s", 50.0, "Largest speed of the stage.", "um/s", 1e-3, 1e4
+    ),
+    ParameterDeclaration(
+        "turn_limit_deg_s", 5.0, "Largest speed of its rotation.", "degrees/s", 1e-3, 360.0
+    ),
+    ParameterDeclaration(
         "travel_limit_px",
         12.0,
         "How far a marker may move from one frame to the next: that blurs it.",
@@ -26,15 +38,17 @@ _LAW = (
         0.1,
         1e4,
     ),
-    Setting("tolerance_px", 0.5, "Converged is what is nearer to the goal.", "px", 0.01, 100.0),
-    Setting(
+    ParameterDeclaration(
+        "tolerance_px", 0.5, "Converged is what is nearer to the goal.", "px", 0.01, 100.0
+    ),
+    ParameterDeclaration(
         "scale_tolerance",
         0.05,
         "The target must be as large as the camera of the frame says, to this fraction.",
         low=0.001,
         high=0.5,
     ),
-    Setting(
+    ParameterDeclaration(
         "axis_sigma_px",
         15.0,
         "How well the calibration knows where the optical axis is seen (1-sigma); what changes of the magnification"
@@ -44,12 +58,16 @@ _LAW = (
         1e4,
         fixed=True,
     ),
-    Setting("feed_forward", True, "Command away the drift that remains beside the commands."),
+    ParameterDeclaration(
+        "feed_forward", True, "Command away the drift that remains beside the commands."
+    ),
 )
 _STAGE = (
-    Setting("start", False, "Begin at once, without ~/start.", fixed=True),
-    Setting("stage", "virtual_sem/stage", "Topic of the stage's velocity.", fixed=True),
-    Setting(
+    ParameterDeclaration("start", False, "Begin at once, without ~/start.", fixed=True),
+    ParameterDeclaration(
+        "stage", "virtual_sem/stage", "Topic of the stage's velocity.", fixed=True
+    ),
+    ParameterDeclaration(
         "goal_frame",
         "instrument",
         "instrument: the goal is a place under the beam; what was removed from the picture as drift is added again."
@@ -57,30 +75,30 @@ _STAGE = (
         choices=("instrument", "specimen"),
         fixed=True,
     ),
-    Setting(
+    ParameterDeclaration(
         "with_drift",
         True,
         "Whether a drift comes with each image, as from stream_corrector; false for images of rectifier.",
         fixed=True,
     ),
-    Setting(
+    ParameterDeclaration(
         "reset_service",
         "stream_corrector/reset",
         "Called when the corrected picture has moved too far from what is in view; empty: never.",
         fixed=True,
     ),
-    Setting(
+    ParameterDeclaration(
         "reset_beyond",
         0.15,
         "That is, when the drift is more than this fraction of the width.",
         low=0.01,
         high=1.0,
     ),
-    Setting(
+    ParameterDeclaration(
         "target_cell_m", 180e-6, "Side of a cell of the largest board.", "m", 1e-9, 1.0, fixed=True
     ),
-    Setting("height_m", 0.0, "Height of the target along the beam.", "m", -1e-3, 1e-3),
-    Setting(
+    ParameterDeclaration("height_m", 0.0, "Height of the target along the beam.", "m", -1e-3, 1e-3),
+    ParameterDeclaration(
         "rotation_centre_x_m",
         0.0,
         "Where the axis of the stage's rotation meets the target, in its own frame.",
@@ -89,7 +107,7 @@ _STAGE = (
         1.0,
         fixed=True,
     ),
-    Setting(
+    ParameterDeclaration(
         "rotation_centre_y_m",
         0.0,
         "Where the axis of the stage's rotation meets the target, in its own frame.",
@@ -99,16 +117,16 @@ _STAGE = (
         fixed=True,
     ),
 )
-SERVO_SETTINGS = (*_GOAL, *_LAW, *_STAGE)
+SERVO_PARAMETERS = (*_GOAL, *_LAW, *_STAGE)
 
 
-def goal_of(settings: Settings) -> PlanePose:
+def read_goal(settings: Parameters) -> PlanePose:
     """The goal as the parameters have it."""
     angle_rad = math.radians(settings["goal_rotation_deg"])
     return PlanePose(settings["goal_x_m"], settings["goal_y_m"], angle_rad)
 
 
-def servo_settings_of(settings: Settings) -> ServoSettings:
+def read_servo_settings(settings: Parameters) -> ServoSettings:
     """The control law as the parameters have it."""
     return ServoSettings(
         gain_hz=settings["gain"],

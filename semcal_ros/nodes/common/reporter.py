@@ -1,0 +1,87 @@
+"""What a node counts and says about the messages that it handles."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import cv2
+from rclpy.clock import Clock
+
+from semcal_ros.bridge.diagnostics import StreamStatistics
+from semcal_ros.core.errors import SemcalError
+
+__all__ = ["NODE_ERRORS", "Reporter"]
+
+NODE_ERRORS = (SemcalError, cv2.error)
+"""What a message can cause; a node counts it, reports it and goes on."""
+
+# Often enough to be seen by somebody who begins to look, seldom enough to leave the rest of the log readable.
+_LOG_AGAIN_S = 10.0
+# Different warnings within that time, so that one whose numbers change does not flood the log.
+_LOGGED_AT_ONCE = 100
+# A stamp further away than this is from another clock, such as a replay without simulated time: no stream is an hour
+# late, and recordings are older.
+_OTHER_CLOCK_S = 3600.0
+
+
+class Reporter:
+    """Counts messages, keeps values for the diagnostics, and logs without flooding.
+
+    Parameters
+    ----------
+    logger
+        The logger of the node.
+    clock
+        The clock of the node, which stamps are compared with.
+    """
+
+    def __init__(self, logger: Any, clock: Clock) -> None:
+        self.statistics = StreamStatistics()
+        self._logger = logger
+        self._clock = clock
+        self._logged: dict[str, float] = {}
+
+    def note(self, key: str, value: bool | float | str) -> None:
+        """Keep a value for the diagnostics."""
+        self.statistics.note(key, value)
+
+    def info(self, text: str) -> None:
+        """Log what a user may want to know."""
+        self._logger.info(text)
+
+    def warn(self, text: str) -> None:
+        """Log a warning."""
+        self._logger.warning(text)
+
+    def warn_seldom(self, text: str) -> None:
+        """Log a warning unless the same one was logged in the last seconds."""
+        now_s = time.monotonic()
+        if now_s - self._logged.get(text, -_LOG_AGAIN_S) < _LOG_AGAIN_S:
+            return
+        if len(self._logged) >= _LOGGED_AT_ONCE:
+            recent = {t: s for t, s in self._logged.items() if now_s - s < _LOG_AGAIN_S}
+            self._logged = recent
+            if len(recent) >= _LOGGED_AT_ONCE:
+                return
+        self._logged[text] = now_s
+        self.warn(text)
+
+    def reject(self, error: Exception) -> None:
+        """Count an unusable message and log its reason, though not again and again."""
+        reason = " ".join(str(error).split())
+        self.statistics.reject(reason)
+        self.warn_seldom(reason)
+
+    def count_received(self) -> None:
+        """Count a frame that has come in."""
+        self.statistics.receive(time.monotonic())
+
+    def count_published(self, stamp_ns: int | None) -> None:
+        """Count a result, with its latency where the stamp is from this clock."""
+        latency_s: float | None = None
+        if stamp_ns is not None:
+            latency_s = (self._clock.now().nanoseconds - stamp_ns) * 1e-9
+            if abs(latency_s) > _OTHER_CLOCK_S:
+                latency_s = None
+        self.statistics.publish(time.monotonic(), latency_s)
