@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from semcal_ros.bridge.fields import require_fields
-from semcal_ros.bridge.protocols import StringMessage
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 __all__ = ["MAX_TEXT_BYTES", "calibration_text_from_message", "fill_calibration_text"]
@@ -12,7 +13,7 @@ MAX_TEXT_BYTES = 16 * 1024 * 1024
 """Limit far above any calibration, so that a wrong topic cannot exhaust memory in the parser."""
 
 
-def calibration_text_from_message(message: StringMessage) -> str:
+def calibration_text_from_message(message: Any) -> str:
     """Text of a calibration, not yet parsed.
 
     Raises
@@ -38,7 +39,7 @@ def calibration_text_from_message(message: StringMessage) -> str:
     return text
 
 
-def fill_calibration_text(message: StringMessage, text: str) -> None:
+def fill_calibration_text(message: Any, text: str) -> None:
     """Set the text; raises :class:`InvalidValueError` where a receiver would refuse it."""
     try:
         size = len(text.encode("utf-8"))

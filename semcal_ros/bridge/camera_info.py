@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from semcal_ros.bridge.fields import assign_floats
-from semcal_ros.bridge.headers import copy_header
-from semcal_ros.bridge.protocols import CameraInfoMessage, HeaderMessage
+from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["fill_camera_info"]
 
 
 def fill_camera_info(
-    message: CameraInfoMessage,
+    message: Any,
     camera: ScanCamera | None,
     header: HeaderMessage,
     width: int,

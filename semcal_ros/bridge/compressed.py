@@ -10,22 +10,20 @@ cv_bridge and other publishers give the codec alone.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.fields import assign_bytes, require_fields
-from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.bridge.images import ENCODINGS, image_from_message
 from semcal_ros.bridge.picture_headers import PictureHeader, read_picture_header
-from semcal_ros.bridge.protocols import HeaderMessage
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 __all__ = [
     "CODECS",
-    "CompressedImageMessage",
     "decoded_image",
     "fill_compressed",
     "image_from_compressed",
@@ -38,14 +36,6 @@ _CODEC_NAMES = {"png": "png", "jpeg": "jpeg", "jpg": "jpeg"}
 # What drivers call grey values that they do not want to call grey.
 _SAME = {"8UC1": "mono8", "16UC1": "mono16"}
 _FORMATS = "png, jpeg, or such as 'mono16; png compressed ' with " + ", ".join(CODECS["png"])
-
-
-class CompressedImageMessage(Protocol):
-    """sensor_msgs/msg/CompressedImage."""
-
-    header: Any
-    format: str
-    data: Any
 
 
 def decoded_image(message: Any) -> tuple[NDArray[Any], str]:
@@ -64,7 +54,7 @@ def decoded_image(message: Any) -> tuple[NDArray[Any], str]:
 # -- reading -------------------------------------------------------------------------------------------
 
 
-def image_from_compressed(message: CompressedImageMessage) -> tuple[NDArray[Any], str]:
+def image_from_compressed(message: Any) -> tuple[NDArray[Any], str]:
     """Pixels of a compressed image, and their encoding.
 
     Parameters
@@ -182,7 +172,7 @@ def _decoded(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
 
 
 def fill_compressed(
-    message: CompressedImageMessage,
+    message: Any,
     image: NDArray[Any],
     encoding: str,
     header: HeaderMessage,

@@ -9,7 +9,6 @@ from enum import IntEnum
 from typing import Any
 
 from semcal_ros.bridge.fields import new_nested
-from semcal_ros.bridge.protocols import DiagnosticStatusMessage
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["DiagnosticLevel", "DiagnosticSummary", "StreamStatistics", "fill_diagnostic_status"]
@@ -161,7 +160,7 @@ class StreamStatistics:
 
 
 def fill_diagnostic_status(
-    message: DiagnosticStatusMessage, name: str, hardware_id: str, summary: DiagnosticSummary
+    message: Any, name: str, hardware_id: str, summary: DiagnosticSummary
 ) -> None:
     """Set a diagnostic_msgs/msg/DiagnosticStatus."""
     message.level = _level_value(message.level, summary.level)

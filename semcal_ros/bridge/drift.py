@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.bridge.fields import assign_floats
-from semcal_ros.bridge.headers import copy_header
-from semcal_ros.bridge.protocols import (
-    HeaderMessage,
-    PoseWithCovarianceStampedMessage,
-    TwistWithCovarianceStampedMessage,
-)
+from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
@@ -26,7 +21,7 @@ _SYMMETRY_TOLERANCE = 1e-6
 
 
 def fill_drift(
-    message: PoseWithCovarianceStampedMessage,
+    message: Any,
     drift_m: ArrayLike,
     covariance: ArrayLike,
     header: HeaderMessage,
@@ -62,7 +57,7 @@ def fill_drift(
 
 
 def fill_drift_velocity(
-    message: TwistWithCovarianceStampedMessage,
+    message: Any,
     velocity_m_s: ArrayLike,
     covariance: ArrayLike,
     header: HeaderMessage,

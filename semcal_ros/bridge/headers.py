@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 from semcal_ros.bridge.fields import whole_number
-from semcal_ros.bridge.protocols import HeaderMessage, StampMessage
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
-__all__ = ["copy_header", "fill_header", "fill_stamp", "optional_stamp_ns", "stamp_ns_from_msg"]
+__all__ = [
+    "HeaderMessage",
+    "StampMessage",
+    "copy_header",
+    "fill_header",
+    "fill_stamp",
+    "optional_stamp_ns",
+    "stamp_ns_from_msg",
+]
 
 _NS_PER_S = 1_000_000_000
 _SEC_MIN, _SEC_MAX = -(2**31), 2**31 - 1
+
+
+class StampMessage(Protocol):
+    """builtin_interfaces/msg/Time, of rclpy or of rosbags."""
+
+    sec: int
+    nanosec: int
+
+
+class HeaderMessage(Protocol):
+    """std_msgs/msg/Header, of rclpy or of rosbags."""
+
+    @property
+    def stamp(self) -> StampMessage:
+        """When."""
+
+    frame_id: str
 
 
 def stamp_ns_from_msg(message: Any) -> int:

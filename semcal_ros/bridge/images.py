@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.fields import byte_memory, require_fields, whole_number
-from semcal_ros.bridge.headers import copy_header
-from semcal_ros.bridge.protocols import HeaderMessage, ImageMessage
+from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 __all__ = [
@@ -52,7 +51,7 @@ _FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
 _GRAY_CODES = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 
-def image_from_message(message: ImageMessage) -> NDArray[Any]:
+def image_from_message(message: Any) -> NDArray[Any]:
     """Pixels of an image message in the byte order of this machine.
 
     Parameters
@@ -193,9 +192,7 @@ def without_databar(image: NDArray[Any], databar_rows: int) -> NDArray[Any]:
     return image[: image.shape[0] - databar_rows]
 
 
-def fill_image(
-    message: ImageMessage, image: NDArray[Any], encoding: str, header: HeaderMessage
-) -> None:
+def fill_image(message: Any, image: NDArray[Any], encoding: str, header: HeaderMessage) -> None:
     """Set every field of an image message; the pixels are copied and rows are not padded.
 
     Parameters
@@ -218,7 +215,7 @@ def fill_image(
 
 
 def pixel_memory(
-    message: ImageMessage, like: NDArray[Any], encoding: str, header: HeaderMessage
+    message: Any, like: NDArray[Any], encoding: str, header: HeaderMessage
 ) -> NDArray[Any]:
     """Set every field of an image message but the pixels, and give their memory to write to.
 

@@ -21,7 +21,6 @@ __all__ = [
     "MAGNIFICATION_LIMITS",
     "MagnificationReading",
     "check_magnification",
-    "magnification_from_message",
     "read_magnification",
 ]
 
@@ -130,16 +129,6 @@ def read_magnification(message: Any, config: MicroscopeConfig) -> MagnificationR
     if not reading.needs_image_width:
         reading.magnification()
     return reading
-
-
-def magnification_from_message(
-    message: Any, config: MicroscopeConfig, image_width_px: int | None = None
-) -> float:
-    """Magnification with respect to the calibration's display width, in one step.
-
-    As :func:`read_magnification` followed by :meth:`MagnificationReading.magnification`.
-    """
-    return read_magnification(message, config).magnification(image_width_px)
 
 
 def _field(message: Any, path: str, type_name: str) -> Any:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from semcal_ros.bridge.fields import assign_floats, new_nested, whole_number
-from semcal_ros.bridge.protocols import MultiArrayMessage
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
@@ -15,7 +16,7 @@ __all__ = ["fill_projection", "projection_from_message"]
 _SHAPE = (("rows", 3), ("columns", 4))
 
 
-def fill_projection(message: MultiArrayMessage, camera: ScanCamera) -> None:
+def fill_projection(message: Any, camera: ScanCamera) -> None:
     """Set a 3 x 4 array, row by row: the undistorted homogeneous pixel of a homogeneous sem-frame
     point in m.
 
@@ -39,7 +40,7 @@ def fill_projection(message: MultiArrayMessage, camera: ScanCamera) -> None:
     assign_floats(message, "data", camera.P_affine)
 
 
-def projection_from_message(message: MultiArrayMessage) -> Array:
+def projection_from_message(message: Any) -> Array:
     """(3, 4) matrix of a message filled by :func:`fill_projection`.
 
     Raises

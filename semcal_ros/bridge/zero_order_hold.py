@@ -57,11 +57,6 @@ class ZeroOrderHold(Generic[T]):
         """Stamp of the newest value, or None."""
         return self._stamps[-1] if self._stamps else None
 
-    @property
-    def oldest_ns(self) -> int | None:
-        """Stamp of the oldest value that is still known, or None."""
-        return self._stamps[0] if self._stamps else None
-
     def clear(self) -> None:
         """Forget everything."""
         self._stamps.clear()
@@ -91,11 +86,6 @@ class ZeroOrderHold(Generic[T]):
         """Value whose stamp is the latest one not after ``stamp_ns``, or None if there is none."""
         place = bisect_right(self._stamps, stamp_ns)
         return self._values[place - 1] if place else None
-
-    def stamp_at(self, stamp_ns: int) -> int | None:
-        """Stamp of the value that :meth:`at` returns, or None."""
-        place = bisect_right(self._stamps, stamp_ns)
-        return self._stamps[place - 1] if place else None
 
     def between(self, start_ns: int, end_ns: int) -> list[T]:
         """Values that began in ``start_ns`` < stamp <= ``end_ns``, oldest first."""

@@ -11,13 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.magnification import magnification_from_message, read_magnification
+from semcal_ros.bridge.magnification import read_magnification
 from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message
 
 New = Callable[[str], Any]
 FLOAT64 = "std_msgs/msg/Float64"
+
+
+def convert_message(
+    message: Any, config: MicroscopeConfig, image_width_px: int | None = None
+) -> float:
+    return read_magnification(message, config).magnification(image_width_px)
 
 
 def config_for(magnification: str) -> MicroscopeConfig:
@@ -48,7 +54,7 @@ def float64(new: New, value: float) -> Any:
 )
 def test_known_answers(new: New, magnification: str, value: float, expected: float) -> None:
     config = config_for(magnification)
-    result = magnification_from_message(float64(new, value), config, 512)
+    result = convert_message(float64(new, value), config, 512)
     assert result == pytest.approx(expected, rel=1e-12)
 
 
@@ -77,7 +83,7 @@ def test_vendor_example() -> None:
     # A Thermo Fisher frame of 1536 px with pixels of 269.792 nm: 500 x on the 207.2 mm wide display
     # that its data bar means, and 1250 x on one of 518 mm. One field of view, so one magnification.
     results = [
-        magnification_from_message(float64(blank_message, value), config_for(text), 1536)
+        convert_message(float64(blank_message, value), config_for(text), 1536)
         for value, text in [
             (269.792, "quantity: pixel_size, unit: nm"),
             (500.0, "quantity: magnification, display_width_m: 0.2072"),
@@ -98,7 +104,7 @@ def test_every_quantity_means_the_same_field(g: float, width_m: float, width_px:
     ]
     for text, value in cases:
         message = float64(blank_message, value)
-        result = magnification_from_message(message, config_for(text), width_px)
+        result = convert_message(message, config_for(text), width_px)
         assert result == pytest.approx(g, rel=1e-9)
 
 
@@ -121,15 +127,13 @@ def test_impossible_magnifications(new: New, value: float) -> None:
 )
 def test_absurd_lengths_do_not_divide_by_zero(text: str, value: float) -> None:
     with pytest.raises(MessageError):
-        magnification_from_message(float64(blank_message, value), config_for(text), 512)
+        convert_message(float64(blank_message, value), config_for(text), 512)
 
 
 def test_a_wrong_unit_is_noticed(new: New) -> None:
     # 46.875 taken as metres instead of nanometres.
     with pytest.raises(MessageError, match="unit"):
-        magnification_from_message(
-            float64(new, 46.875), config_for("quantity: pixel_size, unit: m"), 512
-        )
+        convert_message(float64(new, 46.875), config_for("quantity: pixel_size, unit: m"), 512)
 
 
 def test_field_paths(new: New) -> None:
@@ -138,7 +142,7 @@ def test_field_paths(new: New) -> None:
         np.array([7.0, 800.0]) if isinstance(message.position, np.ndarray) else [7.0, 800.0]
     )
     text = "quantity: magnification, type: sensor_msgs/msg/JointState, field: 'position[{}]'"
-    assert magnification_from_message(message, config_for(text.format(1))) == 800.0
+    assert convert_message(message, config_for(text.format(1))) == 800.0
     with pytest.raises(MessageError, match="2 elements"):
         read_magnification(message, config_for(text.format(2)))
 

@@ -330,7 +330,7 @@ def test_every_executable_and_parameter_exists(
                 assert value is True
                 continue
             # Refuses a wrong type and a value out of range.
-            assert settings[name].checked(value) == value
+            assert settings[name].convert(value) == value
 
 
 # -- the suite -----------------------------------------------------------------------------------------
