@@ -13,7 +13,7 @@ from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 
 from semcal_ros.nodes.common.qos import overridable, relaxed
 
-__all__ = ["AdaptiveSubscription", "MessageInfo", "published_ns"]
+__all__ = ["AdaptiveSubscription", "MessageCounter", "MessageInfo", "published_ns"]
 
 MessageInfo = Mapping[str, Any]
 Callback = Callable[[Any, MessageInfo], None]
@@ -25,6 +25,52 @@ _NO_NUMBER = 2**64 - 1
 def published_ns(info: MessageInfo) -> int:
     """When the message was published, ns; when it was received if the middleware does not say."""
     return int(info["source_timestamp"] or info["received_timestamp"])
+
+
+class MessageCounter:
+    """Counts lost messages, and publishers that begin, from the numbers that each publisher gives its messages.
+
+    Attributes
+    ----------
+    lost
+        Messages that were sent and did not arrive.
+    restarts
+        How often another publisher has begun.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self.restarts = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last message: the next one follows none."""
+        self._last_number: int | None = None
+        self._publishers = 0
+
+    def count(self, number: int | None, publishers: int) -> None:
+        """Count a message.
+
+        Parameters
+        ----------
+        number
+            Its number; None if the middleware gives none.
+        publishers
+            How many publishers the topic has at present.
+        """
+        if number is None or number == _NO_NUMBER:
+            return
+        missed = 0 if self._last_number is None else number - self._last_number - 1
+        # A publisher that was killed still counts for a while, so its successor is one more; one that left is
+        # followed by smaller numbers. Several publishers at once number their messages independently.
+        another = publishers > self._publishers or (missed < 0 and publishers <= 1)
+        if self._last_number is not None and another:
+            self.restarts += 1
+        # With no publisher at all, the last one has ended since.
+        elif missed > 0 and publishers <= 1:
+            self.lost += missed
+        self._publishers = publishers
+        self._last_number = number
 
 
 class AdaptiveSubscription:
@@ -64,9 +110,7 @@ class AdaptiveSubscription:
         self._raw = raw
         self._refused: list[QoSPolicyKind] = []
         self.topic = topic
-        self.lost = 0
-        # How often another publisher has begun.
-        self.restarts = 0
+        self._counter = MessageCounter()
         self._foreign_types: set[str] = set()
         self._guard = node.create_guard_condition(self._relax, callback_group=group)
         # The override parameters are written into the profile.
@@ -82,14 +126,23 @@ class AdaptiveSubscription:
         return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._wished, k))
 
     @property
+    def lost(self) -> int:
+        """Messages that were sent and did not arrive."""
+        return self._counter.lost
+
+    @property
+    def restarts(self) -> int:
+        """How often another publisher has begun."""
+        return self._counter.restarts
+
+    @property
     def depth(self) -> float:
         """How many messages may wait."""
         profile = self._profile
         return math.inf if profile.history == HistoryPolicy.KEEP_ALL else profile.depth
 
     def _subscribe(self, options: Any = None) -> Any:
-        self._last_number = None
-        self._publishers = 0
+        self._counter.reset()
         # rclpy passes the information too, which its annotations do not say.
         callback: Any = self._on_message
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
@@ -105,25 +158,12 @@ class AdaptiveSubscription:
         )
 
     def _on_message(self, message: Any, info: MessageInfo) -> None:
-        self._count_gap(info)
+        self._count(info)
         self._callback(message, info)
 
-    def _count_gap(self, info: MessageInfo) -> None:
+    def _count(self, info: MessageInfo) -> None:
         number = info.get("publication_sequence_number")
-        if number is None or number == _NO_NUMBER:
-            return
-        missed = 0 if self._last_number is None else number - self._last_number - 1
-        publishers = self._subscription.get_publisher_count()
-        # One that was killed still counts for a while, so its successor is one more; one that left is followed by
-        # smaller numbers. Several publishers at once count independently.
-        anew = publishers > self._publishers or (missed < 0 and publishers <= 1)
-        if self._last_number is not None and anew:
-            self.restarts += 1
-        # None any more: it has ended since.
-        elif missed > 0 and publishers <= 1:
-            self.lost += missed
-        self._publishers = publishers
-        self._last_number = number
+        self._counter.count(number, self._subscription.get_publisher_count())
 
     def take_waiting(self) -> None:
         """Run the callback for everything that has already arrived.
@@ -142,7 +182,7 @@ class AdaptiveSubscription:
         if taken is None:
             return None
         message, info = taken
-        self._count_gap(info)
+        self._count(info)
         return message, info
 
     # -- quality of service ------------------------------------------------------------------------

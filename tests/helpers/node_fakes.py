@@ -1,0 +1,88 @@
+"""What a helper of a node is connected with, without ROS at work: messages come in by a call."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+from rclpy.clock import Clock
+
+from semcal_ros.nodes.common.reporter import Reporter
+
+
+class FakeSubscription:
+    """Calls back with what it is given; ``waiting`` is what has arrived and was not handed over yet."""
+
+    def __init__(self, callback: Callable[[Any, Any], None], depth: float) -> None:
+        self.callback = callback
+        self.depth = depth
+        self.lost = 0
+        self.restarts = 0
+        self.waiting: deque[tuple[Any, Any]] = deque()
+
+    def take(self) -> tuple[Any, Any] | None:
+        return self.waiting.popleft() if self.waiting else None
+
+    def take_waiting(self) -> None:
+        while (taken := self.take()) is not None:
+            self.callback(*taken)
+
+
+class FakeEndpoints:
+    """Keeps the subscriptions by topic; guards run at :meth:`hand_over`."""
+
+    def __init__(self, depth: float = 10) -> None:
+        self.subscriptions: dict[str, FakeSubscription] = {}
+        self._depth = depth
+        self._guards: list[Callable[[], None]] = []
+
+    def subscribe(
+        self, _type: Any, topic: str, callback: Any, _profile: Any, _group: Any = None, **_: Any
+    ) -> Any:
+        self.subscriptions[topic] = FakeSubscription(callback, self._depth)
+        return self.subscriptions[topic]
+
+    def guard(self, callback: Callable[[], None]) -> Any:
+        self._guards.append(callback)
+        return SimpleNamespace(trigger=lambda: None)
+
+    def hand_over(self) -> None:
+        """Run what an executor would run for the guards."""
+        for callback in self._guards:
+            callback()
+
+
+class FakeParameters:
+    """Values of parameters; changes go through what was asked to check and to apply them."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = dict(values)
+        self._changes: dict[str, tuple[Any, Any]] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def allowed_path(self, path: str) -> Any:
+        return path
+
+    def on_change(self, name: str, apply: Any, check: Any = None) -> None:
+        self._changes[name] = check or (lambda _value: None), apply
+
+    def set(self, name: str, value: Any) -> None:
+        check, apply = self._changes[name]
+        check(value)
+        self._values[name] = value
+        apply(value)
+
+
+def fake_reporter() -> tuple[Reporter, list[str]]:
+    """A reporter, and the list of what it logs."""
+    log: list[str] = []
+    return Reporter(SimpleNamespace(info=log.append, warning=log.append), Clock()), log
+
+
+def notes(reporter: Reporter) -> dict[str, str]:
+    """What the diagnostics would show."""
+    return dict(reporter.statistics.summary(0.0).values)

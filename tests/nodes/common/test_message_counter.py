@@ -1,0 +1,57 @@
+"""Lost messages and restarted publishers, from the numbers of the messages alone."""
+
+from __future__ import annotations
+
+from semcal_ros.nodes.common.subscription import MessageCounter
+
+
+def counted(*messages: tuple[int | None, int]) -> tuple[int, int]:
+    """(lost, restarts) after messages of (number, publishers)."""
+    counter = MessageCounter()
+    for number, publishers in messages:
+        counter.count(number, publishers)
+    return counter.lost, counter.restarts
+
+
+def test_a_gap_is_lost() -> None:
+    assert counted((1, 1), (2, 1), (5, 1)) == (2, 0)
+
+
+def test_nothing_is_lost_before_the_first_message() -> None:
+    assert counted((40, 1), (41, 1)) == (0, 0)
+
+
+def test_a_message_after_its_publisher_has_ended_counts_too() -> None:
+    assert counted((1, 1), (4, 0)) == (2, 0)
+
+
+def test_a_publisher_that_was_killed_is_followed_by_one_more() -> None:
+    """The killed one still counts, and the numbers of its successor may be larger."""
+    assert counted((7, 1), (1, 2), (2, 2)) == (0, 1)
+    assert counted((1, 1), (9, 2), (10, 2)) == (0, 1)
+
+
+def test_a_publisher_that_left_is_followed_by_smaller_numbers() -> None:
+    assert counted((7, 1), (1, 1), (2, 1)) == (0, 1)
+    # Its last message may come after it.
+    assert counted((7, 1), (8, 0), (1, 1)) == (0, 1)
+
+
+def test_the_killed_one_that_is_forgotten_at_last_is_no_restart() -> None:
+    assert counted((7, 1), (1, 2), (2, 1), (3, 1)) == (0, 1)
+
+
+def test_several_publishers_at_once_lose_nothing_and_restart_nothing() -> None:
+    assert counted((1, 2), (100, 2), (2, 2), (101, 2)) == (0, 0)
+
+
+def test_a_middleware_without_numbers_counts_nothing() -> None:
+    assert counted((None, 1), (None, 2), (2**64 - 1, 1), (2**64 - 1, 3)) == (0, 0)
+
+
+def test_after_a_reset_the_next_message_follows_none() -> None:
+    counter = MessageCounter()
+    counter.count(1, 1)
+    counter.reset()
+    counter.count(9, 2)
+    assert (counter.lost, counter.restarts) == (0, 0)

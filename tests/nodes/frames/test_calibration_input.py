@@ -1,0 +1,135 @@
+"""Which of several calibrations is in force, whatever the order in which they arrive."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from std_msgs.msg import String
+
+from semcal_ros.config.config import load_config
+from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter
+from tests.helpers.node_scenes import make_calibration
+
+TIMEOUT_S = 30.0
+
+
+def text_of(width_m: float) -> str:
+    """A calibration that is told from others by its display width."""
+    return replace(make_calibration(), display_width_m=width_m).dumps()
+
+
+class Bench:
+    """A calibration input that gets messages with a time of publication."""
+
+    def __init__(self, path: str = "") -> None:
+        self.endpoints: Any = FakeEndpoints()
+        self.parameters: Any = FakeParameters({"calibration": path})
+        self.changes: list[float] = []
+        reporter, self.log = fake_reporter()
+        self.input = CalibrationInput(
+            load_config("generic"),
+            self.parameters,
+            self.endpoints,
+            reporter,
+            on_change=lambda: self.changes.append(self.width_m),
+        )
+
+    @property
+    def width_m(self) -> float:
+        assert self.input.current is not None
+        return self.input.current.display_width_m
+
+    def receive(self, width_m: float, sent_ns: int) -> None:
+        info = {"source_timestamp": sent_ns, "received_timestamp": sent_ns}
+        self.endpoints.subscriptions["calibration"].callback(String(data=text_of(width_m)), info)
+
+    def wait_for(self, width_m: float) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
+        while self.input.current is None or self.width_m != width_m:
+            assert time.monotonic() < deadline
+            self.endpoints.hand_over()
+            time.sleep(0.001)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    path = tmp_path / "cal.yaml"
+    path.write_text(text_of(0.05), encoding="utf-8")
+    return str(path)
+
+
+def test_an_older_message_never_replaces_a_newer_one() -> None:
+    bench = Bench()
+    bench.receive(0.10, sent_ns=2_000)
+    bench.wait_for(0.10)
+    bench.receive(0.11, sent_ns=1_999)
+    # Parsed after everything before it.
+    bench.receive(0.12, sent_ns=2_001)
+    bench.wait_for(0.12)
+    assert bench.changes == [0.10, 0.12]
+
+
+def test_an_older_message_that_is_parsed_last_does_not_replace_a_newer_file(file: str) -> None:
+    bench = Bench()
+    bench.receive(0.10, sent_ns=time.time_ns())
+    # In force before the message is parsed, or at least before it is handed over.
+    bench.parameters.set("calibration", file)
+    bench.receive(0.11, sent_ns=time.time_ns() + 10**12)
+    bench.wait_for(0.11)
+    assert bench.changes == [0.05, 0.11]
+
+
+def test_the_file_given_at_start_is_older_than_any_message(file: str) -> None:
+    bench = Bench(file)
+    assert bench.width_m == 0.05
+    assert bench.changes == []
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+
+
+def test_the_same_text_again_counts_from_then_on_and_changes_nothing() -> None:
+    bench = Bench()
+    bench.receive(0.10, sent_ns=1_000)
+    bench.wait_for(0.10)
+    bench.receive(0.10, sent_ns=3_000)
+    bench.receive(0.11, sent_ns=2_000)
+    bench.receive(0.12, sent_ns=4_000)
+    bench.wait_for(0.12)
+    assert bench.changes == [0.10, 0.12]
+
+
+def test_what_this_node_has_published_does_not_come_back_as_news(file: str) -> None:
+    bench = Bench(file)
+    published: list[Any] = []
+
+    class Publisher:
+        publish = staticmethod(published.append)
+
+    sent_ns = time.time_ns()
+    bench.input.publish(Publisher())
+    assert bench.input.has_published
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+    bench.receive(0.05, sent_ns=sent_ns)
+    bench.receive(0.11, sent_ns=time.time_ns() + 10**12)
+    bench.wait_for(0.11)
+    assert bench.changes == [0.10, 0.11]
+
+
+def test_a_bad_text_is_refused_and_the_old_calibration_stays() -> None:
+    bench = Bench()
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+    info = {"source_timestamp": 2, "received_timestamp": 2}
+    callback = bench.endpoints.subscriptions["calibration"].callback
+    callback(String(data="no calibration"), info)
+    bench.receive(0.11, sent_ns=3)
+    bench.wait_for(0.11)
+    callback(String(data=""), info)
+    assert bench.width_m == 0.11
+    assert any("calibration message with 0 bytes" in line for line in bench.log)

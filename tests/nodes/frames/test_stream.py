@@ -1,0 +1,126 @@
+"""Which of the images that wait are worked on, and with which interval and magnification."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from semcal_ros.config.config import load_config
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, is_late
+from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
+from tests.helpers.node_scenes import image_message, magnification_message, texture
+
+IMAGE = texture(size=32)
+
+
+@pytest.mark.parametrize(
+    ("waited_ms", "interval_ms", "late"),
+    [
+        # Less than 40 ms is never late, however fast the stream.
+        (39.0, 1.0, False),
+        (41.0, 1.0, True),
+        (41.0, 26.0, True),
+        # Nor is less than 1.5 intervals, however long they are.
+        (41.0, 28.0, False),
+        (149.0, 100.0, False),
+        (151.0, 100.0, True),
+        # Before there is an interval.
+        (41.0, 0.0, True),
+    ],
+)
+def test_late_is_more_than_40_ms_and_more_than_one_and_a_half_intervals(
+    waited_ms: float, interval_ms: float, late: bool
+) -> None:
+    assert is_late(1e-3 * waited_ms, 1e-3 * interval_ms) == late
+
+
+class Bench:
+    """A frame input, and the frames that it hands on."""
+
+    def __init__(self, depth: float = 10) -> None:
+        self.endpoints: Any = FakeEndpoints(depth)
+        parameters: Any = FakeParameters({"mixed_frames": "drop"})
+        self.reporter, self.log = fake_reporter()
+        self.frames: list[StreamFrame] = []
+        self.input = FrameInput(
+            load_config("virtual_sem"),
+            parameters,
+            self.endpoints,
+            self.reporter,
+            self.frames.append,
+        )
+
+    @property
+    def images(self) -> Any:
+        return self.endpoints.subscriptions["image_raw"]
+
+    def magnification(self, value: float, sent_ns: int) -> None:
+        info = {"source_timestamp": sent_ns, "received_timestamp": sent_ns}
+        topic = self.endpoints.subscriptions["magnification"]
+        topic.callback(magnification_message(value), info)
+
+    def receive(self, *sent_s: float, waited_s: float = 0.0) -> None:
+        """Images that were sent at these times and have waited here for that long, all there at once."""
+        received_ns = time.time_ns() - round(waited_s * 1e9)
+        messages = [
+            (
+                image_message(IMAGE, sent),
+                {"source_timestamp": round(sent * 1e9), "received_timestamp": received_ns},
+            )
+            for sent in sent_s
+        ]
+        self.images.waiting.extend(messages[1:])
+        self.images.callback(*messages[0])
+
+    @property
+    def stamps_s(self) -> list[float]:
+        return [round(frame.stamp_ns * 1e-9, 6) for frame in self.frames]
+
+
+def test_images_in_time_are_all_worked_on_in_order() -> None:
+    bench = Bench()
+    bench.receive(1.0, 1.1, 1.2)
+    assert bench.stamps_s == [1.0, 1.1, 1.2]
+
+
+def test_late_images_make_way_for_the_newest() -> None:
+    bench = Bench()
+    bench.receive(1.0)
+    bench.receive(1.1, 1.2, 1.3, waited_s=10.0)
+    assert bench.stamps_s == [1.0, 1.3]
+    # What was skipped counts as dropped, and not as a longer interval.
+    assert bench.frames[-1].interval_s == pytest.approx(0.1)
+    assert notes(bench.reporter)["dropped"] == "2"
+
+
+def test_a_late_image_that_is_the_newest_is_worked_on() -> None:
+    bench = Bench()
+    bench.receive(1.0, waited_s=10.0)
+    assert bench.stamps_s == [1.0]
+
+
+def test_a_user_with_a_longer_queue_gets_every_image() -> None:
+    bench = Bench(depth=11)
+    bench.receive(1.0, 1.1, 1.2, waited_s=10.0)
+    assert bench.stamps_s == [1.0, 1.1, 1.2]
+
+
+def test_after_a_restart_the_old_magnification_is_not_believed_until_a_new_one_comes() -> None:
+    bench = Bench()
+    bench.magnification(1000.0, sent_ns=1)
+    bench.receive(1.0)
+    bench.images.restarts += 1
+    bench.receive(1.1)
+    assert [frame.magnification for frame in bench.frames] == [1000.0, None]
+    bench.magnification(2000.0, sent_ns=1_150_000_000)
+    bench.receive(1.2)
+    assert bench.frames[-1].magnification == 2000.0
+
+
+def test_one_turn_of_the_executor_is_bounded() -> None:
+    bench = Bench()
+    bench.receive(*(1.0 + 0.1 * number for number in range(20)))
+    assert len(bench.frames) == 9
+    assert len(bench.images.waiting) == 11
