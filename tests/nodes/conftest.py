@@ -10,18 +10,6 @@ import pytest
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.ros_process import Peer
 
-HERE = Path(__file__).parent
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One more try for what depends on several processes getting their turns; each is listed at the end of the run.
-
-    A shared machine may stop any of them for seconds, which no node can be built against. What fails twice is wrong.
-    """
-    for item in items:
-        if HERE in item.path.parents:
-            item.add_marker(pytest.mark.flaky(reruns=1))
-
 
 @pytest.fixture
 def peer() -> Iterator[Peer]:

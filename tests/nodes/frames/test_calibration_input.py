@@ -103,6 +103,17 @@ def test_the_same_text_again_counts_from_then_on_and_changes_nothing() -> None:
     assert bench.changes == [0.10, 0.12]
 
 
+def test_the_same_text_from_an_earlier_time_does_not_make_way_for_an_older_one() -> None:
+    bench = Bench()
+    bench.receive(0.10, sent_ns=3_000)
+    bench.wait_for(0.10)
+    bench.receive(0.10, sent_ns=1_000)
+    bench.receive(0.11, sent_ns=2_000)
+    bench.receive(0.12, sent_ns=4_000)
+    bench.wait_for(0.12)
+    assert bench.changes == [0.10, 0.12]
+
+
 def test_what_this_node_has_published_does_not_come_back_as_news(file: str) -> None:
     bench = Bench(file)
     published: list[Any] = []

@@ -1,0 +1,34 @@
+"""What a node counts and logs."""
+
+from __future__ import annotations
+
+import pytest
+from rclpy.clock import Clock
+
+from semcal_ros.core.errors import MessageError
+from tests.helpers.node_fakes import fake_reporter, notes
+
+
+def test_a_rejected_message_is_counted_each_time_and_logged_once() -> None:
+    reporter, log = fake_reporter()
+    for _ in range(3):
+        reporter.reject(MessageError("no\n  image"))
+    assert log == ["no image"]
+    assert notes(reporter)["rejected"] == "3"
+
+
+def test_warnings_whose_numbers_change_do_not_flood_the_log() -> None:
+    reporter, log = fake_reporter()
+    for number in range(1000):
+        reporter.warn_seldom(f"frame {number}")
+    assert len(log) == 100
+
+
+@pytest.mark.parametrize(("age_s", "shown"), [(0.25, True), (4000.0, False), (-4000.0, False)])
+def test_a_latency_is_shown_unless_the_stamp_is_from_another_clock(
+    age_s: float, shown: bool
+) -> None:
+    reporter, _ = fake_reporter()
+    reporter.count_published(Clock().now().nanoseconds - round(age_s * 1e9))
+    assert notes(reporter)["published"] == "1"
+    assert any("latency" in key for key in notes(reporter)) == shown
