@@ -27,6 +27,9 @@ from semcal_ros.synthetic.specimens.target import TargetSpecimen
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import LATCHED, RELIABLE, NodeProcess, Peer, running
 
+# Four processes must get their turns within a stream's interval; seen to fail at a load of 8 on 2 cores.
+pytestmark = pytest.mark.flaky(reruns=1)
+
 SERVO = "/sem/visual_servo"
 SIZE = 256
 SCOPE = replace(preset("ideal"), timing=ScanTiming(0.1)).with_image_size(SIZE, SIZE)
