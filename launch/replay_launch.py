@@ -42,7 +42,7 @@ ARGUMENTS = {
     "wait_for_subscribers": (
         "1",
         int,
-        "Start when every image topic of the recording has so many subscribers: 1 is the suite,"
+        "Start once every image topic of the recording has this many subscribers: 1 is the suite,"
         " 2 with calibration_server:=true, one more for each viewer. 0: at once.",
     ),
 }
@@ -110,7 +110,7 @@ def on_exit(event, context, is_player):
     if event.returncode == 0:
         after = TimerAction(period=GRACE_S, actions=[Shutdown(reason="the recording has ended")])
         return [after] if is_player else None
-    # The suite starts a node again that has died. A player that began anew would play everything twice, and would
+    # The suite restarts a node that has died. A player that was restarted would play everything twice, and would
     # wait forever for a node that cannot start.
     final = is_player or event.returncode == CANNOT_START
     if not final and IfCondition(LaunchConfiguration("respawn")).evaluate(context):

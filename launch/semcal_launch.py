@@ -26,9 +26,9 @@ PACKAGE = "semcal_ros"
 PROFILE = Path(__file__).absolute().parents[1] / "dds" / "fastdds_large_images.xml"
 # Fast DDS 2 reads the first name, Fast DDS 3 the second.
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-# Bytes. The memory of one frame is used again for the next instead of being faulted in anew.
+# Bytes. The memory of one frame is reused for the next instead of being faulted in again.
 MALLOC_VARIABLES = {"MALLOC_MMAP_THRESHOLD_": "268435456", "MALLOC_TRIM_THRESHOLD_": "536870912"}
-# Seconds. Long enough for on_exit to be heard first, short for who waits for frames.
+# Seconds. Long enough for on_exit to come first, short for a user who waits for frames.
 RESPAWN_DELAY_S = 1.0
 # Asked to end; cannot start with what it was given.
 FINAL = (0, 2)
@@ -40,7 +40,7 @@ ARGUMENTS = {
     "mode": (
         "combined",
         "combined: stream_corrector removes drift and distortion in one interpolation."
-        " separate: drift_compensator, then rectifier, for who needs the images in between too.",
+        " separate: drift_compensator, then rectifier, for users who need the images in between as well.",
     ),
     "calibration_server": ("false", "Also start calibration_server, to calibrate live."),
     "params_file": (

@@ -170,7 +170,7 @@ def node_actions(
     turn(rectifier, MAGNIFICATION)
     turn(corrector, MAGNIFICATION)
     frame(corrector)
-    known = corrector._drift._known.update
+    known = corrector._drift._latest.update
     camera = calibration().at(MAGNIFICATION).resized(size, size)
     tracker, corrector._drift = corrector._drift, KnownDrift(corrector._drift, known, camera)
 

@@ -107,7 +107,7 @@ class BagPlayer(SemNode):
         self.exit_status = 0
         self._bag = open_bag(self.parameters["bag"])
         self.closing.callback(self._bag.close)
-        # Topics whose last message reaches those who come later.
+        # Topics whose last message reaches late subscribers too.
         self._latched: set[str] = set()
         self._undiscovered = self.parameters["wait_for_subscribers"] > 0
         self._publishers_by_topic = self._make_publishers()

@@ -41,7 +41,7 @@ _TICK_S = 0.5
 class ParameterServer(SemNode):
     """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like.
 
-    A calibration that another node publishes is taken over, and published again for those who come later.
+    A calibration that another node publishes is taken over, and published again for late subscribers.
     """
 
     def __init__(self) -> None:

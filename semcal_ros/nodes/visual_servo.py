@@ -193,7 +193,7 @@ class VisualServo(SemNode):
         )
 
     def _keep_in_view(self, frame: ServoFrame, step: ServoStep) -> None:
-        """Let the corrector begin anew where its picture, which it holds in place, has left the field."""
+        """Reset the corrector when its picture, which it holds in place, has left the field."""
         if self._reset is None or not frame.projections or not self._reset.service_is_ready():
             return
         px_per_m = float(np.linalg.norm(frame.projections[-1][:2, :2], 2))

@@ -54,7 +54,7 @@ class Endpoints:
         return self._publisher(message_type, topic, stream_output())
 
     def latched_publisher(self, message_type: Any, topic: str) -> Any:
-        """Publisher whose last message reaches those who come later."""
+        """Publisher whose last message reaches late subscribers too."""
         return self._publisher(message_type, topic, latched())
 
     def _publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:

@@ -56,7 +56,7 @@ def stream_output(depth: int = 8) -> QoSProfile:
 
 
 def latched() -> QoSProfile:
-    """The last value is kept for those who come later."""
+    """The last value is kept for late subscribers."""
     return _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 

@@ -21,7 +21,7 @@ from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor
 from semcal_ros.nodes.frames.stream import StreamFrame
 from semcal_ros.nodes.workers.child_process import ChildProcessEnded
-from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measured, measured
+from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measurement, measure_frame
 
 __all__ = ["DRIFT_PARAMETERS", "FrameDrift", "LiveDrift"]
 
@@ -30,7 +30,7 @@ _RESTARTING = (
         "keyframe_overlap",
         0.6,
         "A new keyframe is taken when less than this fraction of the picture overlaps with the last one."
-        " A change starts the tracking anew.",
+        " A change restarts the tracking.",
         low=0.1,
         high=0.95,
     ),
@@ -38,7 +38,7 @@ _RESTARTING = (
         "max_jump",
         0.25,
         "A shift between frames beyond this fraction of the field counts as a move of the stage."
-        " A change starts the tracking anew.",
+        " A change restarts the tracking.",
         low=0.01,
         high=1.0,
     ),
@@ -48,7 +48,7 @@ _DETAIL = ParameterDeclaration(
     1536,
     "Pictures with a longer side than this are averaged down by a whole factor before their drift is"
     " measured: 4096 x 4096 takes ten times as long, and its finest detail is mostly noise. What is"
-    " published keeps all pixels. A change starts the tracking anew.",
+    " published keeps all pixels. A change restarts the tracking.",
     unit="px",
     low=64,
     high=32766,
@@ -144,8 +144,8 @@ class LiveDrift:
         )
         self._is_beside = False
         self._origin_ns: int | None = None
-        self._known: Measured | None = None
-        self._at_work: Future[Measured] | None = None
+        self._latest: Measurement | None = None
+        self._at_work: Future[Measurement] | None = None
         self._rest_until_s = 0.0
 
     def close(self) -> None:
@@ -155,27 +155,27 @@ class LiveDrift:
     def estimate(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
         """Drift at a frame; raises as :meth:`DriftTracker.update`."""
         if frame.interval_s is not None:
-            self._load.frame(frame.interval_s)
+            self._load.add_interval(frame.interval_s)
         time_s, centre_s = self._times(frame)
-        if self._known is not None and centre_s < self._known.outlook.time_s:
+        if self._latest is not None and centre_s < self._latest.predictor.time_s:
             self.reset()
             time_s, centre_s = self._times(frame)
         waits = self._waits or self._is_far(centre_s)
         self._collect(wait=waits)
         scan = self._config.scan
-        if self._known is None or waits:
+        if self._latest is None or waits:
             self._fetch()
             time_s, centre_s = self._times(frame)
-            self._keep(measured(self._tracker, *self._binned(frame, camera), time_s, scan))
+            self._keep(measure_frame(self._tracker, *self._bin(frame, camera), time_s, scan))
         elif self._beside_is_free():
             tracker = None if self._is_beside else self._tracker
             self._is_beside = True
-            small = self._binned(frame, camera)
+            small = self._bin(frame, camera)
             self._at_work = self._beside.measure(tracker, *small, time_s, scan)
-        assert self._known is not None
-        return _at(self._known, centre_s)
+        assert self._latest is not None
+        return _estimate_at(self._latest, centre_s)
 
-    def _binned(
+    def _bin(
         self, frame: StreamFrame, camera: ScanCamera
     ) -> tuple[NDArray[np.generic], ScanCamera]:
         return bin_image(frame.image, camera, self._parameters[_DETAIL.name])
@@ -186,8 +186,8 @@ class LiveDrift:
 
     def _is_far(self, centre_s: float) -> bool:
         """Whether a forecast would reach over a leap of the clock or a pause, of which the filter knows nothing."""
-        known = self._known
-        return known is not None and centre_s - known.outlook.time_s > _FAR * self._load.turn_s
+        latest = self._latest
+        return latest is not None and centre_s - latest.predictor.time_s > _FAR * self._load.turn_s
 
     def _times(self, frame: StreamFrame) -> tuple[float, float]:
         """Start and centre of a frame's acquisition, in s since the first one."""
@@ -236,14 +236,14 @@ class LiveDrift:
         self._reporter.note("drift_frames_failed", self._failed)
         self._reporter.warn_seldom(f"drift: {reason}")
 
-    def _keep(self, known: Measured) -> None:
-        self._known = known
-        self._load.measured(known.cost_s)
+    def _keep(self, latest: Measurement) -> None:
+        self._latest = latest
+        self._load.add_cost(latest.cost_s)
         self._reporter.note("drift_ms", 1e3 * self._load.cost_s)
 
 
-def _at(known: Measured, centre_s: float) -> FrameDrift:
-    update = known.update
+def _estimate_at(latest: Measurement, centre_s: float) -> FrameDrift:
+    update = latest.update
     if centre_s == update.time_s:
         return FrameDrift(update, update)
-    return FrameDrift(known.outlook.at(centre_s), update)
+    return FrameDrift(latest.predictor.at(centre_s), update)

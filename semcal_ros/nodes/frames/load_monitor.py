@@ -26,8 +26,8 @@ class LoadMonitor:
     --------
     >>> load = LoadMonitor()
     >>> for _ in range(20):
-    ...     load.frame(0.005)
-    ...     load.measured(0.010)
+    ...     load.add_interval(0.005)
+    ...     load.add_cost(0.010)
     >>> load.keeps_up
     False
     """
@@ -55,7 +55,7 @@ class LoadMonitor:
         """Mean time of a measurement, s; NaN before the first."""
         return math.nan if self._cost_s is None else self._cost_s
 
-    def frame(self, interval_s: float) -> None:
+    def add_interval(self, interval_s: float) -> None:
         """The next frame was published ``interval_s`` after the one before.
 
         Raises
@@ -63,13 +63,13 @@ class LoadMonitor:
         InvalidValueError
             If it is negative or not finite.
         """
-        self._interval_s = _mean(self._interval_s, _checked(interval_s))
+        self._interval_s = _mean(self._interval_s, _check(interval_s))
         self._frames += 1
         self._decide()
 
-    def measured(self, cost_s: float) -> None:
-        """A measurement took ``cost_s``; raises as :meth:`frame`."""
-        self._cost_s = _mean(self._cost_s, _checked(cost_s))
+    def add_cost(self, cost_s: float) -> None:
+        """A measurement took ``cost_s``; raises as :meth:`add_interval`."""
+        self._cost_s = _mean(self._cost_s, _check(cost_s))
         self._decide()
 
     def _decide(self) -> None:
@@ -79,7 +79,7 @@ class LoadMonitor:
         self._keeps_up = self._cost_s <= share * self._interval_s
 
 
-def _checked(seconds: float) -> float:
+def _check(seconds: float) -> float:
     if not 0.0 <= seconds < math.inf:
         raise InvalidValueError(f"a time of {seconds} s", expected="a finite number >= 0")
     return seconds

@@ -139,8 +139,9 @@ class MagnificationInput:
         self._last_ns = stamp_ns
 
     def changed_during(self, stamp_ns: int, sent_ns: int) -> bool:
-        """Whether it changed while a frame was being scanned, as far as that can be told; the
-        arguments are those of :meth:`at`, after which this is to be called.
+        """Whether the magnification changed while a frame was being scanned, as far as that is known.
+
+        To be called after :meth:`at`, with its arguments.
         """
         sent = None if self._has_stamp else sent_ns
         interval = scan_interval_ns(stamp_ns, sent, self._config)

@@ -25,7 +25,8 @@ from semcal_ros.nodes.common.subscription import MessageInfo
 
 __all__ = ["ServoFrame", "ServoInput"]
 
-# Frames that wait for what belongs to them; projections of so many magnifications.
+# Frames that wait for their other parts: more than the queues of all inputs hold. Projections: as many magnifications
+# as can be on their way with those frames.
 _WAITING, _PROJECTIONS = 16, 16
 
 

@@ -20,24 +20,24 @@ from semcal_ros.core.drift.tracker import DriftPredictor, DriftTracker, DriftUpd
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 
-__all__ = ["DriftProcess", "Measured", "measured", "serve"]
+__all__ = ["DriftProcess", "Measurement", "measure_frame", "serve"]
 
 # A tenth of the weight of a live node (sched(7): each step is a factor of 1.25): the stream goes first.
 _NICE = 10
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What a frame told, what is to be expected from then on, and the time that it took."""
+class Measurement:
+    """The update from a frame, the predictor from then on, and the time that the measurement took, s."""
 
     update: DriftUpdate
-    outlook: DriftPredictor
+    predictor: DriftPredictor
     cost_s: float
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """What :func:`measured` takes."""
+    """What :func:`measure_frame` takes."""
 
     image: NDArray[np.generic]
     camera: ScanCamera
@@ -45,21 +45,21 @@ class _Frame:
     timing: ScanTiming | None
 
 
-def measured(
+def measure_frame(
     tracker: DriftTracker,
     image: NDArray[np.generic],
     camera: ScanCamera,
     time_s: float,
     timing: ScanTiming | None,
-) -> Measured:
-    """Measure a frame here and now; raises as :meth:`DriftTracker.update`."""
+) -> Measurement:
+    """Measure a frame in this process; raises as :meth:`DriftTracker.update`."""
     started_s = time.monotonic()
     update = tracker.update(image, time_s, camera, timing)
-    return Measured(update, tracker.predictor(), time.monotonic() - started_s)
+    return Measurement(update, tracker.predictor(), time.monotonic() - started_s)
 
 
 class DriftProcess:
-    """Holds a tracker elsewhere; requests are worked on one after the other, in the order in which they came.
+    """Holds a tracker in another process, which works on requests one after the other, in the order in which they came.
 
     The process is started with the first request, which takes a second or two, and again with the first request after
     it has died. Futures raise what the tracker raised, or :class:`ChildProcessEnded` if the process has died; the
@@ -73,7 +73,7 @@ class DriftProcess:
         self._ended = False
 
     def is_ready(self) -> bool:
-        """Whether the process has begun to answer; with the first question it is started."""
+        """Whether the process has begun to answer; the first call starts it."""
         if self._warming is None:
             self._warming = self.fetch()
         return self._warming.done() and self._warming.exception() is None
@@ -85,8 +85,8 @@ class DriftProcess:
         camera: ScanCamera,
         time_s: float,
         timing: ScanTiming | None,
-    ) -> Future[Measured]:
-        """Measure a frame, with ``tracker`` from now on if there is one, else with the one that is there."""
+    ) -> Future[Measurement]:
+        """Measure a frame, from now on with ``tracker``; None stands for the one that the process has."""
         frame = _Frame(image, camera, time_s, timing)
         return self._queue.submit(self._ask, tracker, frame)
 
@@ -124,7 +124,7 @@ class DriftProcess:
 
 
 def serve(channel: Channel) -> None:
-    """Answer requests until there is nobody left to ask."""
+    """Answer requests until the node closes its end."""
     # The stream has the other processors.
     cv2.setNumThreads(1)
     held = DriftTracker()
@@ -134,7 +134,7 @@ def serve(channel: Channel) -> None:
         answer: Any = held
         if frame is not None:
             try:
-                answer = measured(held, frame.image, frame.camera, frame.time_s, frame.timing)
+                answer = measure_frame(held, frame.image, frame.camera, frame.time_s, frame.timing)
             except (SemcalError, cv2.error) as error:
                 answer = SemcalError(str(error))
         channel.send(answer)

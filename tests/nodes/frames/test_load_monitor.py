@@ -27,12 +27,12 @@ def config(stamp: str = "start", scan: str = SCAN) -> MicroscopeConfig:
     return parse_config(CONFIG.format(stamp=stamp, scan=scan))
 
 
-def run(pace: LoadMonitor, frames: int, interval_s: float, cost_s: float) -> list[bool]:
+def run(load: LoadMonitor, frames: int, interval_s: float, cost_s: float) -> list[bool]:
     states = []
     for _ in range(frames):
-        pace.frame(interval_s)
-        pace.measured(cost_s)
-        states.append(pace.keeps_up)
+        load.add_interval(interval_s)
+        load.add_cost(cost_s)
+        states.append(load.keeps_up)
     return states
 
 
@@ -41,28 +41,28 @@ def test_a_slow_stream_is_measured_frame_by_frame() -> None:
 
 
 def test_a_fast_stream_is_not_waited_for_and_comes_back_with_room_to_spare() -> None:
-    pace = LoadMonitor()
-    assert not run(pace, 50, 0.005, 0.01)[-1]
+    load = LoadMonitor()
+    assert not run(load, 50, 0.005, 0.01)[-1]
     # Just enough time would make it go to and fro.
-    assert not run(pace, 200, 0.020, 0.01)[-1]
-    assert run(pace, 200, 0.030, 0.01)[-1]
-    assert run(pace, 200, 0.020, 0.01)[-1]
+    assert not run(load, 200, 0.020, 0.01)[-1]
+    assert run(load, 200, 0.030, 0.01)[-1]
+    assert run(load, 200, 0.020, 0.01)[-1]
 
 
 def test_one_hiccup_changes_nothing() -> None:
-    pace = LoadMonitor()
-    run(pace, 50, 0.1, 0.02)
-    pace.measured(0.3)
-    assert pace.keeps_up
+    load = LoadMonitor()
+    run(load, 50, 0.1, 0.02)
+    load.add_cost(0.3)
+    assert load.keeps_up
     assert math.isnan(LoadMonitor().cost_s)
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
 def test_times_that_cannot_be_are_refused(value: float) -> None:
     with pytest.raises(InvalidValueError):
-        LoadMonitor().frame(value)
+        LoadMonitor().add_interval(value)
     with pytest.raises(InvalidValueError):
-        LoadMonitor().measured(value)
+        LoadMonitor().add_cost(value)
 
 
 @pytest.mark.parametrize(("stamp", "start_ms"), [("start", 0), ("centre", -500), ("end", -1000)])
