@@ -77,12 +77,14 @@ class KnownDrift:
     """In the place of the tracker, whose time is measured by itself."""
 
     def __init__(self, tracker: Any, update: Any, camera: Any) -> None:
+        from semcal_ros.core.drift.estimates import DriftEstimate
         from semcal_ros.nodes.frames.live_drift import FrameDrift
 
         covariance = np.eye(4) * 1e-18
         self._tracker = tracker
         self._made = cycle(
-            FrameDrift(d.position, d.velocity, covariance, d, update, True) for d in drifts(camera)
+            FrameDrift(DriftEstimate(0.0, d.position, d.velocity, np.zeros(2), covariance), update)
+            for d in drifts(camera)
         )
 
     def estimate(self, _frame: Any, _camera: Any) -> Any:

@@ -119,6 +119,23 @@ def test_after_a_restart_the_old_magnification_is_not_believed_until_a_new_one_c
     assert bench.frames[-1].magnification == 2000.0
 
 
+def test_a_microscope_that_says_nothing_after_its_restart_is_believed_again_after_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench()
+    bench.magnification(1000.0, sent_ns=1)
+    bench.receive(1.0)
+    bench.images.restarts += 1
+    bench.receive(1.1)
+    now_s = time.monotonic()
+    # The latched value is offered once more after 3 s.
+    monkeypatch.setattr("semcal_ros.nodes.frames.magnification.time.monotonic", lambda: now_s + 3.5)
+    bench.receive(1.2)
+    monkeypatch.setattr("semcal_ros.nodes.frames.magnification.time.monotonic", lambda: now_s + 4.5)
+    bench.receive(1.3)
+    assert [frame.magnification for frame in bench.frames] == [1000.0, None, None, 1000.0]
+
+
 def test_one_turn_of_the_executor_is_bounded() -> None:
     bench = Bench()
     bench.receive(*(1.0 + 0.1 * number for number in range(20)))

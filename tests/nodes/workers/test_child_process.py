@@ -35,6 +35,10 @@ def answer(channel: Channel) -> None:
             channel.send("done")
         elif request == "leave":
             return
+        elif request == "work":
+            # As a calibration does, it does not listen meanwhile.
+            channel.send("at work")
+            time.sleep(10 * TIMEOUT_S)
         elif request == "fail":
             os._exit(7)
         elif request == "several":
@@ -144,8 +148,9 @@ PARENT = """
     process = ChildProcess(answer, 0)
     process.send("describe")
     print(process.receive()[0], flush=True)
-    process.send("print")
+    process.send("work")
     process.receive()
+    print("at work", flush=True)
     sys.stdin.read()
 """
 
@@ -163,6 +168,7 @@ def test_it_ends_with_the_process_that_started_it(how: signal.Signals | None) ->
     )
     assert parent.stdout is not None
     worker = int(parent.stdout.readline())
+    assert parent.stdout.readline() == "at work\n"
     assert _is_alive(worker)
     if how is not None:
         parent.send_signal(how)
