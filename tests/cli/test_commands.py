@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -229,3 +231,29 @@ def test_the_module_is_the_command(folder):
     )
     assert "nm per px" in done.stdout
     assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
+    """One after the other, on the recordings of this module."""
+    page = Path(__file__).resolve().parents[2] / "doc" / "python.md"
+    snippets = re.findall(
+        r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
+    assert len(snippets) == 7
+    for name in ("grid", "gold"):
+        (tmp_path / name).symlink_to(folder / name)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "\n".join(snippets)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(page.parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=170,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Calibration(joint, 300x to 3000x, 512 x 512 px, 9 views, RMS " in done.stdout
+    assert {"calibration.png", "drift.csv", "gold_rect", "gold.tif"} <= {
+        path.name for path in tmp_path.iterdir()
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -11,11 +11,13 @@ import tifffile
 
 import semcal_ros
 from semcal_ros import measure_cantilever, rectify, stack, track_drift
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.synthetic.specimens.cantilever import cantilever_plan
 from semcal_ros.workflows.evaluate import evaluate
+from semcal_ros.workflows.inputs import resolve_config
 from tests.helpers.node_scenes import make_calibration, texture
 
 G, SIZE, COUNT = 20000.0, 96, 5
@@ -92,6 +94,26 @@ def test_an_average_says_what_is_in_it(frames, tmp_path):
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "m.tif"), result.image.mean)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "s.tif"), result.image.standard_error)
     assert (tmp_path / "m.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_video_shows_what_the_average_leaves_out(frames, tmp_path):
+    blank = (np.full((SIZE, SIZE), 9, np.uint8), G, 2.5)
+    mixed = [*frames[:3], blank, *frames[3:]]
+    without = stack(mixed, config="virtual_sem")
+    result = stack(mixed, config="virtual_sem", video=tmp_path / "v.avi")
+    assert result.image.frames == COUNT
+    np.testing.assert_array_equal(result.image.mean, without.image.mean)
+    assert (tmp_path / "v.avi").stat().st_size > 1000
+
+
+def test_magnifications_refer_to_the_display_of_the_calibration():
+    wide = replace(load_config("generic"), display_width_m=0.24)
+    calibration = make_calibration()
+    assert resolve_config(wide, calibration).display_width_m == calibration.display_width_m
+    assert resolve_config(wide).display_width_m == 0.24
+    assert resolve_config(wide, frame_time_s=0.5).scan.frame_time_s == 0.5
+    with pytest.raises(InvalidValueError):
+        resolve_config(wide, frame_time_s=-1.0)
 
 
 def test_an_average_without_drift_is_the_mean(frames):
