@@ -83,9 +83,9 @@ def find_lattice(
     """Find the corners of a chess board seen in part or as a whole, at any rotation and tilt.
 
     Candidates are maxima of minus the determinant of the Hessian at several scales; a lattice is
-    grown from them with local prediction; every corner in view is then fitted by a model of two
-    crossing blurred edges (see :mod:`semcal_ros.core.corners.edge_model`), which gives position and
-    covariance, and must have the alternating sign of the contrast.
+    grown from them with local prediction and the alternating sign of the contrast; every corner in
+    view is then fitted by a model of two crossing blurred edges (see
+    :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance.
 
     Parameters
     ----------

@@ -148,6 +148,7 @@ class _Growth:
     def run(self, seed: int, axes: Array) -> tuple[Lattice, Indices]:
         centre = np.array([[self._half, self._half]])
         self._used = np.zeros(len(self._saddles.xy), dtype=bool)
+        self._sign = float(np.sign(axes[0] @ self._saddles.hessian[seed] @ axes[1]))
         self._place(centre, np.array([seed]), axes[None])
         frontier = centre
         while len(frontier):
@@ -203,13 +204,18 @@ class _Growth:
         return total / count[:, None], axes / count[:, None, None]
 
     def _look_up(self, cells: Indices, predicted: Array, axes: Array) -> Indices:
-        """Index of the saddle at each prediction; -1 where there is none."""
+        """Index of the saddle of the right sign at each prediction; -1 where there is none."""
         radius = SEARCH_RADIUS * np.linalg.norm(axes, axis=2).min(axis=1)
         k = min(2, len(self._saddles.xy))
         queried = self._tree.query(predicted, k=k)
         distance = np.asarray(queried[0]).reshape(-1, k)
         index = np.asarray(queried[1]).reshape(-1, k)
-        usable = (distance < radius[:, None]) & ~self._used[index]
+        # Every fitted corner must pass the same test; here it chooses between neighbouring saddles:
+        # without it, 4 of 105 reference frames grow another lattice.
+        parity = np.where((cells.sum(axis=1) % 2) == 0, self._sign, -self._sign)
+        hessian = self._saddles.hessian[index]
+        sign = np.sign(np.einsum("na,nkab,nb->nk", axes[:, 0], hessian, axes[:, 1]))
+        usable = (distance < radius[:, None]) & (sign == parity[:, None]) & ~self._used[index]
         choice = np.argmin(np.where(usable, distance, np.inf), axis=1)
         row = np.arange(len(cells))
         members = np.where(usable[row, choice], index[row, choice], -1)
