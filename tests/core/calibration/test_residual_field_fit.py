@@ -14,12 +14,8 @@ from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.laws import Exponential
 from semcal_ros.synthetic.microscope import Residual
+from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
-pytestmark = pytest.mark.slow
-
-CALIBRATED = [100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0]
-BETWEEN = [170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0]
-NOISE = 0.05
 MICROSCOPES = {
     "spiral": preset("spiral"),
     "scan_nonlinear": preset("scan_nonlinear"),
@@ -40,7 +36,7 @@ def _views(microscope, magnifications, noise_px=0.0, seed=0, views=4):
 
 def _calibrate(microscope, residual, magnifications=CALIBRATED, **changes):
     return calibrate_views(
-        _views(microscope, magnifications, NOISE, **changes),
+        _views(microscope, magnifications, NOISE_PX, **changes),
         image_size=microscope.image_size,
         display_width_m=microscope.display_width_m,
         options=CalibrationOptions(residual=residual),
@@ -54,18 +50,25 @@ def _model_error(result, microscope, magnifications=BETWEEN):
     return float(np.sqrt(np.mean(np.square(list(errors.values())))))
 
 
+def _calibrate_named(name, residual):
+    if name in ("spiral", "scan_nonlinear"):
+        return calibrated(name, CalibrationOptions(residual=residual))
+    return _calibrate(MICROSCOPES[name], residual)
+
+
 @pytest.fixture(scope="module", params=list(MICROSCOPES))
 def microscope(request):
-    return MICROSCOPES[request.param]
+    return request.param
 
 
 @pytest.fixture(scope="module")
 def with_field(microscope):
-    return _calibrate(microscope, "auto")
+    return _calibrate_named(microscope, "auto")
 
 
 def test_auto_finds_what_two_parameters_cannot_describe(microscope, with_field):
-    without = _calibrate(microscope, "off")
+    without = _calibrate_named(microscope, "off")
+    microscope = MICROSCOPES[microscope]
     assert without.model.residual is None
     about = with_field.model.statistics["fit"]["residual_field"]
     assert about["worthwhile"] and about["converged"]
@@ -76,7 +79,7 @@ def test_auto_finds_what_two_parameters_cannot_describe(microscope, with_field):
 
 
 def test_what_is_left_is_the_noise(with_field):
-    expected = NOISE * np.sqrt(2.0)
+    expected = NOISE_PX * np.sqrt(2.0)
     assert with_field.model.statistics["rms_px"] == pytest.approx(expected, rel=0.07)
     assert with_field.model.statistics["held_out_rms_px"] == pytest.approx(expected, rel=0.25)
     assert with_field.model.statistics["fit"]["variance_factor"] == pytest.approx(1.0, rel=0.12)
@@ -94,40 +97,48 @@ def test_the_field_leaves_the_rest_of_the_model_alone(with_field):
 @pytest.mark.parametrize("name", ["jsm820", "no_distortion", "strong_perspective"])
 def test_a_microscope_without_such_distortion_is_not_made_worse(name):
     ordinary = preset(name)
-    off, auto, on = (_calibrate(ordinary, mode) for mode in ("off", "auto", "on"))
+    auto, on = calibrated(name), calibrated(name, CalibrationOptions(residual="on"))
     assert auto.model.residual is None
     assert on.model.residual is not None
     # The promise of the project.
-    assert _model_error(on, ordinary) < _model_error(off, ordinary) + 0.005
+    assert _model_error(on, ordinary) < _model_error(auto, ordinary) + 0.005
 
 
-def test_held_out_agrees_with_a_new_calibration(with_field, microscope):
+def test_a_field_that_is_not_worthwhile_leaves_no_trace():
+    auto, off = calibrated("jsm820"), calibrated("jsm820", CalibrationOptions(residual="off"))
+    for name, function in off.model.functions.items():
+        np.testing.assert_array_equal(
+            auto.model.functions[name].coefficients, function.coefficients
+        )
+    np.testing.assert_array_equal(auto.model.covariance, off.model.covariance)
+
+
+def test_held_out_agrees_with_a_new_calibration():
     """One Gauss-Newton step leaves a magnification out as well as a calibration that never saw it."""
-    g = CALIBRATED[3]
-    fresh = _calibrate_without(microscope, g)
-    own = [v for v in with_field.views if v.magnification == g]
-    expected = fit_poses(own, fresh.model.at, height_sigma_m=4e-5).rms_px()
-    # Both have some thousandths of px of model error, on top of the noise.
-    assert with_field.held_out_rms_px[g] == pytest.approx(expected, rel=0.05)
-
-
-def _calibrate_without(microscope, g):
-    views = [v for v in _views(microscope, CALIBRATED, NOISE) if v.magnification != g]
-    return calibrate_views(
+    result, g = calibrated("scan_nonlinear"), CALIBRATED[3]
+    others = tuple(other for other in CALIBRATED if other != g)
+    views = [v for v in result.views if v.magnification != g]
+    microscope = MICROSCOPES["scan_nonlinear"]
+    fresh = calibrate_views(
         views,
         image_size=microscope.image_size,
         display_width_m=microscope.display_width_m,
         options=CalibrationOptions(residual="on"),
     )
+    assert fresh.model.magnifications == others
+    own = [v for v in result.views if v.magnification == g]
+    expected = fit_poses(own, fresh.model.at, height_sigma_m=4e-5).rms_px()
+    # Both have some thousandths of px of model error, on top of the noise.
+    assert result.held_out_rms_px[g] == pytest.approx(expected, rel=0.05)
 
 
 def test_one_magnification_is_enough():
     spiral = MICROSCOPES["spiral"]
-    result = _calibrate(spiral, "auto", [1000.0], views=8)
+    result = calibrated("spiral", magnifications=(1000.0,), views=8)
     assert result.model.residual is not None
     # 8 views of 0.05 px determine some fifty coefficients worse than 28 do.
     assert _model_error(result, spiral, [1000.0]) < 0.03
-    off = _calibrate(spiral, "off", [1000.0], views=8)
+    off = calibrated("spiral", CalibrationOptions(residual="off"), (1000.0,), 8)
     assert _model_error(off, spiral, [1000.0]) > 0.1
 
 
