@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semcal_ros.bridge.parameters import value_of
+from semcal_ros.bridge.continuous_parameters import value_of
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError

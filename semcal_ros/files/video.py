@@ -46,7 +46,7 @@ class VideoCodec:
 #: H.264 in 4:2:0 with the index in front is what browsers play. Measured with 60 frames of 512 x
 #: 512 px and noise of 3 (25) grey levels: constant quality 20 with the preset "veryfast" takes 660
 #: kB (6.1 MB) and 1.7 s (2.6 s) and comes back within 3.3 (5.4) levels RMS; the default preset takes
-#: 5 s (10 s) for the same. OpenCV's mp4v took 570 kB (4.1 MB) and 0.9 s (1.5 s), and came back 4
+#: 4 to 5 s (8 to 14 s) at qualities 23 to 18. OpenCV's mp4v took 570 kB (4.1 MB) and 0.9 s (1.5 s), and came back 4
 #: levels too dark and within 5.3 (12.9) levels RMS. Motion JPEG is for programs that edit frames: the
 #: quantiser 2 to 3 leaves 2.8 (4.1) levels RMS.
 VIDEO_CODECS: Mapping[str, VideoCodec] = MappingProxyType(

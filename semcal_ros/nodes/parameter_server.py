@@ -13,8 +13,8 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
 
 from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.bridge.parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.nodes.common.base import SemNode

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.bridge.parameters import value_of
+from semcal_ros.bridge.continuous_parameters import value_of
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera

@@ -20,7 +20,7 @@ with warnings.catch_warnings():
     from rclpy.node import Node
 
 
-from semcal_ros.bridge.parameters import PARAMETER_KINDS
+from semcal_ros.bridge.continuous_parameters import PARAMETER_KINDS
 from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from tests.helpers.node_scenes import make_calibration

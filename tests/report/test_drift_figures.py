@@ -26,7 +26,7 @@ REASONS = (
     "no shift stands out: featureless, or another place",
     "ambiguous: shifts (1.0, -2.0) and (-30.0, 4.0) px explain the picture equally well",
     "shift is 529 deviations from the prediction",
-    "pictures differ (likeness 0.31)",
+    "pictures differ (noise-corrected correlation 0.31)",
     "jump of (200, 3) px: a move of the stage with $\\frac{ in its text",
 )
 

@@ -369,7 +369,10 @@ def _check(
             MatchFailure.STAGES_DISAGREE, f"coarse and fine shift differ by {apart:.1f} px"
         )
     if correlation < limits.min_correlation:
-        return Rejection(MatchFailure.DISSIMILAR, f"pictures differ (likeness {correlation:.2f})")
+        return Rejection(
+            MatchFailure.DISSIMILAR,
+            f"pictures differ (noise-corrected correlation {correlation:.2f})",
+        )
     allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
     shear = np.abs(alignment.joint_px[2:])
     if np.all(shear <= max_shear_px):

@@ -18,9 +18,9 @@ from semcal_ros.report.calibration.cells import (
     concatenate_corners,
 )
 from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
-from semcal_ros.report.calibration.error_figures import normalise_residuals
 from semcal_ros.report.calibration.geometry import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.report.calibration.numbers import tabulate_views
+from semcal_ros.report.calibration.rms_figures import normalise_residuals
 from semcal_ros.report.html.text import format_magnification, remove_control_characters
 
 __all__ = ["collect_warnings", "estimate_pattern_px"]

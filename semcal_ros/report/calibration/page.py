@@ -21,13 +21,12 @@ from semcal_ros.report.calibration.coverage_figures import (
     plot_tilt_directions,
     plot_tilts,
 )
-from semcal_ros.report.calibration.error_figures import plot_residual_histogram, plot_rms
 from semcal_ros.report.calibration.examples import (
     choose_examples,
     overlay_corners,
     show_rejected,
 )
-from semcal_ros.report.calibration.field_figures import (
+from semcal_ros.report.calibration.field_error_figures import (
     plot_distortion,
     plot_mean_residuals,
     plot_residual_field,
@@ -47,6 +46,7 @@ from semcal_ros.report.calibration.paper import tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import plot_parameters
 from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes
 from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
+from semcal_ros.report.calibration.rms_figures import plot_residual_histogram, plot_rms
 from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters

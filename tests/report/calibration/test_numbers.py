@@ -16,8 +16,7 @@ from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.cells import compute_empty_share, compute_reached_shares
 from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
-from semcal_ros.report.calibration.error_figures import plot_rms
-from semcal_ros.report.calibration.field_figures import plot_residual_field
+from semcal_ros.report.calibration.field_error_figures import plot_residual_field
 from semcal_ros.report.calibration.findings import collect_warnings, estimate_pattern_px
 from semcal_ros.report.calibration.geometry import (
     compute_displacements,
@@ -36,6 +35,7 @@ from semcal_ros.report.calibration.numbers import (
 from semcal_ros.report.calibration.paper import compute_median_px, tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
 from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
+from semcal_ros.report.calibration.rms_figures import plot_rms
 from semcal_ros.report.html.text import (
     format_length,
     format_magnification,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.parameters import (
+from semcal_ros.bridge.continuous_parameters import (
     PARAMETER_KINDS,
     is_continuous_parameter,
     parse_parameter_name,
