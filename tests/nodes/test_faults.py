@@ -220,7 +220,7 @@ def test_a_publisher_that_only_offers_best_effort_is_heard(
     with running("rectifier", {"calibration": calibration_file}) as node:
         peer.wait_heard(NODE, "image_rect")
         peer.wait_for(lambda: "image_raw without reliability" in peer.state(NODE)["message"], "it")
-        assert "does not offer the wished reliability" in node.output
+        assert "does not offer the requested reliability" in node.output
         # Best effort loses messages while the two sides still find each other.
         deadline = time.monotonic() + TIMEOUT_S
         while not images and time.monotonic() < deadline:

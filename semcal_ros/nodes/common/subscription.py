@@ -74,9 +74,9 @@ class MessageCounter:
 
 
 class AdaptiveSubscription:
-    """Subscribes as wished, then again with less after the incompatible-QoS event, without which nothing would arrive.
+    """Subscribes as requested, then again with less after the incompatible-QoS event, without which nothing would arrive.
 
-    When the last publisher is gone, :meth:`check_publishers` returns to the wished quality.
+    When the last publisher is gone, :meth:`check_publishers` returns to the requested quality.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class AdaptiveSubscription:
     callback
         Called with each message and its information from the middleware.
     profile
-        The wished quality; overridable by parameters.
+        The requested quality; overridable by parameters.
     raw
         Whether the callback takes the serialized bytes.
     """
@@ -114,16 +114,16 @@ class AdaptiveSubscription:
         self._foreign_types: set[str] = set()
         self._guard = node.create_guard_condition(self._relax, callback_group=group)
         # The override parameters are written into the profile.
-        self._wished = self._profile = profile
+        self._requested = self._profile = profile
         self._subscription = self._subscribe(overridable())
 
     @property
     def downgraded(self) -> str:
         """The demands that were dropped, such as ``"reliability"``; empty while there are none."""
-        if self._profile is self._wished:
+        if self._profile is self._requested:
             return ""
         kinds = ("reliability", "durability")
-        return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._wished, k))
+        return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._requested, k))
 
     @property
     def lost(self) -> int:
@@ -202,14 +202,14 @@ class AdaptiveSubscription:
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe()
             self._node.get_logger().warning(
-                f"a publisher on {self.topic} does not offer {refused.name.lower()} as wished;"
+                f"a publisher on {self.topic} does not offer the requested {refused.name.lower()};"
                 f" subscribed again without ({self.downgraded})"
             )
 
     def check_publishers(self) -> None:
         """See who publishes; to be called now and then.
 
-        Warns of publishers of another type, which the middleware ignores silently, and returns to the wished
+        Warns of publishers of another type, which the middleware ignores silently, and returns to the requested
         quality once nobody publishes any more.
         """
         publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
@@ -220,9 +220,9 @@ class AdaptiveSubscription:
                 " configuration or the publisher"
             )
         self._foreign_types = foreign
-        if self._profile is not self._wished and not publishers:
+        if self._profile is not self._requested and not publishers:
             self._node.destroy_subscription(self._subscription)
-            self._profile = self._wished
+            self._profile = self._requested
             self._subscription = self._subscribe()
 
     @property
