@@ -76,17 +76,17 @@ def image_from_compressed(message: Any) -> tuple[NDArray[Any], str]:
         understood or says something else than the data.
     """
     require_fields(message, ("format", "data"), "sensor_msgs/msg/CompressedImage")
-    data = _bytes_of(message.data)
+    data = _read_bytes(message.data)
     picture = read_picture_header(data.data)
-    encoding, swapped = _agreed(str(message.format), picture)
-    image = _decoded(data, picture)
+    encoding, swapped = _agree_on_encoding(str(message.format), picture)
+    image = _decode(data, picture)
     if swapped:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     image.flags.writeable = False
     return image, encoding
 
 
-def _bytes_of(data: Any) -> NDArray[np.uint8]:
+def _read_bytes(data: Any) -> NDArray[np.uint8]:
     if len(data) == 0:
         raise MessageError(
             "a compressed image without data", expected="PNG or JPEG", do="check the publisher"
@@ -99,9 +99,9 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
         ) from error
 
 
-def _agreed(text: str, picture: PictureHeader) -> tuple[str, bool]:
+def _agree_on_encoding(text: str, picture: PictureHeader) -> tuple[str, bool]:
     """Encoding of the image, and whether the order of the decoded channels must be reversed for it."""
-    original, codec, target = _parsed(text)
+    original, codec, target = _parse_format(text)
     if codec and codec != picture.codec:
         raise _contradiction(text, picture)
     if not original:
@@ -117,7 +117,7 @@ def _agreed(text: str, picture: PictureHeader) -> tuple[str, bool]:
     return original, False
 
 
-def _parsed(text: str) -> tuple[str, str, str]:
+def _parse_format(text: str) -> tuple[str, str, str]:
     """Original encoding, codec and target of a ``format``; empty where it does not say."""
     before, separator, after = text.partition(";")
     original = _SAME.get(before.strip(), before.strip()) if separator else ""
@@ -143,7 +143,7 @@ def _contradiction(text: str, picture: PictureHeader) -> MessageError:
     )
 
 
-def _decoded(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
+def _decode(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
     pixel = ENCODINGS[picture.encoding]
     channels = () if pixel.channels == 1 else (pixel.channels,)
     # As it is: no conversion of depth or colour, and no turning by an orientation in the metadata.
@@ -209,7 +209,7 @@ def fill_compressed(
         encoding; or a setting is out of range.
     """
     _check_carried(codec, encoding)
-    pixels = _ordered(image, encoding)
+    pixels = _to_opencv_layout(image, encoding)
     settings = _settings(codec, jpeg_quality, png_level)
     try:
         done, coded = cv2.imencode(f".{codec}", pixels, settings)
@@ -238,7 +238,7 @@ def _check_carried(codec: str, encoding: str) -> None:
         )
 
 
-def _ordered(image: NDArray[Any], encoding: str) -> NDArray[Any]:
+def _to_opencv_layout(image: NDArray[Any], encoding: str) -> NDArray[Any]:
     """The image as OpenCV writes it: contiguous, blue first."""
     pixel = ENCODINGS[encoding]
     shape_fits = image.ndim == 2 if pixel.channels == 1 else image.shape[2:] == (pixel.channels,)

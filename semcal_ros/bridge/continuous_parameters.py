@@ -15,10 +15,10 @@ __all__ = [
     "PARAMETER_KINDS",
     "CameraSource",
     "ParameterRequest",
+    "continuous_value",
     "is_continuous_parameter",
     "parse_parameter_name",
     "read_parameter",
-    "value_of",
 ]
 
 PARAMETER_KINDS = ("p", "k", "d", "e", "p_affine", "pixel_size", "sigma")
@@ -74,7 +74,7 @@ def parse_parameter_name(name: str) -> ParameterRequest:
     return ParameterRequest(kind, magnification)
 
 
-def value_of(kind: str, camera: ScanCamera) -> list[float]:
+def continuous_value(kind: str, camera: ScanCamera) -> list[float]:
     """Value of one kind at the magnification of ``camera``.
 
     Returns
@@ -139,4 +139,4 @@ def read_parameter(name: str, calibration: CameraSource) -> list[float]:
             f"parameter {name}",
             expected=f"a magnification within the calibrated range, {low:g} to {high:g}",
         )
-    return value_of(kind, calibration.at(magnification))
+    return continuous_value(kind, calibration.at(magnification))

@@ -117,7 +117,7 @@ def _check_size(header: PictureHeader, size: int) -> None:
         )
 
 
-def _damaged(codec: str, what: str) -> MessageError:
+def _damaged_error(codec: str, what: str) -> MessageError:
     return MessageError(
         f"a damaged {codec}: {what}",
         expected="a whole one",
@@ -132,7 +132,7 @@ def _read_png(data: memoryview) -> PictureHeader:
     chunks = _png_chunks(data)
     name, body = next(chunks)
     if name != b"IHDR" or len(body) != 13:
-        raise _damaged("png", "its header is missing")
+        raise _damaged_error("png", "its header is missing")
     width, height, depth, colour = struct.unpack_from(">IIBB", body)
     encoding = _PNG_ENCODINGS.get((colour, depth))
     if encoding is None:
@@ -149,19 +149,19 @@ def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     position = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PNG_CHUNKS):
         if position + 12 > len(data):
-            raise _damaged("png", "it is truncated")
+            raise _damaged_error("png", "it is truncated")
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 8 + length
         if end + 4 > len(data):
-            raise _damaged("png", "it is truncated")
+            raise _damaged_error("png", "it is truncated")
         if zlib.crc32(data[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise _damaged("png", "a checksum is wrong")
+            raise _damaged_error("png", "a checksum is wrong")
         name = bytes(data[position + 4 : position + 8])
         if name == b"IEND":
             return
         yield name, data[position + 8 : end]
         position = end + 4
-    raise _damaged("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
+    raise _damaged_error("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
 
 
 # -- JPEG ----------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def _read_jpeg(data: memoryview) -> PictureHeader:
             _check_jpeg_scans(data[end:])
             break
     if header is None:
-        raise _damaged("jpeg", "its header is missing")
+        raise _damaged_error("jpeg", "its header is missing")
     return header
 
 
@@ -185,10 +185,10 @@ def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
     position = 2
     while True:
         if position + 4 > len(data):
-            raise _damaged("jpeg", "it is truncated")
+            raise _damaged_error("jpeg", "it is truncated")
         marker = data[position + 1]
         if data[position] != 0xFF or marker in (0x00, _EOI):
-            raise _damaged("jpeg", "a marker is missing")
+            raise _damaged_error("jpeg", "a marker is missing")
         if marker == 0xFF:  # filling
             position += 1
             continue
@@ -198,14 +198,14 @@ def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
         (length,) = struct.unpack_from(">H", data, position + 2)
         end = position + 2 + length
         if length < 2 or end > len(data):
-            raise _damaged("jpeg", "it is truncated")
+            raise _damaged_error("jpeg", "it is truncated")
         yield marker, data[position + 4 : end], end
         position = end
 
 
 def _jpeg_frame(marker: int, body: memoryview) -> PictureHeader:
     if len(body) < 6:
-        raise _damaged("jpeg", "its header is too short")
+        raise _damaged_error("jpeg", "its header is too short")
     depth, height, width, components = struct.unpack_from(">BHHB", body)
     if marker not in _HUFFMAN_FRAMES or depth != 8:
         kind = "" if marker in _HUFFMAN_FRAMES else "lossless, hierarchical or arithmetic-coded "
@@ -222,6 +222,6 @@ def _check_jpeg_scans(coded: memoryview) -> None:
     # In coded data a byte 0xFF is followed by 0 or a restart number, so these two are never pixels.
     scans = bytes(coded)
     if scans.rfind(bytes((0xFF, _EOI))) < 0:
-        raise _damaged("jpeg", "it is truncated")
+        raise _damaged_error("jpeg", "it is truncated")
     if scans.count(bytes((0xFF, _SOS))) >= _MAX_SCANS:
-        raise _damaged("jpeg", f"it has more than {_MAX_SCANS} scans")
+        raise _damaged_error("jpeg", f"it has more than {_MAX_SCANS} scans")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from semcal_ros.bridge.continuous_parameters import value_of
+from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import CalibrationSeen, Session
 
-__all__ = ["calibration_seen", "check_calibration", "live_size"]
+__all__ = ["check_calibration", "describe_calibration", "live_size"]
 
 # A row of a thousand: what rounding leaves of the shape when a size is scaled.
 _ASPECT = 1e-3
@@ -23,7 +23,7 @@ def live_size(session: Session, config: MicroscopeConfig) -> tuple[int, int] | N
     return image.width, image.height - config.image.databar_rows
 
 
-def calibration_seen(
+def describe_calibration(
     source: str,
     calibration: Calibration,
     magnification: float | None,
@@ -35,7 +35,7 @@ def calibration_seen(
     if magnification is not None:
         try:
             camera = calibration.at(magnification).resized(*(size or calibration.image_size))
-            centre, *corners = value_of("sigma", camera)
+            centre, *corners = continuous_value("sigma", camera)
             sigma = centre, max(corners)
         except SemcalError as error:
             trouble = str(error)

@@ -9,8 +9,8 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.calibration_checks import (
-    calibration_seen,
     check_calibration,
+    describe_calibration,
     live_size,
 )
 from semcal_ros.doctor.environment import collect_environment
@@ -33,7 +33,7 @@ from semcal_ros.doctor.stream_checks import (
     check_output_rate,
     check_stamps,
     check_transport_time,
-    magnification_seen,
+    describe_magnifications,
 )
 
 __all__ = ["diagnose", "evaluate"]
@@ -69,7 +69,7 @@ def diagnose(
     needed = [*check_rclpy(around), *check_domain(around)]
     if "rclpy" not in around.import_errors and not any(map(_is_problem, needed)):
         try:
-            session = _observed(config, namespace, seconds)
+            session = _observe(config, namespace, seconds)
         except (SemcalError, RuntimeError) as error:
             found.append(problem("ROS 2", f"does not start here: {' '.join(str(error).split())}"))
     if session is None:
@@ -82,7 +82,7 @@ def _is_problem(finding: Finding) -> bool:
     return finding.level is Severity.PROBLEM
 
 
-def _observed(config: MicroscopeConfig, namespace: str, seconds: float) -> Session:
+def _observe(config: MicroscopeConfig, namespace: str, seconds: float) -> Session:
     # Imports ROS, which need not be there.
     from semcal_ros.doctor.live import observe
 
@@ -143,11 +143,11 @@ def _judge_calibrations(
     effective = config
     if used is not None:
         effective = replace(config, display_width_m=used[1].display_width_m)
-    magnification = magnification_seen(session, effective)
+    magnification = describe_magnifications(session, effective)
     g = None if magnification is None else magnification.value
     found += check_magnification(topic, magnification, session)
     size = live_size(session, config)
-    seen = None if used is None else calibration_seen(*used, g, size)
+    seen = None if used is None else describe_calibration(*used, g, size)
     found += check_calibration(seen, size, g, config)
     if given and live and given[1].dumps() != live[1].dumps():
         found.append(

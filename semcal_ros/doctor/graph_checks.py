@@ -16,7 +16,7 @@ __all__ = [
     "check_parameters",
     "check_simulated_time",
     "check_topic",
-    "resolved",
+    "resolve_topic",
     "suite_topics",
 ]
 
@@ -50,7 +50,7 @@ class Topic:
     keys: str = ""
 
 
-def resolved(topic: str, namespace: str) -> str:
+def resolve_topic(topic: str, namespace: str) -> str:
     """Full name of a topic."""
     return topic if topic.startswith("/") else f"{namespace}/{topic}"
 
@@ -68,10 +68,10 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
         ("calibration", "std_msgs/msg/String", "calibration", False),
     )
     return (
-        Topic(resolved(images.topic, namespace), images.type, "images", True, keys="image"),
-        Topic(resolved(g.topic, namespace), g.type, g.quantity, True, keys="magnification"),
+        Topic(resolve_topic(images.topic, namespace), images.type, "images", True, keys="image"),
+        Topic(resolve_topic(g.topic, namespace), g.type, g.quantity, True, keys="magnification"),
         *(
-            Topic(resolved(name, namespace), kind, what, single=one)
+            Topic(resolve_topic(name, namespace), kind, what, single=one)
             for name, kind, what, one in outputs
         ),
     )
@@ -117,7 +117,7 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
     senders = [p for p in publishers if p.type == topic.type]
     listeners = [s for s in subscriptions if s.type == topic.type]
     if not publishers:
-        return [*found, _unpublished(topic, graph)]
+        return [*found, _find_unpublished(topic, graph)]
     if topic.single and len(senders) > 1:
         found.append(
             problem(
@@ -156,7 +156,7 @@ def _types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Find
             )
 
 
-def _unpublished(topic: Topic, graph: Graph) -> Finding:
+def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
     last = topic.name.rpartition("/")[2]
     same = [
         name

@@ -123,7 +123,7 @@ class _Observer:
             seconds=seconds,
             graph=replace(graph, parameters=values),
             arrivals={name: tuple(heard) for name, heard in self._arrivals.items()},
-            image=self._image_seen(),
+            image=self._describe_image(),
             reading=reading,
             reading_trouble=trouble,
             calibration_text=self._calibration,
@@ -192,7 +192,7 @@ class _Observer:
                 level = int.from_bytes(status.level, "little")
                 self._statuses[name] = Status(name, level, status.message)
 
-    def _image_seen(self) -> ImageSeen | None:
+    def _describe_image(self) -> ImageSeen | None:
         message, trouble = self._image, ""
         # Only plain images tell their size without being decoded.
         if message is None or not hasattr(message, "encoding"):

@@ -23,7 +23,7 @@ __all__ = [
     "check_output_rate",
     "check_stamps",
     "check_transport_time",
-    "magnification_seen",
+    "describe_magnifications",
     "rate_hz",
 ]
 
@@ -94,7 +94,7 @@ class MagnificationSeen:
     trouble: str = ""
 
 
-def magnification_seen(session: Session, config: MicroscopeConfig) -> MagnificationSeen | None:
+def describe_magnifications(session: Session, config: MicroscopeConfig) -> MagnificationSeen | None:
     """The magnification by the display width of ``config``; None where no message came."""
     if session.reading is None:
         return MagnificationSeen(None, session.reading_trouble) if session.reading_trouble else None

@@ -11,7 +11,7 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["AllowedPaths"]
 
 
-def _resolved(path: str) -> Path:
+def _resolve(path: str) -> Path:
     try:
         return Path(os.path.realpath(os.path.expanduser(path)))
     except ValueError as error:
@@ -35,10 +35,10 @@ class AllowedPaths:
     """
 
     def __init__(self, directory: str = "", trusted: Sequence[str] = ()) -> None:
-        self._trusted = tuple(_resolved(path) for path in trusted)
+        self._trusted = tuple(_resolve(path) for path in trusted)
         self._folders = tuple(path.parent for path in self._trusted)
         if directory:
-            folder = _resolved(directory)
+            folder = _resolve(directory)
             if not folder.is_dir():
                 raise InvalidValueError(
                     f"directory {directory}, which is not a folder", expected="an existing folder"
@@ -53,7 +53,7 @@ class AllowedPaths:
         InvalidValueError
             The file lies elsewhere.
         """
-        real = _resolved(path)
+        real = _resolve(path)
         if real in self._trusted or any(real.is_relative_to(folder) for folder in self._folders):
             return real
         if not self._folders:

@@ -344,7 +344,7 @@ def open_recording(
     path = Path(path)
     used = load_config("generic") if config is None else config
     with reading(path):
-        kind = _kind_of(path, magnification)
+        kind = _frame_kind(path, magnification)
     if kind == "plain" and magnification is not None:
         return _PlainRecording(path, used, checked_magnification(magnification))
     if kind == "tiff":
@@ -357,7 +357,7 @@ def open_recording(
     return _BagRecording(path, used)
 
 
-def _kind_of(path: Path, magnification: float | None) -> str:
+def _frame_kind(path: Path, magnification: float | None) -> str:
     """``tiff``, ``plain`` or ``bag``; the reader of bags then says what is wrong with anything else."""
     kind = "bag"
     if path.exists() and not is_bag(path):

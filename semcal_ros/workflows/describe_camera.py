@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.bridge.continuous_parameters import value_of
+from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -48,5 +48,5 @@ def describe_camera(calibration: Calibration, magnification: float) -> dict[str,
         "distortion_centre_px": [camera.ex, camera.ey],
         "parameters": dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True)),
         "parameter_sigma": parameter_sigma(camera),
-        "projection_sigma_px": value_of("sigma", camera),
+        "projection_sigma_px": continuous_value("sigma", camera),
     }

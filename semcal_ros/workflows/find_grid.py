@@ -144,7 +144,7 @@ def collect_views(
         for v in found
         if v.detection.image_size != image_size
     ]
-    views, assignment = _assigned(same, display_width_m, squares_m)
+    views, assignment = _assign_squares(same, display_width_m, squares_m)
     # At a single magnification only heights differ, and those of a photographed board may differ by much.
     judged = len({v.magnification for v in same}) > 1
     misfits = assignment.misfits & judged
@@ -162,11 +162,11 @@ def collect_views(
         )
     if odd:
         same = [v for v, misfit in zip(same, misfits, strict=True) if not misfit]
-        views, assignment = _assigned(same, display_width_m, squares_m)
+        views, assignment = _assign_squares(same, display_width_m, squares_m)
     return CollectedViews(views, tuple(same), (*rejected, *other, *odd), assignment, image_size)
 
 
-def _assigned(
+def _assign_squares(
     found: Sequence[FoundView], display_width_m: float, squares_m: Sequence[float]
 ) -> tuple[tuple[GridView, ...], SquareAssignment]:
     return views_from_detections(

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from semcal_ros.bridge.continuous_parameters import (
     PARAMETER_KINDS,
+    continuous_value,
     is_continuous_parameter,
     parse_parameter_name,
     read_parameter,
-    value_of,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -75,35 +75,39 @@ def test_ordinary_parameters_are_left_alone() -> None:
 
 
 def test_values(camera: ScanCamera) -> None:
-    assert value_of("p", camera) == camera.P.reshape(-1).tolist()
-    assert value_of("k", camera) == camera.K.reshape(-1).tolist()
-    assert value_of("p_affine", camera)[8:] == [0.0, 0.0, 50.0, 1.0]
-    assert value_of("d", camera) == [0.002, 0.001]
-    assert value_of("e", camera) == [227.0, 267.0]
+    assert continuous_value("p", camera) == camera.P.reshape(-1).tolist()
+    assert continuous_value("k", camera) == camera.K.reshape(-1).tolist()
+    assert continuous_value("p_affine", camera)[8:] == [0.0, 0.0, 50.0, 1.0]
+    assert continuous_value("d", camera) == [0.002, 0.001]
+    assert continuous_value("e", camera) == [227.0, 267.0]
     # m = 2.1e7 px per m with aspect 1.01.
-    assert value_of("pixel_size", camera) == pytest.approx([1 / 2.121e7, 1.01 / 2.1e7], rel=1e-12)
-    assert all(isinstance(v, float) for kind in PARAMETER_KINDS for v in value_of(kind, camera))
+    assert continuous_value("pixel_size", camera) == pytest.approx(
+        [1 / 2.121e7, 1.01 / 2.1e7], rel=1e-12
+    )
+    assert all(
+        isinstance(v, float) for kind in PARAMETER_KINDS for v in continuous_value(kind, camera)
+    )
 
 
 def test_sigma_at_centre_and_corners(camera: ScanCamera) -> None:
     # Only px (3 px) and py (4 px) are uncertain; without distortion they shift all pixels by 5 px.
     plain = replace(camera, xi_r=0.0, xi_t=0.0)
-    np.testing.assert_allclose(value_of("sigma", plain), np.full(5, 5.0), rtol=1e-9)
-    assert len(set(np.round(value_of("sigma", camera), 6))) == 5
+    np.testing.assert_allclose(continuous_value("sigma", plain), np.full(5, 5.0), rtol=1e-9)
+    assert len(set(np.round(continuous_value("sigma", camera), 6))) == 5
 
 
 def test_what_a_camera_does_not_have(camera: ScanCamera) -> None:
     parallel = replace(camera, rho=0.0)
     for kind in ("p", "k"):
         with pytest.raises(InvalidValueError, match="P_affine"):
-            value_of(kind, parallel)
-    assert len(value_of("p_affine", parallel)) == 12
+            continuous_value(kind, parallel)
+    assert len(continuous_value("p_affine", parallel)) == 12
     with pytest.raises(InvalidValueError, match="covariance"):
-        value_of("sigma", replace(camera, covariance=None))
+        continuous_value("sigma", replace(camera, covariance=None))
     with pytest.raises(InvalidValueError, match="corner"):
-        value_of("sigma", replace(camera, xi_r=0.2))
+        continuous_value("sigma", replace(camera, xi_r=0.2))
     with pytest.raises(InvalidValueError, match="kind"):
-        value_of("z", camera)
+        continuous_value("z", camera)
 
 
 def test_read_by_name(camera: ScanCamera) -> None:

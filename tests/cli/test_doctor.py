@@ -17,7 +17,7 @@ from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.doctor import environment_checks as checks
-from semcal_ros.doctor.calibration_checks import calibration_seen, check_calibration
+from semcal_ros.doctor.calibration_checks import check_calibration, describe_calibration
 from semcal_ros.doctor.diagnosis import evaluate
 from semcal_ros.doctor.findings import Finding, Severity
 from semcal_ros.doctor.graph_checks import (
@@ -45,7 +45,7 @@ from semcal_ros.doctor.stream_checks import (
     check_output_rate,
     check_stamps,
     check_transport_time,
-    magnification_seen,
+    describe_magnifications,
 )
 from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
 from tests.helpers.node_scenes import make_calibration
@@ -444,7 +444,7 @@ def test_the_output_keeps_up(made: int, level: Severity) -> None:
 
 def test_magnification() -> None:
     def found(heard: Session, config: MicroscopeConfig = CONFIG) -> list[Finding]:
-        return check_magnification(MAGNIFICATION, magnification_seen(heard, config), heard)
+        return check_magnification(MAGNIFICATION, describe_magnifications(heard, config), heard)
 
     only(found(session()), OK, "1000")
     only(found(session(reading=None)), PROBLEM, "nothing came", "transient local")
@@ -474,13 +474,13 @@ def calibrated(
     size: tuple[int, int] | None = (96, 96),
     config: MicroscopeConfig = CONFIG,
 ) -> list[Finding]:
-    seen = calibration_seen("cal.yaml", CALIBRATION, g, size)
+    seen = describe_calibration("cal.yaml", CALIBRATION, g, size)
     return check_calibration(seen, size, g, config)
 
 
 def test_a_calibration_that_fits() -> None:
     only(calibrated(), OK, "500x to 8000x", "96 x 96", "1-sigma")
-    seen = calibration_seen("cal.yaml", CALIBRATION, 1000.0, (96, 96))
+    seen = describe_calibration("cal.yaml", CALIBRATION, 1000.0, (96, 96))
     assert seen.sigma_px is not None
     assert 0.0 < seen.sigma_px[0] < seen.sigma_px[1] < 1.0
 

@@ -258,7 +258,7 @@ def _step(
     state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Indices
 ) -> _State:
     pose, point, coupling, right_pose, right_point = blocks
-    inverse = _inverted(_damp(point, damping))
+    inverse = _invert(_damp(point, damping))
     reduced, moved = _form_schur_complement(_damp(pose, damping), inverse, coupling, free)
     right = right_pose.ravel()[free] - moved @ right_point.ravel()
     step = np.zeros(6 * len(pose))
@@ -281,7 +281,7 @@ def _damp(blocks: Array, damping: float) -> Array:
     return np.asarray(out, dtype=np.float64)
 
 
-def _inverted(blocks: Array) -> Array:
+def _invert(blocks: Array) -> Array:
     return np.asarray(np.linalg.inv(blocks), dtype=np.float64)
 
 
@@ -336,7 +336,7 @@ def _finish(
     converged: bool,
 ) -> Adjustment:
     pose, point, coupling, _, _ = problem.normal(state, sigma)
-    inverse = _inverted(_damp(point, 1e-12))
+    inverse = _invert(_damp(point, 1e-12))
     reduced, moved = _form_schur_complement(pose, inverse, coupling, free)
     poses = invert_scaled(reduced, rcond=1e-14)
     # About the middle of the points: where the whole lies along the beam is not determined.

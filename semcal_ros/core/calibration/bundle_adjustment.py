@@ -16,12 +16,12 @@ from semcal_ros.core.calibration.normal_equations import (
     Problem,
     State,
     normal_equations,
-    part_of,
     prior_cost,
     reduced_normal_equations,
     residuals,
     retract,
     schur_complement,
+    select_views,
     view_costs,
 )
 
@@ -178,7 +178,7 @@ def _refine_following_poses(
     short = trial_costs > costs - _POOR_GAIN * step.predicted + _NEGLIGIBLE
     if not np.any(short):
         return trial, trial_costs
-    part = part_of(problem, short)
+    part = select_views(problem, short)
     start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
     own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
     rotations, translations = trial.rotations.copy(), trial.translations_m.copy()

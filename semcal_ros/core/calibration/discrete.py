@@ -24,7 +24,7 @@ from semcal_ros.core.calibration.problem import (
     build_problem,
     constant_functions,
     resolve_mirrored_tilts,
-    theta_of,
+    stack_coefficients,
     variance_factor,
 )
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
@@ -83,7 +83,7 @@ def _fit_one(setup: Setup, tau_px: float | None) -> tuple[DistortionCentre, Prob
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     functions = constant_functions(setup, {"scale": start.scale_factor})
     problem = build_problem(setup, functions, setup.views, setup.priors.height_sigma_m)
-    state = State(theta_of(functions), start.rotations, start.translations_m)
+    state = State(stack_coefficients(functions), start.rotations, start.translations_m)
     # Aspect and skew are freed only with the distortion, which they would otherwise imitate.
     held = _hold(problem, {"xi_r": 0.0, "xi_t": 0.0, "aspect": 1.0, "skew": 0.0})
     pinhole = adjust(held, resolve_mirrored_tilts(held, state)[0])

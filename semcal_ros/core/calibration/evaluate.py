@@ -15,7 +15,7 @@ from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
-from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
+from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
@@ -104,17 +104,17 @@ def fit_poses(
             do="check the magnification and the display width",
         )
     g_of_view = magnifications[problem.group]
-    best = _best_of(usable, problem.starts, g_of_view)
-    excess = excess_sigma_px(views, np.concatenate(best.residuals_px), 6 * len(views))
+    best = _select_best(usable, problem.starts, g_of_view)
+    excess = estimate_excess_sigma_px(views, np.concatenate(best.residuals_px), 6 * len(views))
     if excess == 0.0:
         return best
-    whitening = np.concatenate([v.whitening for v in with_excess(views, excess)])
+    whitening = np.concatenate([v.whitening for v in add_excess_noise(views, excess)])
     state = State(np.ones(1), best.rotations, best.translations_m)
     again = refine(replace(problem, whitening=whitening), state, fixed_theta=True)
-    return _best_of([again], problem.starts, g_of_view)
+    return _select_best([again], problem.starts, g_of_view)
 
 
-def _best_of(fits: Sequence[BundleResult], starts: Indices, magnifications: Array) -> ViewPose:
+def _select_best(fits: Sequence[BundleResult], starts: Indices, magnifications: Array) -> ViewPose:
     costs = np.stack(
         [
             np.add.reduceat(

@@ -27,7 +27,7 @@ from semcal_ros.core.calibration.problem import (
     build_problem,
     constant_functions,
     resolve_mirrored_tilts,
-    theta_of,
+    stack_coefficients,
     variance_factor,
     with_coefficients,
 )
@@ -36,11 +36,11 @@ from semcal_ros.core.calibration.residual_field_fit import (
     FieldSystem,
     blank_field,
     choose_field,
-    corrected,
     field_system,
     solve_field,
+    undo_field,
 )
-from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
+from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 
@@ -205,13 +205,13 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
     functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
     height = np.full(len(setup.views), setup.priors.height_sigma_m)
     problem = build_problem(setup, functions, setup.views, height)
-    state = State(theta_of(functions), start.rotations, start.translations_m)
+    state = State(stack_coefficients(functions), start.rotations, start.translations_m)
     state, _ = resolve_mirrored_tilts(problem, state)
 
     size = min(3, max(1, len(setup.magnifications) - 1))
     functions = refit_functions(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, height)
-    result = adjust(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    result = adjust(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
     for _ in range(_HEIGHT_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
         height = _update_height_sigma(setup, result)
@@ -242,9 +242,9 @@ def _pad_covariance(
     prior says. Nor is zero what the data say: by how much all coefficients would move if those were let free, the
     estimate may be wrong on top of that.
     """
-    views = setup.views if field is None else corrected(setup, field.field).views
+    views = setup.views if field is None else undo_field(setup, field.field).views
     problem = build_problem(setup, padded, views, adjustment.problem.height_sigma_m)
-    state = replace(adjustment.result.state, theta=theta_of(padded))
+    state = replace(adjustment.result.state, theta=stack_coefficients(padded))
     result = refine(problem, state, max_iterations=0)
     factor = variance_factor(adjustment.problem, adjustment.result)
     if field is None:
@@ -271,7 +271,7 @@ def _select_and_adjust(
 ) -> Adjustment:
     """Choose the number of coefficients of every function until the choice no longer changes."""
     problem = build_problem(setup, functions, setup.views, height_sigma_m)
-    result = refine(problem, replace(state, theta=theta_of(functions)), tolerance=_COARSE)
+    result = refine(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
     settled, rounds = len(setup.magnifications) < 3, 0
     while rounds < _MAX_ROUNDS and not settled:
         rounds += 1
@@ -283,7 +283,7 @@ def _select_and_adjust(
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
         problem = build_problem(setup, functions, setup.views, _update_height_sigma(setup, result))
         result = refine(
-            problem, replace(result.state, theta=theta_of(functions)), tolerance=_COARSE
+            problem, replace(result.state, theta=stack_coefficients(functions)), tolerance=_COARSE
         )
     functions = with_coefficients(functions, result.state.theta)
     return Adjustment(functions, problem, result, rounds, settled)
@@ -319,7 +319,7 @@ def _add_field(
             if not (choice.worthwhile or always):
                 return start, None
         theta, field = solve_field(system, choice.prior, blank)
-        after = corrected(setup, field)
+        after = undo_field(setup, field)
         adjustment = _readjust(after, adjustment, theta, choosing=turn < _CHOOSING_TURNS)
         pairs = zip(before.views, after.views, strict=True)
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
@@ -370,10 +370,12 @@ def fit_joint(
     if residual != "off":
         on_stage("residual field", 0.5)
         adjustment, field = _add_field(setup, adjustment, residual == "on")
-    excess = excess_sigma_px(setup.views, adjustment.result.residuals_px, 6 * len(setup.views))
+    excess = estimate_excess_sigma_px(
+        setup.views, adjustment.result.residuals_px, 6 * len(setup.views)
+    )
     if excess > 0.0:
-        setup = replace(setup, views=with_excess(setup.views, excess))
-    final = setup if field is None else corrected(setup, field.field)
+        setup = replace(setup, views=add_excess_noise(setup.views, excess))
+    final = setup if field is None else undo_field(setup, field.field)
     if excess > 0.0:
         height = _update_height_sigma(setup, adjustment.result)
         adjustment = _select_and_adjust(
@@ -403,6 +405,6 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
     information, gradient = result.information.copy(), result.gradient.copy()
     information[index] = 0.0
     gradient[index] = 0.0
-    theta = theta_of(functions)
+    theta = stack_coefficients(functions)
     matrix, right = reduced_normal_equations(fit.adjustment.problem, theta, information, gradient)
     return with_coefficients(functions, theta + solve_scaled(matrix, right)), None

@@ -27,12 +27,12 @@ __all__ = [
     "WhitenedRows",
     "make_problem",
     "normal_equations",
-    "part_of",
     "prior_cost",
     "reduced_normal_equations",
     "residuals",
     "retract",
     "schur_complement",
+    "select_views",
     "view_costs",
     "whiten",
     "whitened_norm",
@@ -291,7 +291,7 @@ def retract(problem: Problem, state: State, change: Array, pose: Array) -> State
     )
 
 
-def part_of(problem: Problem, chosen: Mask) -> Problem:
+def select_views(problem: Problem, chosen: Mask) -> Problem:
     """The problem with only some of its views."""
     points = chosen[problem.view_of_point]
     counts = np.diff(problem.starts)[chosen]

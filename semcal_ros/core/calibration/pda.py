@@ -40,7 +40,7 @@ def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Ar
     return -np.linalg.lstsq(a / scale, b, rcond=1e-10)[0] / scale
 
 
-def _fitted(
+def _fit_curve(
     name: str,
     kind: str,
     size: int,
@@ -112,9 +112,11 @@ def pda_functions(
         sigma = np.maximum(np.sqrt(discrete.covariances[:, i, i]), 1e-8 * (1.0 + np.abs(values)))
         if legendre_degree is None:
             weights = ode_weights(position, values, 1.0 / sigma, order)
-            fitted = _fitted(name, "ode", order, weights, g, values, sigma)
+            fitted = _fit_curve(name, "ode", order, weights, g, values, sigma)
         else:
-            fitted = _fitted(name, "legendre", legendre_degree + 1, np.empty(0), g, values, sigma)
+            fitted = _fit_curve(
+                name, "legendre", legendre_degree + 1, np.empty(0), g, values, sigma
+            )
         functions[name], block = fitted
         blocks.append(block)
     size = sum(len(b) for b in blocks)

@@ -23,7 +23,7 @@ __all__ = [
     "constant_functions",
     "prior_vectors",
     "resolve_mirrored_tilts",
-    "theta_of",
+    "stack_coefficients",
     "variance_factor",
     "with_coefficients",
 ]
@@ -94,7 +94,7 @@ def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, C
     }
 
 
-def theta_of(functions: Functions) -> Array:
+def stack_coefficients(functions: Functions) -> Array:
     """(K,) all coefficients in the order of ``FUNCTION_NAMES``."""
     return np.concatenate([functions[name].coefficients for name in FUNCTION_NAMES])
 

@@ -30,9 +30,9 @@ __all__ = [
     "FieldSystem",
     "blank_field",
     "choose_field",
-    "corrected",
     "field_system",
     "solve_field",
+    "undo_field",
 ]
 
 
@@ -160,7 +160,7 @@ def blank_field(setup: Setup) -> ResidualField:
     return zero_field(setup.image_size, (float(g[0]), float(g[-1])), count)
 
 
-def corrected(setup: Setup, field: ResidualField) -> Setup:
+def undo_field(setup: Setup, field: ResidualField) -> Setup:
     """The views as the parametric distortion alone would have made them."""
     slices = {float(g): field.at(float(g)) for g in setup.magnifications}
     views = []

@@ -21,10 +21,10 @@ __all__ = [
     "RejectedView",
     "SquareAssignment",
     "ViewStatus",
+    "add_excess_noise",
     "assign_squares",
-    "excess_sigma_px",
+    "estimate_excess_sigma_px",
     "views_from_detections",
-    "with_excess",
 ]
 
 # Relative error of the size of a square that tilt, height, noise and the microscope's own scale do not explain.
@@ -90,7 +90,7 @@ class GridView:
         last = 1.0 / np.sqrt(yy - xy * xy / xx)
         return np.stack([first, -last * xy / xx, last], axis=1)
 
-    def with_excess(self, sigma_px: float) -> GridView:
+    def add_excess_noise(self, sigma_px: float) -> GridView:
         """The view with corners that are more uncertain by ``sigma_px`` per axis."""
         spread = self.covariance_px2
         if spread is not None:
@@ -314,7 +314,9 @@ _MEDIAN_SQUARE = 2.0 * float(np.log(2.0))
 _GOOD_ENOUGH = 1.5
 
 
-def excess_sigma_px(views: Sequence[GridView], residuals_px: Array, unknowns: int) -> float:
+def estimate_excess_sigma_px(
+    views: Sequence[GridView], residuals_px: Array, unknowns: int
+) -> float:
     """1-sigma per axis, px, that all corners scatter beyond their own; 0 where that is not worth a correction.
 
     Parameters
@@ -339,6 +341,6 @@ def excess_sigma_px(views: Sequence[GridView], residuals_px: Array, unknowns: in
     return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / target + 1e-12)))
 
 
-def with_excess(views: Sequence[GridView], sigma_px: float) -> tuple[GridView, ...]:
+def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridView, ...]:
     """The views, their corners more uncertain by ``sigma_px`` per axis."""
-    return tuple(view.with_excess(sigma_px) for view in views)
+    return tuple(view.add_excess_noise(sigma_px) for view in views)

@@ -15,12 +15,12 @@ from semcal_ros.core.corners.window import PixelWindows
 __all__ = [
     "CORNERS_MIN",
     "MARGIN_PX",
-    "Fitted",
-    "credible",
-    "inflation",
-    "one_board",
-    "parity_of",
-    "undisturbed",
+    "FittedCorners",
+    "contrast_signs",
+    "find_credible",
+    "find_undisturbed",
+    "inflate_variance",
+    "select_connected",
 ]
 
 
@@ -33,7 +33,7 @@ LEVERAGE_MAX = 25.0
 PART_MIN = 4
 
 
-def one_board(fitted: Fitted, keep: Mask) -> Mask:
+def select_connected(fitted: FittedCorners, keep: Mask) -> Mask:
     """The largest part of the lattice, and the others that continue it; (n,) true for these.
 
     Where two boards meet, growing a lattice goes on from one to the other, but no corner in between
@@ -62,7 +62,7 @@ def one_board(fitted: Fitted, keep: Mask) -> Mask:
         waiting = [p for p in waiting if p not in continuing]
 
 
-def _continues(fitted: Fitted, joined: Mask, other: Mask) -> bool:
+def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
     """Whether the corners around a part are where the joined ones predict them."""
     cells, xy = fitted.cells, fitted.fit.xy
     maps = fit_local_maps(cells[other], cells[joined], xy[joined])
@@ -101,7 +101,7 @@ CORNERS_MIN = 6
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedCorners:
     """Cells with their local maps, pixels, fits, and which of them are credible."""
 
     cells: Indices
@@ -110,9 +110,9 @@ class Fitted:
     fit: CornerFit
     good: Mask
 
-    def select(self, keep: Mask) -> Fitted:
+    def select(self, keep: Mask) -> FittedCorners:
         """Those where ``keep`` is true."""
-        return Fitted(
+        return FittedCorners(
             self.cells[keep],
             self.maps.select(keep),
             self.windows.select(keep),
@@ -121,9 +121,9 @@ class Fitted:
         )
 
     @staticmethod
-    def join(first: Fitted, second: Fitted) -> Fitted:
+    def join(first: FittedCorners, second: FittedCorners) -> FittedCorners:
         """Both sets."""
-        return Fitted(
+        return FittedCorners(
             np.concatenate([first.cells, second.cells]),
             LocalMaps.join([first.maps, second.maps]),
             PixelWindows.join([first.windows, second.windows]),
@@ -132,14 +132,14 @@ class Fitted:
         )
 
 
-def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) -> Mask:
+def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) -> Mask:
     """Fits that settled near the prediction, with the right sign of contrast."""
     norm = np.linalg.norm(maps.axes, axis=2)
     spacing = np.abs(maps.cell_px2) / norm.max(axis=1)
     expected = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
     turn = np.abs(np.angle(np.exp(1j * (fit.angles - expected)))).max(axis=1)
     moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
-    signed = fit.contrast * parity_of(cells)
+    signed = fit.contrast * contrast_signs(cells)
     limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
     settled = (
         np.all((fit.xy >= MARGIN_PX) & (fit.xy <= limit), axis=1)
@@ -159,12 +159,12 @@ def credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) ->
     return judged & ((fit.chi2 < usual) | small)
 
 
-def parity_of(cells: Indices) -> Array:
+def contrast_signs(cells: Indices) -> Array:
     """(n,) 1 for cells of even i + j, -1 for the others: the sign of the contrast alternates."""
     return np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
-def undisturbed(fitted: Fitted) -> Mask:
+def find_undisturbed(fitted: FittedCorners) -> Mask:
     """Corners whose pixels the model explains: no debris, no border of the board.
 
     In a picture with little noise the model's own shortcomings are significant everywhere, so that
@@ -196,7 +196,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
     return ~uneven & (pull < BLUR_SIGMAS * typical)
 
 
-def inflation(fit: CornerFit, keep: Mask) -> Array:
+def inflate_variance(fit: CornerFit, keep: Mask) -> Array:
     """Factor on the covariances: the pooled misfit, or a corner's own if that is far larger."""
     pooled = float(np.median(fit.chi2[keep]))
     significant = pooled * (1.0 + 3.0 * np.sqrt(2.0 / fit.freedom))

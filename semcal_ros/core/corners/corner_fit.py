@@ -19,7 +19,7 @@ from semcal_ros.core.corners.edge_model import (
     evaluate,
 )
 from semcal_ros.core.corners.priors import Prior
-from semcal_ros.core.corners.symmetry_test import opposite_squares
+from semcal_ros.core.corners.symmetry_test import compare_opposite_squares
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
@@ -252,7 +252,7 @@ def _fit_block(
     chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
     level, variance = _statistics(windows, residual, model, freedom)
     balance = (
-        opposite_squares(windows, nonlinear, jacobian, residual, weight, normal, step)
+        compare_opposite_squares(windows, nonlinear, jacobian, residual, weight, normal, step)
         if judged
         else np.zeros((2, len(shortest)))
     )

@@ -149,7 +149,7 @@ def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, 
         lattice = grow_best_lattice(find_saddles(image, scale), size)
         if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
             continue
-        filled = _filled(lattice, size)
+        filled = _covered_share(lattice, size)
         if filled <= FILLED:
             candidates.append((filled, lattice))
             continue
@@ -172,7 +172,7 @@ def _better(
     return best
 
 
-def _filled(lattice: Lattice, size: tuple[int, int]) -> float:
+def _covered_share(lattice: Lattice, size: tuple[int, int]) -> float:
     """Part of the image that the cells of a lattice cover."""
     area = float(np.abs(np.linalg.det(lattice.axes)).sum())
     return area / (size[0] * size[1])

@@ -10,12 +10,12 @@ from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.checks import (
     CORNERS_MIN,
     MARGIN_PX,
-    Fitted,
-    credible,
-    inflation,
-    one_board,
-    parity_of,
-    undisturbed,
+    FittedCorners,
+    contrast_signs,
+    find_credible,
+    find_undisturbed,
+    inflate_variance,
+    select_connected,
 )
 from semcal_ros.core.corners.corner_fit import (
     ASSUMED_VARIANCE,
@@ -28,7 +28,7 @@ from semcal_ros.core.corners.corner_fit import (
 from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import smooth
+from semcal_ros.core.corners.neighbour_consistency import find_consistent
 from semcal_ros.core.corners.priors import (
     Learnt,
     learn,
@@ -107,7 +107,7 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
     lattice
         Grown from saddle points.
     """
-    grown = _plausible(_shuffled(lattice))
+    grown = _plausible(_shuffle(lattice))
     if len(grown.ij) < CORNERS_MIN:
         return None
     maps = fit_local_maps(grown.ij, grown.ij, grown.xy, leave_out_self=False)
@@ -134,19 +134,19 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
     last = _last_fit(image, known, knowledge)
     if last is None:
         return None
-    keep = last.good & undisturbed(last)
-    keep &= smooth(replace(last, good=keep))
+    keep = last.good & find_undisturbed(last)
+    keep &= find_consistent(replace(last, good=keep))
     if keep.sum() < CORNERS_MIN:
         return None
-    agreeing, keep = int(keep.sum()), one_board(last, keep)
+    agreeing, keep = int(keep.sum()), select_connected(last, keep)
     passed = last.cells[keep]
     doubtful = np.concatenate([second.cells[~second.good], last.cells[~keep]])
     expected = np.concatenate([second.maps.xy[~second.good], last.maps.xy[~keep]])
-    result = _result(last, keep, part, _failed(doubtful, expected, passed, image))
+    result = _result(last, keep, part, _find_failed(doubtful, expected, passed, image))
     return replace(result, foreign=agreeing - len(passed))
 
 
-def _quality(fitted: Fitted, image: Array32) -> float:
+def _quality(fitted: FittedCorners, image: Array32) -> float:
     """Part of the corners that passed, of those expected well inside of the image."""
     size = np.array([image.shape[1], image.shape[0]])
     slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
@@ -154,7 +154,7 @@ def _quality(fitted: Fitted, image: Array32) -> float:
     return float(fitted.good[expected].mean()) if np.any(expected) else 0.0
 
 
-def _better_maps(grown: Lattice, first: Fitted) -> LocalMaps:
+def _better_maps(grown: Lattice, first: FittedCorners) -> LocalMaps:
     """Local maps with what was fitted in place of the saddle points."""
     count = len(first.cells)
     xy = np.concatenate([first.fit.xy, grown.xy[count:]])
@@ -162,13 +162,13 @@ def _better_maps(grown: Lattice, first: Fitted) -> LocalMaps:
     return fit_local_maps(grown.ij, grown.ij[known], xy[known], leave_out_self=False)
 
 
-def _shuffled(lattice: Lattice) -> Lattice:
+def _shuffle(lattice: Lattice) -> Lattice:
     """The lattice in random but fixed order, so that its first corners are a fair sample."""
     order = np.random.default_rng(0).permutation(len(lattice.ij))
     return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
 
 
-def _failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array:
+def _find_failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array:
     """(k, 2) positions in the image of the cells, each once, that are not among those passed."""
     keys, first = np.unique(_keys(cells), return_index=True)
     size = np.array([image.shape[1], image.shape[0]])
@@ -176,10 +176,12 @@ def _failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array
     return xy[first][inside & ~np.isin(keys, _keys(passed))]
 
 
-def _result(fitted: Fitted, keep: Mask, quality: float, rejected_xy: Array) -> RefinedCorners:
+def _result(
+    fitted: FittedCorners, keep: Mask, quality: float, rejected_xy: Array
+) -> RefinedCorners:
     fit = fitted.fit
     order = np.lexsort(fitted.cells[keep].T[::-1])
-    covariance = fit.covariance[keep] * inflation(fit, keep)[keep, None, None]
+    covariance = fit.covariance[keep] * inflate_variance(fit, keep)[keep, None, None]
     return RefinedCorners(
         fitted.cells[keep][order],
         fit.xy[keep][order],
@@ -199,16 +201,16 @@ def _plausible(lattice: Lattice) -> Lattice:
     return lattice.select(keep)
 
 
-def _first_fit(image: Array32, cells: Indices, maps: LocalMaps) -> Fitted:
+def _first_fit(image: Array32, cells: Indices, maps: LocalMaps) -> FittedCorners:
     """Fit with equal weights and loose priors."""
     windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
     prior = loose_prior(maps, geometry, FIRST_BLUR_PX)
     fit = fit_corners(windows, geometry, None, prior, noise=None, iterations=3)
-    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
+    return FittedCorners(cells, maps, windows, fit, find_credible(cells, maps, fit, image))
 
 
-def _learn(first: Fitted) -> _Knowledge:
+def _learn(first: FittedCorners) -> _Knowledge:
     good = first.select(first.good)
     geometry = EdgeGeometry.from_map(good.maps.axes, good.maps.bend)
     learnt = learn(
@@ -218,11 +220,11 @@ def _learn(first: Fitted) -> _Knowledge:
         ASSUMED_VARIANCE,
         float(np.median(good.fit.chi2)),
     )
-    sign = float(np.sign(np.median(good.fit.contrast * parity_of(good.cells))))
+    sign = float(np.sign(np.median(good.fit.contrast * contrast_signs(good.cells))))
     return _Knowledge(fit_noise(good.fit), learnt, sign)
 
 
-def _relearn(known: Fitted, knowledge: _Knowledge) -> _Knowledge:
+def _relearn(known: FittedCorners, knowledge: _Knowledge) -> _Knowledge:
     """What the second fits teach beyond the first, which knew neither blur nor noise."""
     few = known.select(np.arange(len(known.cells)) < SECOND_SAMPLE)
     geometry = EdgeGeometry.from_map(few.maps.axes, few.maps.bend)
@@ -234,18 +236,18 @@ def _relearn(known: Fitted, knowledge: _Knowledge) -> _Knowledge:
 
 def _fit(
     image: Array32, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
-) -> Fitted:
+) -> FittedCorners:
     """Fit all cells from their local maps and judge each fit on its own."""
     band = band_px(knowledge.blur_px)
     windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band)
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
     prior = knowledge.learnt.prior(maps, geometry)
-    start = rough_start(windows, prior, knowledge.sign * parity_of(cells))
+    start = rough_start(windows, prior, knowledge.sign * contrast_signs(cells))
     fit = fit_corners(windows, geometry, start, prior, noise=knowledge.noise, iterations=iterations)
-    return Fitted(cells, maps, windows, fit, credible(cells, maps, fit, image))
+    return FittedCorners(cells, maps, windows, fit, find_credible(cells, maps, fit, image))
 
 
-def _last_fit(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted | None:
+def _last_fit(image: Array32, known: FittedCorners, knowledge: _Knowledge) -> FittedCorners | None:
     """Fit once more, with maps and levels through the corners themselves."""
     maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
     known, maps = known.select(maps.usable), maps.select(maps.usable)
@@ -265,11 +267,11 @@ def _last_fit(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted | 
         iterations=1,
         judged=True,
     )
-    good = credible(known.cells, maps, fit, image)
-    return Fitted(known.cells, maps, known.windows, fit, good)
+    good = find_credible(known.cells, maps, fit, image)
+    return FittedCorners(known.cells, maps, known.windows, fit, good)
 
 
-def _fill(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted:
+def _fill(image: Array32, known: FittedCorners, knowledge: _Knowledge) -> FittedCorners:
     """Fit free cells next to good corners, round by round, as long as that finds more."""
     limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
     tried = _keys(known.cells)
@@ -288,7 +290,7 @@ def _fill(image: Array32, known: Fitted, knowledge: _Knowledge) -> Fitted:
         fitted = _fit(image, near, maps.select(inside), knowledge, iterations=4)
         if not np.any(fitted.good):
             break
-        known = Fitted.join(known, fitted.select(fitted.good))
+        known = FittedCorners.join(known, fitted.select(fitted.good))
     return known
 
 

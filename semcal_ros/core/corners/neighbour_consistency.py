@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices, Mask
-from semcal_ros.core.corners.checks import CORNERS_MIN, Fitted, inflation
+from semcal_ros.core.corners.checks import CORNERS_MIN, FittedCorners, inflate_variance
 from semcal_ros.core.corners.local_map import SUPPORT_MIN, fit_local_maps
 from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
 
-__all__ = ["smooth"]
+__all__ = ["find_consistent"]
 
 
 # Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
@@ -26,7 +26,7 @@ TREND_DEGREE = 5
 MEDIAN_SQUARE = 1.386
 
 
-def smooth(fitted: Fitted) -> Mask:
+def find_consistent(fitted: FittedCorners) -> Mask:
     """Corners that agree with what their neighbours predict.
 
     Later looks are without the worst, which spoil the predictions of their neighbours.
@@ -35,11 +35,11 @@ def smooth(fitted: Fitted) -> Mask:
     for sigmas in MISS_SIGMAS:
         if good.sum() < CORNERS_MIN:
             return np.zeros(len(good), dtype=np.bool_)
-        good = fitted.good & _predicted(fitted, good, sigmas)
+        good = fitted.good & _agree_with_neighbours(fitted, good, sigmas)
     return good
 
 
-def _predicted(fitted: Fitted, good: Mask, sigmas: float) -> Mask:
+def _agree_with_neighbours(fitted: FittedCorners, good: Mask, sigmas: float) -> Mask:
     """Corners within so many standard deviations of what the good ones around them predict."""
     cells, xy = fitted.cells, fitted.fit.xy
     # Local maps extrapolate at the rim and are coarse in large squares, where only what is left
@@ -48,21 +48,21 @@ def _predicted(fitted: Fitted, good: Mask, sigmas: float) -> Mask:
     maps = fit_local_maps(cells, cells[good], rest[good])
     # The neighbours are as uncertain as the corner itself.
     miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
-    covariance = fitted.fit.covariance * inflation(fitted.fit, good)[:, None, None]
-    error = _map_error(fitted, good, covariance, _squared(miss, covariance))
+    covariance = fitted.fit.covariance * inflate_variance(fitted.fit, good)[:, None, None]
+    error = _map_error(fitted, good, covariance, _squared_mahalanobis(miss, covariance))
     covariance = covariance + (error**2)[:, None, None] * np.eye(2)
-    passed = _squared(miss, covariance) < sigmas**2
+    passed = _squared_mahalanobis(miss, covariance) < sigmas**2
     return passed & (maps.support >= SUPPORT_MIN)
 
 
-def _squared(miss: Array, covariance: Array) -> Array:
+def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:
     """(n,) squared lengths of (n, 2) vectors in standard deviations."""
     x, y = miss.T
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
-def _map_error(fitted: Fitted, good: Mask, covariance: Array, squared: Array) -> Array:
+def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Array) -> Array:
     """(n,) what the maps miss besides noise, px, from what the image as a whole shows of it.
 
     An uneven board is uneven everywhere; a distortion too strong for the maps is so in a part of

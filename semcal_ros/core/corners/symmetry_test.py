@@ -7,10 +7,10 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = ["opposite_squares"]
+__all__ = ["compare_opposite_squares"]
 
 
-def opposite_squares(
+def compare_opposite_squares(
     windows: PixelWindows,
     nonlinear: Array,
     jacobian: Array32,

@@ -123,10 +123,10 @@ def _gather_block(
     limit_u = (band * np.linalg.norm(axes[:, 1], axis=1) / cell).astype(np.float32)
     limit_v = (band * np.linalg.norm(axes[:, 0], axis=1) / cell).astype(np.float32)
     inside &= (u <= limit_u[:, None, None]) | (v <= limit_v[:, None, None])
-    return _packed(image, inside, start, shift, origin, coverage)
+    return _pack(image, inside, start, shift, origin, coverage)
 
 
-def _packed(
+def _pack(
     image: Array32,
     inside: Mask,
     start: NDArray[np.int64],

@@ -8,11 +8,11 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
+    "apparent_zoom_shift",
     "carry_covariance",
     "centre_covariance",
     "relative_scale_sigma",
     "scale_covariance",
-    "zoom_of",
 ]
 
 
@@ -59,7 +59,7 @@ def centre_covariance(camera: ScanCamera | None) -> Array:
     return np.asarray(camera.covariance[_CENTRE, _CENTRE])
 
 
-def zoom_of(before: ScanCamera, after: ScanCamera) -> Array:
+def apparent_zoom_shift(before: ScanCamera, after: ScanCamera) -> Array:
     """(2, 2) metres that a change of magnification seems to move the specimen by, the other way, per
     px of error of the principal point that both cameras share.
     """

@@ -7,7 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.camera_uncertainty import carry_covariance, relative_scale_sigma, zoom_of
+from semcal_ros.core.drift.camera_uncertainty import (
+    apparent_zoom_shift,
+    carry_covariance,
+    relative_scale_sigma,
+)
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.operations import CloneKeyframe, Measure
 from semcal_ros.core.drift.state import DriftState
@@ -106,7 +110,9 @@ def add_zoom_uncertainty(measure: Measure, before: ScanFrame, now: ScanFrame) ->
         return measure
     covariance = measure.covariance.copy()
     covariance[:2, :2] += carry_covariance(before.camera, now.camera)
-    return replace(measure, covariance=covariance, zoom=zoom_of(before.camera, now.camera))
+    return replace(
+        measure, covariance=covariance, zoom=apparent_zoom_shift(before.camera, now.camera)
+    )
 
 
 def clone_keyframe(

@@ -305,7 +305,7 @@ class BagReader:
                 c for c in self._connections if c.topic == raw.topic and c.msgtype == raw.type
             )
             with reading(self.path, f"the definition of {raw.type}"):
-                self._stores[raw.type] = _store_of(connection, self.path)
+                self._stores[raw.type] = _find_typestore(connection, self.path)
         return self._stores[raw.type]
 
 
@@ -326,7 +326,7 @@ def _is_latched(connection: Connection) -> bool:
     return any(profile.durability == QosDurability.TRANSIENT_LOCAL for profile in profiles)
 
 
-def _store_of(connection: Connection, path: Path) -> Typestore:
+def _find_typestore(connection: Connection, path: Path) -> Typestore:
     """Types to decode a topic with: the recording's own where they differ from Jazzy's."""
     encoding = getattr(connection.ext, "serialization_format", "cdr")
     if encoding != "cdr":

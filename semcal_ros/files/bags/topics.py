@@ -21,7 +21,7 @@ def topic_matches(wanted: str, recorded: str) -> bool:
     return recorded == wanted or recorded.endswith("/" + wanted)
 
 
-def _listed(topics: Sequence[BagTopic]) -> str:
+def _list_topics(topics: Sequence[BagTopic]) -> str:
     shown = [f"{t.name} ({t.type}, {t.count})" for t in topics[:_MAX_LISTED]]
     more = len(topics) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "") if shown else "no topics"
@@ -61,7 +61,7 @@ def find_topic(
         return candidates[
             0
         ], f"the {what} is read from {candidates[0].name}: there is no topic {wanted}"
-    seen = _listed(candidates) if candidates else _listed(topics)
+    seen = _list_topics(candidates) if candidates else _list_topics(topics)
     problem = "several topics could be" if candidates else "no topic is"
     raise BagError(
         f"in {path} {problem} the {what}; the topics are {seen}",

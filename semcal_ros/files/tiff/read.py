@@ -116,7 +116,7 @@ def _parsing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
+def _open(path: Path) -> Iterator[tifffile.TiffFile]:
     with _parsing(path):
         check_counts(path)
         with tifffile.TiffFile(path) as file:
@@ -133,7 +133,7 @@ def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
 def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
     """Settings and stored (width, height), pixels undecoded; errors as :func:`read_sem_tiff`."""
     path = Path(path)
-    with _opened(path) as file:
+    with _open(path) as file:
         page = _first_page(file, path)
         size_px = page_size(path, page)
         return _settings(path, page, size_px), size_px
@@ -155,7 +155,7 @@ def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemIm
         The file is missing, truncated or not a TIFF, or has no known metadata, no usable pixel size, or an absurd size.
     """
     path = Path(path)
-    with _opened(path) as file:
+    with _open(path) as file:
         page = _first_page(file, path)
         settings = _settings(path, page, page_size(path, page))
         image: NDArray[Any] = grey_image(path, page)

@@ -39,7 +39,7 @@ def _head(tag: Mapping[str, Any], index: int) -> float | None:
     return plain_number(numbers[index]) if len(numbers) > index else None
 
 
-def _refined(rounded: float | None, exact: float | None, tolerance: float) -> float | None:
+def _refine(rounded: float | None, exact: float | None, tolerance: float) -> float | None:
     """The value with more digits, where it rounds to the named one."""
     if rounded is None or exact is None:
         return rounded
@@ -52,7 +52,7 @@ def _magnification(tag: Mapping[str, Any]) -> float | None:
     if shown is None:
         return None
     value = shown * (1000.0 if text.endswith("K") else 1.0)
-    return positive(_refined(value, _head(tag, _MAGNIFICATION), 0.006 * value))
+    return positive(_refine(value, _head(tag, _MAGNIFICATION), 0.006 * value))
 
 
 def _pixel_size(path: Path, tag: Mapping[str, Any]) -> float:
@@ -60,7 +60,7 @@ def _pixel_size(path: Path, tag: Mapping[str, Any]) -> float:
     text = _text(tag, "ap_image_pixel_size")
     value = positive(quantity(text, "m"))
     if value is not None:
-        value = _refined(value, _head(tag, _PIXEL_SIZE), 1e-3 * value)
+        value = _refine(value, _head(tag, _PIXEL_SIZE), 1e-3 * value)
     return check_pixel_size(path, value, "AP_IMAGE_PIXEL_SIZE in tag 34118 (CZ_SEM)", text)
 
 
@@ -87,7 +87,7 @@ def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
         pixel_size_m=pixel_m,
         pixel_size_y_m=pixel_m,
         displayed_magnification=_magnification(tag),
-        working_distance_m=_refined(distance, _head(tag, _WORKING_DISTANCE), 6e-5),
+        working_distance_m=_refine(distance, _head(tag, _WORKING_DISTANCE), 6e-5),
         scan_rotation_rad=_rotation(tag),
         dwell_s=positive(quantity(_text(tag, "dp_dwell_time"), "s")),
         frame_time_s=positive(quantity(_text(tag, "ap_frame_time"), "s")),

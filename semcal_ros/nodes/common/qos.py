@@ -16,7 +16,7 @@ __all__ = [
     "image_input",
     "latched",
     "overridable",
-    "relaxed",
+    "relax",
     "service_queue",
     "stream_output",
     "value_input",
@@ -82,7 +82,7 @@ def _check_depth(profile: QoSProfile) -> SetParametersResult:
     return SetParametersResult(successful=good, reason=reason)
 
 
-def relaxed(profile: QoSProfile, refused: QoSPolicyKind) -> QoSProfile | None:
+def relax(profile: QoSProfile, refused: QoSPolicyKind) -> QoSProfile | None:
     """The profile without the demand that a publisher does not meet; None if it demands nothing of that kind."""
     reliability, durability = profile.reliability, profile.durability
     if refused == QoSPolicyKind.RELIABILITY:

@@ -11,7 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 
-from semcal_ros.nodes.common.qos import overridable, relaxed
+from semcal_ros.nodes.common.qos import overridable, relax
 
 __all__ = ["AdaptiveSubscription", "MessageCounter", "MessageInfo", "published_ns"]
 
@@ -74,7 +74,7 @@ class MessageCounter:
 
 
 class AdaptiveSubscription:
-    """Subscribes as requested, then again with less after the incompatible-QoS event, without which nothing would arrive.
+    """Subscribes as requested, then with less after an incompatible-QoS event: else nothing would arrive.
 
     When the last publisher is gone, :meth:`check_publishers` returns to the requested quality.
 
@@ -123,7 +123,9 @@ class AdaptiveSubscription:
         if self._profile is self._requested:
             return ""
         kinds = ("reliability", "durability")
-        return ", ".join(k for k in kinds if getattr(self._profile, k) != getattr(self._requested, k))
+        return ", ".join(
+            k for k in kinds if getattr(self._profile, k) != getattr(self._requested, k)
+        )
 
     @property
     def lost(self) -> int:
@@ -195,7 +197,7 @@ class AdaptiveSubscription:
     def _relax(self) -> None:
         while self._refused:
             refused = self._refused.pop()
-            weaker = relaxed(self._profile, refused)
+            weaker = relax(self._profile, refused)
             if weaker is None:
                 continue
             self._profile = weaker

@@ -67,7 +67,7 @@ class JobResult:
     failed: bool = False
 
 
-def _refused(error: SemcalError) -> JobResult:
+def _refuse(error: SemcalError) -> JobResult:
     return JobResult("", str(error), failed=True)
 
 
@@ -83,17 +83,17 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
             on_stage=on_stage,
         )
     except SemcalError as error:
-        return _refused(error)
+        return _refuse(error)
     except MemoryError:
         what = f"not enough memory for a calibration from {len(job.views)} views"
-        return _refused(CalibrationError(what, do="use fewer views, or residual off"))
+        return _refuse(CalibrationError(what, do="use fewer views, or residual off"))
     except _NUMERIC as error:
         reason = CalibrationError(
             f"views that cannot be solved for ({type(error).__name__}: {error})",
             expected="views of a grid from different directions",
             do="add tilted views",
         )
-        return _refused(reason)
+        return _refuse(reason)
     held_out = [v for v in done.result.held_out_rms_px.values() if np.isfinite(v)]
     worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
     low, high = done.calibration.magnification_range

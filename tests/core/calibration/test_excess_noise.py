@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.views import GridView, excess_sigma_px, with_excess
+from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
@@ -25,12 +25,12 @@ def test_known_excess_is_found(excess):
     # A tenth of outliers must not matter much: they move the median by a few percent.
     residuals[:400] *= 30.0
     # The median of 4000 squares is known to 2 %, the outliers raise it by 20 %: 10 % of a sigma.
-    assert excess_sigma_px([view], residuals, 6) == pytest.approx(excess, rel=0.13)
+    assert estimate_excess_sigma_px([view], residuals, 6) == pytest.approx(excess, rel=0.13)
 
 
 def test_excess_is_added_to_every_corner():
     view = _view(10, np.random.default_rng(1))
-    (wider,) = with_excess([view], 0.3)
+    (wider,) = add_excess_noise([view], 0.3)
     np.testing.assert_allclose(wider.sigma_px**2, view.sigma_px**2 + 0.09)
     np.testing.assert_allclose(wider.covariance_px2, view.covariance_px2 + 0.09 * np.eye(2))
 
@@ -57,9 +57,9 @@ def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
         "options": CalibrationOptions(residual="off"),
     }
     good, bad = (calibrate_views(v, **options) for v in (even, uneven))
-    assert good.model.statistics["fit"]["excess_sigma_px"] == 0.0
+    assert good.model.statistics["fit"]["estimate_excess_sigma_px"] == 0.0
     # Some thousand corners: known to a few percent.
-    assert bad.model.statistics["fit"]["excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
+    assert bad.model.statistics["fit"]["estimate_excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
     assert not any("residuals are" in w for w in good.warnings)
     assert any("residuals are 10" in w or "residuals are 9" in w for w in bad.warnings)
     # Where there are views, ten times the scatter makes what they determine much less certain.

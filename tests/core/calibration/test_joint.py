@@ -10,7 +10,7 @@ import pytest
 from semcal_ros.core.calibration.bundle_adjustment import refine
 from semcal_ros.core.calibration.joint import JointFit, fit_joint
 from semcal_ros.core.calibration.priors import Priors, Setup
-from semcal_ros.core.calibration.problem import build_problem, theta_of, variance_factor
+from semcal_ros.core.calibration.problem import build_problem, stack_coefficients, variance_factor
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
@@ -34,7 +34,7 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
     setup: Setup, fit: JointFit
 ) -> None:
     adjustment = fit.adjustment
-    start = theta_of(fit.padded)
+    start = stack_coefficients(fit.padded)
     heights = adjustment.problem.height_sigma_m
     problem = build_problem(setup, fit.padded, setup.views, heights)
     freed = refine(problem, replace(adjustment.result.state, theta=start))

@@ -14,11 +14,11 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
+    apparent_zoom_shift,
     carry_covariance,
     centre_covariance,
     relative_scale_sigma,
     scale_covariance,
-    zoom_of,
 )
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
@@ -465,10 +465,12 @@ def test_a_zoom_about_a_wrong_principal_point_is_an_apparent_step() -> None:
             pixel = axis + jacobian @ specimen
             seen.append(np.linalg.solve(jacobian, pixel - (axis + error)))
         step = seen[1] - seen[0]
-        np.testing.assert_allclose(step, -zoom_of(before, after) @ error, rtol=1e-9)
+        np.testing.assert_allclose(step, -apparent_zoom_shift(before, after) @ error, rtol=1e-9)
     # There and back is no step, nor is one without a change of magnification.
-    np.testing.assert_allclose(zoom_of(after, before), -zoom_of(before, after))
-    np.testing.assert_array_equal(zoom_of(before, before), 0.0)
+    np.testing.assert_allclose(
+        apparent_zoom_shift(after, before), -apparent_zoom_shift(before, after)
+    )
+    np.testing.assert_array_equal(apparent_zoom_shift(before, before), 0.0)
 
 
 def test_the_principal_point_is_as_uncertain_as_its_camera_says() -> None:
