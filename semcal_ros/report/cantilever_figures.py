@@ -45,9 +45,11 @@ __all__ = [
     "write_strip_figure",
 ]
 
+# Resolution of figures, dots per inch.
 _DPI = 90.0
 _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
 _MARKS = "osD^vX"
+# Columns of the figure of frames: first, most bent and last pose.
 _SHOWN_POSES = 3
 # Frames are shown smaller than they are: noise averages out, and the file is smaller.
 _SHOWN_PX = 128
@@ -217,6 +219,7 @@ def _draw_frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: 
     axes.set_title(title, fontsize=7, color=INK)
 
 
+# OpenCV draws at sixteenths of a pixel.
 _FRACTION_BITS = 4
 
 

@@ -34,12 +34,15 @@ from semcal_ros.report.html.style import (
 __all__ = ["plot_drift", "write_drift_figure"]
 
 
+# Resolution: 1600 px across the figure of 10 inches.
 _DPI = 160.0
 # Half the width of an interval that holds 95 % of a normal distribution.
 _BAND = 1.96
+# Letters in a line of the legend.
 _LINE_LENGTH = 64
 # Colours and marks of the reasons; those beyond are put together.
 _MARKS = ((SECOND, "X"), (REFERENCE, "D"), (ACCENT, "^"), ("#8a6d00", "v"))
+# Part of the height of a plot that is kept free below the curves for the marks of rejected frames.
 _TICK_ROOM = 0.09
 
 

@@ -28,19 +28,29 @@ __all__ = ["Background", "follow_background"]
 # The first look is at a picture that is reduced to some 256 px, in tiles: their number along each
 # side, their least side, and how many must be matched for their median to be trusted.
 _FIRST_PX = 256
+# Tiles along the shorter side.
 _TILES = 4
+# A smaller tile holds too little texture for a peak that stands out.
 _LEAST_TILE_PX = 64
+# The median of three is right even if one of them is wrong.
 _LEAST_TILES = 3
+# A tile is used if the beam covers less than this part of it.
 _MOSTLY = 0.5
 # Cells in which changes are looked for, px. Of n frames chance makes 1 in 10^4 cells exceed the usual
 # range by a factor of 1 + 4 / sqrt(n).
 _CELL_PX = 8
+# Factor of 1 / sqrt(n) in that range.
 _CHANCE = 4.0
+# Error of the rough drift to either side, px: 0.1 px of a picture that was reduced four times.
+# An edge of some slope changes its cells by twice as much without moving by itself.
 _ROUGH_PX = 0.4
 # A body moves if that many of its cells do, and that share of them.
 _LEAST_CELLS = 4
+# The share matters for large bodies, of which a few cells exceed the limit by chance.
 _BODY_SHARE = 0.03
+# Sigma of the rim of what is covered, px: without an edge that the tracker could follow.
 _SOFT_PX = 3.0
+# Sigma over which the ground beside covered places fills them, px: several widths of the rim.
 _FILL_PX = 14.0
 
 

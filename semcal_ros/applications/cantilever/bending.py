@@ -39,12 +39,14 @@ SHAPES = ("free", "beam", "parabola")
 _TURN_RAD = 1e-5
 # Mean and 1-sigma of a shape that nobody knows: a parabola and a beam loaded at its end are likely.
 _PRIOR = (-0.25, 0.35)
+# Keeps divisions from zero, m^2: far below any variance, which is at least 1e-26 (see the prior).
 _TINY = 1e-30
 # Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
 # doi:10.1080/03610927708827533).
 _TUKEY = 4.685
 # Reweighting has settled long before; a linear fit costs little.
 _ROUNDS = 12
+# Least number of edges in a fit: it has four unknowns, and two more show the scatter.
 _LEAST = 6
 
 

@@ -26,9 +26,15 @@ __all__ = [
 ]
 
 
+# Gauss-Newton steps. The first one finds the grey levels only; each later one moves the edge by at
+# most half the reach, so that two can bring it anywhere within reach and two more settle it.
 _STEPS = 5
+# Pixels of an edge (weighted by the taper): four for each of its three unknowns.
 _LEAST_PIXELS = 12
+# Widths (1-sigma) that are tried, px: from an edge as sharp as the pixels to 5.1 px, nearly the
+# reach; 16 % apart, since a parabola interpolates between them.
 _WIDTHS_PX = tuple(0.55 * 1.16**k for k in range(16))
+# Keeps divisions from zero.
 _TINY = 1e-30
 # Both edges of the beam move alike: deviations beyond which one of them is not its own.
 _SAME_WIDTH = 4.5

@@ -20,17 +20,25 @@ __all__ = ["Strip", "find_strip"]
 
 # Larger pictures are reduced before they are searched.
 _SEARCHED_PX = 640
+# All directions are searched in a picture of at most this size.
 _COARSE_PX = 256
+# Sigma of the smoothing before gradients are taken.
 _BLUR_PX = 1.5
+# Half a step turns the ends of a line across 256 px by 1.1 px: within the 3 px that are summed.
 _STEP_RAD = np.deg2rad(1.0)
+# Twice the coarse step to either side; half a fine step turns the ends across 640 px by 0.6 px.
 _FINE_RAD = np.deg2rad(np.arange(-2.0, 2.01, 0.2))
+# The two edges of a narrower strip merge under the smoothing.
 _LEAST_WIDTH_PX = 4
+# Of the shorter side: a wider bright area is not taken for a cantilever.
 _LARGEST_WIDTH = 0.35
 # A strip is one where its edges are at least that strong, relative to where they are strong.
 _EDGE_SHARE = 0.35
+# Of the shorter side: shorter gaps in the edges are dirt or texture and no end.
 _GAP = 0.06
 # Of the picture's side: a strip is longer, and it is out of view if it ends closer to the border.
 _LEAST_LENGTH = 0.2
+# The mean along the strip reaches 4 px beyond its end, and the outer 3 px are not searched.
 _BORDER_PX = 7.0
 _GIVE_CLICKS = "give two points on its centre line, the base and the free end, as base and tip"
 

@@ -20,7 +20,10 @@ from semcal_ros.core.rectification.raw_positions import RasterDrift
 __all__ = ["Axis", "PlaneMap", "evaluate_drift"]
 
 
+# Distance of the nodes at which the distortion is undone: a hundredth of the pixels. Distortion is
+# smooth, so that a spline between them interpolates the others.
 _NODE_SPACING_PX = 10.0
+# Degree of that spline, the highest that FITPACK has.
 _DEGREE = 5
 
 

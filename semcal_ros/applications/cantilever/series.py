@@ -39,9 +39,15 @@ __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 
 # Steps of an edge relative to the reference within which it is the same edge.
 _SAME_STEP = (0.5, 1.6)
+# Relative difference between measured and given length that is noted: a choice, well above the
+# uncertainty of a calibrated scale and of both ends.
 _WRONG_LENGTH = 0.03
+# Largest deflection that is looked for where the user gives none, of the length: the search passes
+# over whatever lies beside the beam, so that a wider one finds other bodies.
 _LARGEST = 0.04
+# A fit beyond this many times the largest deflection has found something else than the beam.
 _ABSURD = 1.5
+# Points of the centre line in the results, for drawing.
 _LINE_POINTS = 65
 # Where the background was not tracked, the base alone tells what moved.
 _UNTRACKED_M = 1e-7

@@ -25,14 +25,20 @@ PixelSamples = tuple[Array, Array, Array]
 
 #: How far from an edge pixels count.
 REACH_PX = 6.0
+# Width (1-sigma) of an edge to begin with, until it is fitted.
 _EDGE_PX = 1.1
+# Length of a block along the beam: as long as the pixels that count reach across an edge.
 _BLOCK_PX = 12.0
+# Blocks with both edges: a fit with four unknowns needs some more.
 _LEAST_BLOCKS = 6
 # Edges of a narrow beam must not see each other.
 _REACH_OF_HALF_WIDTH = 1.5
 # The ends are searched for around where the strip seemed to end.
 _END_SEARCH_PX = 14.0
+# The holder's edge is fitted between these distances from the beam: beyond the blur of the beam's
+# own edge, and no further than the holder may be taken for straight.
 _BESIDE_PX = 3.0
+# The far end of that range.
 _BESIDE_REACH_PX = 24.0
 
 

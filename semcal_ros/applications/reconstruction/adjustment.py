@@ -25,7 +25,9 @@ __all__ = ["Adjustment", "adjust"]
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
 _LEAST_SCALE = 1e-6  # of observations without errors
 _POINT_SPREAD = 3.0  # 1-sigma of the points' heights about their middle, in their spread
+# Relative to the diagonal: the usual start of Levenberg and Marquardt.
 _FIRST_DAMPING = 1e-3
+# Steps are then 1e-10 of a plain one: no lower cost can be found within rounding.
 _LAST_DAMPING = 1e10
 
 

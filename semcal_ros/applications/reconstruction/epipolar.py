@@ -17,6 +17,7 @@ from semcal_ros.core.errors import StructureError
 __all__ = ["AffineEpipolar", "fit_epipolar"]
 
 
+# Four pairs define the geometry, a fifth one tests it.
 _LEAST_POINTS = 5
 
 

@@ -20,10 +20,17 @@ from semcal_ros.core.errors import StructureError
 __all__ = ["AffineStructure", "factorize"]
 
 
+# Numbers of successive views that are tried as the first block: short ones share more points, long
+# ones turn further.
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
+# Points that all views of a block share: four times the rank, so that the other singular values
+# show the noise.
 _LEAST_COMMON = 12
+# Points in a view: twice the four unknowns of each row of its camera.
 _LEAST_IN_VIEW = 8
+# Two affine views leave the relief open.
 _LEAST_VIEWS = 3
+# Constant of Huber's weights, in sigma: near the 1.345 that is 95 % efficient with normal noise.
 _HUBER = 1.5
 # A new point waits until the squared lever arm of its depth is this part of that across the view.
 _WEAKEST = 1e-3

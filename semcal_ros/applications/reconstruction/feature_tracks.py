@@ -27,6 +27,7 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["SequenceTracker", "TrackKeyframe", "TrackerSettings", "project_to_plane"]
 
 
+# With fewer features left than this, the whole frame is processed: the others may be anywhere.
 _FEW = 30
 
 

@@ -24,7 +24,9 @@ from semcal_ros.core.errors import StructureError
 __all__ = ["MetricUpgrade", "mirror_structure", "upgrade_to_metric"]
 
 
+# Turns depth around.
 _MIRROR = np.diag([1.0, 1.0, -1.0])
+# Rows and columns of the six different entries of Q.
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 

@@ -18,7 +18,9 @@ from semcal_ros.core.errors import StructureError
 __all__ = ["LocalSurface", "compute_spacing_m", "fit_local_surface"]
 
 
+# Neighbours in a fit, at most: eight for each coefficient of a quadric; bounds time and memory.
 _NEIGHBOURS = 48
+# A quadric has six coefficients; two more show the scatter.
 _LEAST = 8
 
 

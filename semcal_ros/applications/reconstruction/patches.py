@@ -51,6 +51,8 @@ def project_to_plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, ra
 
 
 WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
+# Least contrast of a patch over that of the template. It keeps the division bounded for patches
+# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
 _GAIN_LEAST = 0.3
 
 

@@ -19,7 +19,9 @@ __all__ = ["TargetView", "find_target"]
 # Larger images are averaged down by a whole factor to find the markers; their sides are then measured at full
 # resolution.
 _SEARCHED_PX = 1024
+# Three pixels for each of the six squares along a side.
 _SMALLEST_SIDE_PX = 18.0
+# Sigma of the smoothing for the search: a third of the smallest square that can be read.
 _NOISE_BLUR_PX = 1.0
 
 

@@ -13,6 +13,7 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["CommandHistory", "DisturbanceObserver", "StageMonitor"]
 
 
+# Commands that are kept: those of 30 s, the longest latency that is foretold, at 34 a second.
 _KEPT = 1024
 # Deviations beyond which a surprise is none of a drift, and how many in a row are one after all.
 _GATE, _ODD = 5.0, 4

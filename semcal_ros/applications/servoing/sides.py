@@ -23,8 +23,12 @@ __all__ = ["RefinedQuads", "refine_quads"]
 _ENDS = 0.14
 # Half-width of the window over the side, px at least and at most. Border and frame of a marker are wider.
 _WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
+# The windows are laid over the corners found last, at most this often.
 _ROUNDS = 4
+# Movement of the corners after which that ends: what they are uncertain by at best.
 _SETTLED_PX = 0.02
+# Largest number of places along a side at which its step is measured: more of them cost time, and
+# neighbours that are closer than a pixel share their noise.
 _MOST_PLACES = 96
 # Steps further off than this from the line of the others are dust.
 _OUTLIER = 3.5
@@ -32,6 +36,7 @@ _OUTLIER = 3.5
 _RAGGED = 0.5
 # Least contrast of a side, in deviations of its pixels from the two levels.
 _LEAST_CONTRAST = 2.0
+# The least number of places on a side, also after outliers were left out: three per unknown.
 _LEAST_PLACES = 6
 
 

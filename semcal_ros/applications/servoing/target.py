@@ -21,20 +21,25 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["CELLS", "MARKER_BITS", "RATIO", "SIDE", "NestedTarget", "dictionary"]
 
 
+# The middle cell of the 3 x 3 holds the next board.
 RATIO = 3
 """How many times smaller the next board is."""
 
+# Leaves a white border of 0.15 of a cell, wider than one square of the marker (0.7 / 6 = 0.12).
 SIDE = 0.7
 """Side of a marker over that of its cell; the rest is its white border."""
 
+# As generated from the dictionary below.
 MARKER_BITS = 6
 """Squares along the side of a marker: four that code, and its black border."""
 
+# All cells of the 3 x 3 but the middle one.
 CELLS: tuple[tuple[int, int], ...] = tuple(
     (column, row) for row in (-1, 0, 1) for column in (-1, 0, 1) if (column, row) != (0, 0)
 )
 """(column, row) of the eight outer cells, in the order of their markers."""
 
+# Eight markers a level: the fifty of the dictionary are enough for six.
 _MOST_LEVELS = 6
 
 

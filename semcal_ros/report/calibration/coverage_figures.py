@@ -39,6 +39,7 @@ __all__ = [
 ]
 
 
+# Cells across the field in the map of coverage: some 430 of them in a 4:3 image.
 _CELLS = 24
 
 

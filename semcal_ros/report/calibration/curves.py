@@ -20,6 +20,7 @@ __all__ = [
 ]
 
 
+# Points of a curve: closer together than a line of the figure bends.
 _SAMPLES = 81
 
 

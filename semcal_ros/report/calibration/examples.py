@@ -27,12 +27,16 @@ __all__ = [
 ]
 
 
+# Width of a thumbnail with marks, px: two fit beside each other in the column of a page.
 _OVERLAY_WIDTH = 320
 # Half the size of a cross: this part of the spacing of the corners, within limits, in px of the
 # thumbnail.
 _MARK_OF_SPACING = 0.2
+# Smaller crosses cannot be seen, larger ones cover the corner.
 _MARK_LIMITS_PX = (0.8, 4.0)
+# Thumbnails only give an impression; a page may hold dozens of them.
 _JPEG_QUALITY = 70
+# Width of the thumbnail of a rejected image, px: enough to see what is wrong with it.
 _REJECTED_WIDTH = 200
 
 

@@ -33,7 +33,9 @@ __all__ = [
 ]
 
 
+# Cells across the field for mean residuals: large enough to hold many corners each.
 _RESIDUAL_CELLS = 12
+# More arrows overlap in a figure of this size.
 _MAX_ARROWS = 700
 # Corners in a cell below which the mean of its residuals says little.
 _MIN_IN_CELL = 5

@@ -25,23 +25,32 @@ from semcal_ros.report.html.text import format_magnification, remove_control_cha
 
 __all__ = ["collect_warnings", "estimate_pattern_px"]
 
+# Part of the field without a corner that is worth a warning: about 5 of 108 cells of a 4:3 image.
 _EMPTY_SHARE = 0.05
+# This tilt shortens the grid by 0.4 % only, which shows little of the perspective.
 _SMALL_TILT_DEG = 5.0
 # Predicting a magnification from the others is a little worse than fitting it; this much worse
 # means that the functions between the magnifications miss something.
 _HELD_OUT_RATIO = 1.5
+# Part of the field that the corners of one magnification should reach.
 _FILLED_SHARE = 0.5
+# More rejected views than this are no accident: something is wrong with the recording.
 _REJECTED_SHARE = 1.0 / 3.0
 # A view whose corners fit this much worse than they should.
 _VIEW_RATIO = 3.0
 # Mean squares of the cells' mean residuals over those of chance, and their size in px, beyond which
 # they are a pattern.
 _PATTERN_RATIO = 3.0
+# A smaller one may be certain but matters to nobody.
 _PATTERN_PX = 0.02
 # Beyond this predicted error, between two calibrated magnifications or at one, more images help.
 _SIGMA_PX = 2.0
+# Cells across the field in which a pattern is looked for, and corners in each: larger cells than in
+# the figure, so that the noise of their means is smaller.
 _PATTERN_CELLS = 8
+# With fewer corners a cell is left out.
 _MIN_IN_CELL = 5
+# Views or magnifications that a sentence names; the others are counted.
 _NAMED = 5
 
 

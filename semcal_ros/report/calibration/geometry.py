@@ -23,6 +23,7 @@ __all__ = [
 
 # How far a pose may move when the distortion is left out: what a view cannot see must not run away.
 _TURN_RAD = 0.1
+# The same for the height, m.
 _HEIGHT_M = 1e-4
 
 

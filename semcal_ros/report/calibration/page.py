@@ -53,11 +53,15 @@ from semcal_ros.report.html.text import format_length, format_px, remove_control
 
 __all__ = ["write_calibration_report"]
 
+# Example images on a page, at most: they make most of its size.
 _MAX_OVERLAYS = 24
 # Seen at once; the others unfold.
 _FIRST_OVERLAYS = 8
+# Pictures of rejected images, at most.
 _MAX_THUMBNAILS = 12
+# Rows in the list of rejected images, at most.
 _MAX_REJECTED = 200
+# Rows in the table of the views that fit worst.
 _WORST_VIEWS = 5
 
 

@@ -40,9 +40,13 @@ __all__ = ["plot_predicted_errors"]
 
 # The map goes on to this factor outside of the calibrated range, to show what extrapolation costs.
 _BEYOND = 1.5
+# Magnifications across the map.
 _COLUMNS = 61
+# Circles about the image centre in the map, and directions on each of them.
 _RINGS = 24
+# Every 11 degrees; the corners of the field are added.
 _DIRECTIONS = 32
+# Points across the field in the maps over it.
 _ACROSS = 17
 
 

@@ -29,6 +29,7 @@ from semcal_ros.report.html.style import (
 __all__ = ["normalise_residuals", "plot_residual_histogram", "plot_rms"]
 
 
+# Ends of the histogram, in sigma; what lies beyond is counted in the last bins.
 _HISTOGRAM_LIMIT = 5.0
 
 

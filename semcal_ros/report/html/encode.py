@@ -32,11 +32,13 @@ __all__ = [
 # Two dots of the file per CSS pixel of the page (96 per inch), so that pictures are sharp on fine
 # screens.
 _FIGURE_DPI = 192.0
+# By the definition of CSS.
 _CSS_PX_PER_INCH = 96.0
 # Line drawings with soft edges need no more colours; the file is three times smaller than in RGB.
 _COLORS = 128
 # Quality of JPEG files. Pictures that a caller hands in are the subject of a page, and get more.
 _JPEG_QUALITY = 82
+# That of pictures that a caller hands in.
 _CALLER_QUALITY = 88
 # Width of pictures that a caller hands in, px: that of a column of the page.
 _CALLER_WIDTH = 640

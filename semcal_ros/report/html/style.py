@@ -48,6 +48,7 @@ REFERENCE = "#7a4f9a"
 # From white to a blue on which dark numbers can still be read.
 LIGHT_MAP = LinearSegmentedColormap.from_list("light", ["#ffffff", "#d3e4f3", "#8fbfe0"])
 _GRID = "#dde2e8"
+# Size of the labels, points.
 _TEXT_PT = 9.0
 
 
