@@ -9,6 +9,8 @@ from semcal_ros.core.errors import InvalidValueError, MessageError
 
 __all__ = ["MAX_TEXT_BYTES", "calibration_text_from_message", "fill_calibration_text"]
 
+# A file's size grows with the square of its coefficients, 49 MB for 3000; ours have a few hundred,
+# so about 0.5 MB.
 MAX_TEXT_BYTES = 16 * 1024 * 1024
 """Limit far above any calibration, so that a wrong topic cannot exhaust memory in the parser."""
 

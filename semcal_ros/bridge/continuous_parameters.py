@@ -25,6 +25,7 @@ PARAMETER_KINDS = ("p", "k", "d", "e", "p_affine", "pixel_size", "sigma")
 """Projection, K, distortion, its centre, affine-safe projection, pixel size, predicted error."""
 
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?([eE][+-]?[0-9]+)?")
+# Characters of a wrong name that an error repeats: the error stays one line.
 _MAX_SHOWN = 60
 
 

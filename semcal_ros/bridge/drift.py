@@ -14,9 +14,12 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["UNKNOWN_VARIANCE", "fill_drift", "fill_drift_velocity"]
 
+# Standard deviations of 1 km and of 1000 rad.
 UNKNOWN_VARIANCE = 1e6
 """Variance of what is not observed (height in m2, rotations in rad2): beyond anything physical."""
 
+# Relative to the largest entry: above the rounding of single precision (6e-8), far below what a
+# wrong matrix shows.
 _SYMMETRY_TOLERANCE = 1e-6
 
 

@@ -17,7 +17,7 @@ __all__ = [
     "stamp_ns_from_msg",
 ]
 
-_NS_PER_S = 1_000_000_000
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
 _SEC_MIN, _SEC_MAX = -(2**31), 2**31 - 1
 
 

@@ -29,6 +29,8 @@ _PNG_ENCODINGS = {(0, 8): "mono8", (0, 16): "mono16", (2, 8): "bgr8"}
 _PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey and alpha", 6: "colour and alpha"}
 _PNG_REFUSED = {b"tRNS": "transparency", b"acTL": "an animation", b"IHDR": "two headers"}
 _PNG_ACCEPTED = "a PNG with 8 or 16 bit grey or 8 bit colour, without alpha or palette"
+# Bounds the time that a stream of empty chunks costs. In libpng's chunks of 8 KiB this many hold
+# 512 MB, the largest accepted picture without any compression.
 _MAX_PNG_CHUNKS = 65536
 
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
@@ -37,7 +39,9 @@ _JPEG_ACCEPTED = "a baseline or progressive JPEG with 8 bit and 1 or 3 component
 _EOI, _SOS = 0xD9, 0xDA
 # Start-of-frame markers; 0xC4, 0xC8 and 0xCC between them mean something else.
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# Baseline, extended sequential and progressive, all with Huffman coding (T.81, table B.1).
 _HUFFMAN_FRAMES = {0xC0, 0xC1, 0xC2}
+# TEM and RST0 to RST7, the markers of table B.1 that stand alone within an image.
 _WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD8)}
 # Every scan costs a pass over the whole picture, however short it is; encoders write about ten.
 _MAX_SCANS = 100

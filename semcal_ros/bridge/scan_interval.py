@@ -6,7 +6,7 @@ from semcal_ros.config.config import MicroscopeConfig
 
 __all__ = ["scan_interval_ns"]
 
-_NS_PER_S = 1_000_000_000
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
 # Part of the acquisition at either end in which a change does no harm: less than a row or two.
 _MARGIN = 0.01
 # A magnification that is published so shortly before its frame was announced together with it.

@@ -11,7 +11,7 @@ __all__ = ["ZeroOrderHold"]
 
 T = TypeVar("T")
 
-_NS_PER_S = 1_000_000_000
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
 
 
 class ZeroOrderHold(Generic[T]):

@@ -45,7 +45,7 @@ _SAFE_DOMAINS = 101
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 # What the shipped profile asks of a socket: one frame of 4096 x 4096 with 16 bits.
 _SOCKET_BYTES = 32 * 1024**2
-_MB = 1024**2
+_MB = 1024**2  # bytes per MiB
 
 
 def check_python(seen: Environment) -> list[Finding]:

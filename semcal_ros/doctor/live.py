@@ -38,8 +38,12 @@ __all__ = ["observe"]
 
 # Before anything is known, nodes need to find each other.
 _DISCOVERY_S = 1.0
+# Longest wait for the parameter services, and again for their answers: a busy node answers late, a
+# stuck one never. Chosen, not measured.
 _ANSWER_S = 5.0
+# Longest wait in one step of the executor: how late the end of the listening time is noticed.
 _STEP_S = 0.05
+# Messages that may wait while others are handled. Chosen, not measured.
 _DEPTH = 50
 _PARAMETERS = ("use_sim_time", "config")
 

@@ -35,10 +35,12 @@ __all__ = [
 ]
 
 
+# The format's only version so far; a file with any other number is refused.
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
 # A residual field of 3000 coefficients fills 49 MB with its covariance; ours have a few hundred.
 _MAX_TEXT = 64 * 1024 * 1024
+# Characters of a reason: it may repeat a value from the file, which can have any length.
 _MAX_REASON = 400
 _HEADER = (
     "# Calibration of a scanning electron microscope as functions of the magnification. SI units.\n"

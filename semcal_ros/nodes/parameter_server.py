@@ -35,6 +35,7 @@ _SIZE = (
 )
 # To discover other publishers of a calibration, and to receive theirs once one is discovered.
 _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
+# How often the end of that time is checked: six times within the shorter one.
 _TICK_S = 0.5
 
 

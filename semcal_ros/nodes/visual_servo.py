@@ -31,6 +31,7 @@ from semcal_ros.nodes.servo.settings import SERVO_PARAMETERS, read_goal, read_se
 
 __all__ = ["VisualServo", "main"]
 
+# Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
 # The stage stops after this many intervals, and at least this time, without a frame: one lost frame is no reason.
 _SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
@@ -39,6 +40,8 @@ _OTHER_CLOCK_S = 30.0
 # A target that is not found may have left the picture if the drift is more than this part of its width: more than
 # markers at the edge can hide.
 _HIDDEN = 0.03
+# Least time between two resets while the target is still found, in addition to two frame intervals:
+# the corrector needs a new keyframe before its drift is small again. Chosen, not measured.
 _RESET_AGAIN_S = 2.0
 
 

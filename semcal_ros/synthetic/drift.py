@@ -20,6 +20,8 @@ __all__ = ["DRIFTS", "NO_DRIFT", "Drift", "DriftFunction", "drift_preset"]
 DriftFunction = Callable[[Array], Array]
 """Displacement (n, 2) in m, sem frame, at times (n,) in s: what lay at X is seen at X + drift."""
 
+# Sines in the wander: with the default periods of 120 s to 4 s each period is 30^(1/13) = 1.3 times
+# the next, which gives 2.6 sines to an octave.
 _TERMS = 14
 
 

@@ -17,7 +17,11 @@ from semcal_ros.synthetic.laws import Constant, Law
 __all__ = ["Residual", "VirtualMicroscope"]
 
 
+# A fixed-point step multiplies the error by the residual's derivative: from 10 px, 60 steps reach
+# the tolerance for derivatives up to 0.65.
 _FIXED_POINT_STEPS = 60
+# A hundred times below the 1e-8 px of the splines that render with it, and above the rounding of a
+# coordinate of 4096 px (9e-13).
 _FIXED_POINT_TOLERANCE_PX = 1e-10
 
 

@@ -19,10 +19,14 @@ from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_l
 __all__ = ["render_frame", "render_reflectivity"]
 
 
+# Pixel rows that are drawn at once, so that a block's arrays stay in the CPU's cache: 1 MiB for
+# each coordinate at 4096 columns without supersampling.
 _BLOCK_ROWS = 32
 # Passes that lie closer together than this are drawn once: the blur that is left out has a variance
 # of 0.2^2 / 12 px^2.
 _PASS_SPACING_PX = 0.2
+# Samples of the drift per pass when the length of its path is measured: only a vibration at a
+# multiple of seven times the pass rate escapes them.
 _LOOKS_PER_PASS = 7
 _DEFAULT_DETECTOR = Detector()
 

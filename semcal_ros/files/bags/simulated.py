@@ -19,6 +19,7 @@ __all__ = ["SIMULATED_START_NS", "write_simulated"]
 SIMULATED_START_NS = 1_700_000_000_000_000_000
 """Stamp of time zero, ns: arbitrary but fixed, which keeps recordings of one seed identical."""
 
+# 1 ms: a magnification is recorded just before the scan of the first frame it belongs to.
 _MAGNIFICATION_LEAD_NS = 1_000_000
 _FRAME_ID = "sem_optical"
 

@@ -20,7 +20,7 @@ __all__ = [
     "scan_tiff_folder",
 ]
 
-_SECOND_NS = 1_000_000_000
+_SECOND_NS = 1_000_000_000  # one second, ns
 _SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
 MIN_SPACING_NS = 1_000_000
 """Least time between two images of a folder, whose files have whole seconds: 1000 images fit into one."""

@@ -17,7 +17,7 @@ __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size
 
 # They bound the memory that a damaged header can ask for: 2^29 pixels of 16 bits are 1 GiB.
 MAX_SIDE_PX = 65_536
-MAX_PIXELS = 2**29
+MAX_PIXELS = 2**29  # 1 GiB at 16 bits
 _MAX_SAMPLES = 4  # red, green, blue, alpha
 # Above what Deflate (1032) and LZW reach: beyond, the pixels are not in the file.
 _MAX_PACKING = 4096

@@ -12,8 +12,10 @@ from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_num
 
 __all__ = ["TAG", "tescan_pairs", "tescan_settings"]
 
+# TESCAN's private TIFF tag.
 TAG = 50431
 _LENGTH_BYTES, _TYPE_BYTES = 4, 2
+# Type of the record that holds a preview instead of text.
 _THUMBNAIL = 1
 
 

@@ -12,6 +12,7 @@ from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_num
 
 __all__ = ["TAGS", "thermo_fisher_settings"]
 
+# Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)
 # Above it a note says that pixels are not square; both sizes are used as they are in any case.
 _SQUARE_TOLERANCE = 1e-3

@@ -33,6 +33,7 @@ SIDECAR = "import.json"
 """File in the recording's folder with the same settings, the notes and the skipped files."""
 
 _NUMBER_TYPES = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+# A tenth of the least spacing: after the image before, whatever their order in the folder.
 _BEFORE_IMAGE_NS = MIN_SPACING_NS // 10
 
 

@@ -18,6 +18,7 @@ from semcal_ros.files.tiff.values import (
 
 __all__ = ["TAG", "zeiss_settings"]
 
+# Private TIFF tag of Zeiss, CZ_SEM.
 TAG = 34118
 # The unnamed numbers at the head of the tag repeat some settings with more digits.
 _PIXEL_SIZE, _MAGNIFICATION, _WORKING_DISTANCE = 3, 4, 9

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["corner_overlay"]
 
+# Green, in OpenCV's order of blue, green, red.
 _FOUND_BGR = (0, 220, 0)
-_REFUSED_BGR = (0, 0, 255)
+_REFUSED_BGR = (0, 0, 255)  # pure red
 
 
 def corner_overlay(

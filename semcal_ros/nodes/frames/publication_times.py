@@ -17,7 +17,7 @@ __all__ = ["SourceTimestamps"]
 _KEPT = 256
 # Encapsulation, and the stamp with which std_msgs/Header and so every image begins.
 _ENCAPSULATION = 4
-_NS_PER_S = 1_000_000_000
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
 
 
 class SourceTimestamps:

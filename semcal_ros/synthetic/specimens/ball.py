@@ -43,6 +43,7 @@ BALL_MAGNIFICATIONS = tuple(9000.0 + 100.0 * step for step in range(11))
 
 BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
 
+# Samples per pixel and direction: the outline has steps of a quarter of the contrast at most.
 _SAMPLES = 2
 _MARGIN_M = 20e-9  # by which perspective moves the outline at the end of the tip, and more
 _STEEPEST = 0.08  # cosine below which the yield grows no more: the exit depth is not zero
@@ -214,6 +215,7 @@ class BallPlan:
         }
 
 
+# Corners of the cube from -1 to 1, (8, 3).
 _CUBE = np.array([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
 
 

@@ -37,6 +37,7 @@ __all__ = [
 CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
 """Those of Malti et al. (2012), section 4.3."""
 
+# No push on the way back repeats one of the way up.
 CANTILEVER_PUSHES: tuple[float, ...] = (
     0.0,
     0.08,

@@ -14,10 +14,16 @@ from semcal_ros.core.arrays import Array, Image
 __all__ = ["GoldOnCarbon"]
 
 
+# Texels along each side of a tile: 17 diameters of its largest particle.
 _TILE = 1024
+# Smallest and largest radius. Their ratio of 5 exceeds the ratio of 4 between octaves, so that the
+# sizes have no gap.
 _RADII_TEXELS = (6.0, 30.0)
 _MARGIN = 32  # texels around a particle's centre, beyond the largest radius and its soft edge
+# Summed area of the particles, relative to the tile: six octaves leave exp(-6 * 0.17) = 36 % of the
+# film bare.
 _COVERAGE = 0.17
+# Rotation from octave to octave: no small number of them is a whole turn, so octaves do not align.
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
