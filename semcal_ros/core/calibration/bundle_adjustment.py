@@ -28,12 +28,17 @@ from semcal_ros.core.calibration.normal_equations import (
 __all__ = ["BundleResult", "BundleStatus", "refine"]
 
 
+# A guard against endless iteration; the result says where it was reached.
 _MAX_ITERATIONS = 60
+# Levenberg-Marquardt damping relative to the diagonal: nearly Gauss-Newton at the start, and from
+# rounding to steps of no length.
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
 # Decrease over its prediction, below which the quadratic model of a view has failed.
 _POOR_GAIN = 0.25
+# Steps by which the pose of such a view follows a new camera. It has to be near only: the next
+# iteration continues from there.
 _FOLLOWING_STEPS = 6
-# A change of a view's half chi-square that is nothing.
+# Change of a view's half chi-square that does not count as a failure.
 _NEGLIGIBLE = 1e-2
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-7

@@ -57,12 +57,20 @@ __all__ = [
 
 RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+# Rounds of choosing the numbers of coefficients. A choice that alternates never settles; the
+# calibration then carries a warning.
 _MAX_ROUNDS = 5
+# Number of zero coefficients that are added to the chosen ones, and the least number in all: what
+# the views leave open of them enters the covariance.
 _RESERVE, _LEAST_SIZE = 2, 5
+# Updates of the spread of the heights before anything is selected. It has to be near only, since
+# every later adjustment updates it again.
 _HEIGHT_UPDATES = 4
 # Spread of heights over its prior: a micrometre is below what any view shows, and nobody has millimetres of depth of
 # field.
 _LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
+# Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
+# mount, less than tilts that are set on purpose.
 _FLAT_RAD = np.radians(5.0)
 # Fewer views than this say nothing about a spread of their own.
 _ENOUGH_HEIGHTS = 4
@@ -70,6 +78,8 @@ _ENOUGH_HEIGHTS = 4
 _ENOUGH_CORNERS = 60
 # Tolerance of the adjustments on the way; only the last one has to be exact.
 _COARSE = 1e-6
+# Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
+# change; with both fixed the turns converge.
 _MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
 # Change of the corrections of all corners, RMS in px, that is none: a fiftieth of good corners' noise.
 _FIELD_SETTLED_PX = 1e-3

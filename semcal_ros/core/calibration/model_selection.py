@@ -25,6 +25,8 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 __all__ = ["Summary", "select_functions"]
 
 
+# Most coefficients of one function. It bounds the search; with few magnifications their number is
+# the smaller limit.
 _MAX_SIZE = 8
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0

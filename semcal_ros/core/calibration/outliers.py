@@ -83,6 +83,8 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
 _HEIGHT_SIGMAS = 8.0
 # Spread below which differences of height are nothing, m.
 _LEAST_HEIGHT_M = 5e-6
+# RMS residual of a view over that of the median view. Good views differ by less, and a wrong
+# magnification that the height cannot imitate exceeds it. Chosen by trial.
 _MISFIT_RATIO = 6.0
 # Fewer views at a magnification are compared with those of all others instead.
 _ENOUGH_VIEWS = 3

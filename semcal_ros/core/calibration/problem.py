@@ -30,7 +30,10 @@ __all__ = [
 
 Functions = Mapping[str, ContinuousFunction]
 
+# Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
+# no view turns.
 _MAX_TURNS = 5
+# Steps from either sign of a tilt, enough to say which fits better; the adjustment does the rest.
 _POSE_ITERATIONS = 12
 
 

@@ -38,6 +38,7 @@ __all__ = [
 
 # Standard deviations of a coefficient that are tried, px: from less than the noise to a camera lens.
 _STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
+# A prior this narrow holds the field at zero; the same equations then serve without a field.
 _NO_STRENGTH_PX = 1e-7
 # Second differences of the coefficients are so much smaller than the coefficients: fields are smooth.
 _SMOOTHNESS = 4.0
@@ -45,9 +46,11 @@ _SMOOTHNESS = 4.0
 _STEADINESS = 3.0
 # Standard deviation of what the field has in common with the rest of the model, px.
 _OVERLAP_PX = 1e-4
+# The field is taken to change slowly with the magnification: as a parabola in log g at most.
 _MAX_COEFFICIENTS_IN_G = 3
 # Fewer magnifications say nothing about one that is left out.
 _ENOUGH_MAGNIFICATIONS = 4
+# Bounds the time: every fold is solved once for each strength.
 _MAX_FOLDS = 6
 # A field must gain so many held-out half chi-squares, and standard errors over what is left out.
 _LEAST_GAIN, _CLEARLY = 6.0, 2.5

@@ -21,6 +21,8 @@ from semcal_ros.core.arrays import Array, Mask
 __all__ = ["Undistortion", "distort_jacobians", "distort_normalised", "undistort_normalised"]
 
 
+# Newton's method converges quadratically from the closed inverse of the radial part; a point that
+# needs more steps lies at a fold of the map.
 _MAX_ITERATIONS = 50
 # Half an ulp of a coordinate of order one: Newton cannot do better in double precision.
 _TOLERANCE = 1e-14

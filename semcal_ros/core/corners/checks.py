@@ -79,16 +79,29 @@ def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
 # Corners nearer to the frame than this are not fitted: less than half of their window is in the
 # image.
 MARGIN_PX = 2.0
+# Least contrast relative to the median of the image. Saddle points are kept down to about the same
+# part of the contrast of the strong ones.
 CONTRAST_MIN = 0.3
+# Least part of the window in the image. A corner on one side of the frame keeps half of its window
+# and is fitted; one in a corner of the frame keeps a quarter and is not.
 COVERAGE_MIN = 0.3
+# Largest angle between a fitted edge and the local map, rad: more than six standard deviations of
+# its prior.
 ANGLE_MAX = 0.2
+# Residuals of more than twice the usual size (four times the median chi-square) do not belong to a
+# corner.
 CHI2_MAX = 4.0
+# A corner counts as disturbed where its chi-square exceeds the median by this part, which allows
+# for differences between good corners and was chosen by trial,
 CHI2_EXCESS = 0.5
+# and by this number of standard deviations of chi-square per degree of freedom, sqrt(2 / freedom).
 CHI2_SIGMAS = 6.0
+# RMS residual, in parts of half the contrast, below which a misfit is not visible and a corner is
+# kept whatever its chi-square. Chosen by trial.
 MISFIT_MAX = 0.12
-# Undisturbed corners exceed this score once in 2000; it has two degrees of freedom, and a median
-# of 1.39.
+# Undisturbed corners exceed this score, a chi-square with two degrees of freedom, once in 2000.
 IMBALANCE_MAX = 15.0
+# The median of that chi-square, 2 ln 2.
 IMBALANCE_MEDIAN = 1.39
 # Stains of the board and the model's own shortcomings, relative to half the contrast.
 UNLIKE_MAX = 0.05
@@ -97,6 +110,8 @@ BORDER = 0.5
 # Noise alone exceeds four sigmas once in 15000 corners, but the spread is that of all corners and
 # its tails are longer than a normal distribution's.
 BLUR_SIGMAS = 4.0
+# A quadratic map has six coefficients per coordinate and a linear one half of that: fewer corners
+# cannot be compared with each other.
 CORNERS_MIN = 6
 
 

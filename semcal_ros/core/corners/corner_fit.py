@@ -25,9 +25,16 @@ from semcal_ros.core.corners.window import PixelWindows
 __all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
 
 
+# A pixel averages over its own width, which alone is a blur of 1 / sqrt(12) = 0.289 px: no edge is
+# sharper.
 BLUR_MIN_PX = 0.28
+# Least half-width of the band along an edge, which leaves room for an error of the prediction.
 BAND_MIN_PX = 3.0
+# Half-width of the band in blur widths: at three of them the slope of an edge is 1 % of its peak.
 BAND_BLURS = 3.0
+# The line of the noise model falls below zero for dark pixels; this part of the floor keeps their
+# weights within a factor of four of those at the mean of the dark pixels. A safeguard, not a
+# measurement.
 LEAST_OF_FLOOR = 0.25
 # Large enough to hide what a call costs, small enough to keep the arrays in a cache.
 BLOCK_PIXELS = 24000

@@ -17,7 +17,12 @@ from semcal_ros.core.errors import Rejection
 __all__ = ["LatticeDetection", "LatticeStatus", "find_lattice"]
 
 
+# Scales of the search for saddle points, px. A quarter of the spacing is best, so that these suit
+# spacings of about 10, 6, 17 and 28 px, in steps of a factor of 1.7. The first suits the small
+# squares of low magnifications; a convincing lattice ends the search.
 SCALES_PX = (2.5, 1.5, 4.2, 7.0)
+# A view with fewer corners is refused; it is also the least that the search for the distortion
+# centre uses.
 MINIMUM_CORNERS = 12
 # A lattice that fills this part of the image is not going to be beaten at another scale.
 FILLED = 0.6

@@ -36,16 +36,22 @@ __all__ = [
 ]
 
 
-# x, y, direction of the edge along i and of that along j, log blur, extra sagitta of the two edges
-# over half a square; then b0, bx, by, a0, ax, ay, g1, g2.
+# Number of nonlinear parameters: x, y, direction of the edge along i and of that along j, log blur,
+# extra sagitta of the two edges over half a square.
 NONLINEAR = 7
+# Number of linear parameters, which follow: b0, bx, by, a0, ax, ay, g1, g2.
 LINEAR = 8
+# Indices of the parameters: directions of the two edges,
 ANGLES = slice(2, 4)
+# logarithm of the blur,
 LOG_BLUR = 4
+# extra sagittas,
 SAGITTAS = slice(5, 7)
+# brightness b0 and contrast a0,
 BRIGHTNESS, CONTRAST = 7, 10
-# bx, by and ax, ay
+# gradients of the brightness and of the contrast,
 GRADIENTS = (slice(8, 10), slice(11, 13))
+# growth of the bright squares at the two edges.
 GROWTH = slice(13, 15)
 
 
@@ -93,6 +99,7 @@ class EdgeGeometry:
 # erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
 # 7.1.26, error below 1.5e-7, single precision's own. It shares the exponential with the derivative.
 ERF_P = np.float32(0.3275911)
+# c1 to c5.
 ERF_C = tuple(
     np.float32(c) for c in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
 )

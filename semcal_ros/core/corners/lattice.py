@@ -13,14 +13,24 @@ from semcal_ros.core.corners.saddle import SaddlePoints
 __all__ = ["Lattice", "grow_best_lattice"]
 
 
+# Nearest saddle points among which the four neighbours of a seed are looked for: the first four
+# shells of a square lattice (4 + 4 + 4 + 8). A tilt and spurious saddle points move the four
+# neighbours beyond the first shell.
 NEIGHBOURS = 20
 # Saddle directions of skewed cells are off by some degrees, and noise adds to it.
 COSINE_MIN = float(np.cos(np.deg2rad(28.0)))
+# Sum of two opposite arms over their length. Where a neighbour is missing, arms of one and of three
+# squares give 0.5.
 SEED_ASYMMETRY_MAX = 0.25
+# Distance from a prediction within which a saddle point is accepted, in squares. Below 0.5 it
+# cannot be nearer to the prediction of the next cell.
 SEARCH_RADIUS = 0.3
+# Bounds the time for images without a board.
 SEEDS_TRIED = 8
-# Seeds are looked for among so many of the strongest saddles; one in the middle of a board is enough.
+# Number of the strongest saddle points among which seeds are looked for; one seed in the middle of
+# a board is enough.
 SEED_POINTS = 1200
+# From a cell to its four neighbours.
 STEPS: Indices = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 
 

@@ -40,12 +40,17 @@ from semcal_ros.core.corners.window import gather_windows
 __all__ = ["RefinedCorners", "refine_lattice"]
 
 
+# Blur that the first fits start from; its loose prior covers 0.4 to 2.7 px within two sigma.
 FIRST_BLUR_PX = 1.0
+# Rounds of filling in; each adds a ring of cells around what has been found, and growing has found
+# most of them before.
 GROW_ROUNDS = 4
-# Corners that teach what the image is like, and the part of them that must look like corners.
+# Corners from which noise, blur and spreads are learnt.
 SAMPLE = 40
+# Part of the sample that must pass. The finder asks for half of all corners in the end, and a
+# sample of 40 falls this far below a half by three standard deviations.
 HOPELESS = 0.25
-# Corners that teach again, when noise and blur are known.
+# Corners from which the spreads are learnt again, when noise and blur are known.
 SECOND_SAMPLE = 160
 # Corners nearer to the frame than this part of a square, besides the margin, may fail.
 RIM_PART = 0.1

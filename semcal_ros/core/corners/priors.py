@@ -28,22 +28,31 @@ __all__ = ["LARGE_SQUARE_PX", "Learnt", "Prior", "learn", "loose_prior", "smooth
 
 
 PARAMETERS = NONLINEAR + LINEAR
+# Direction of an edge about that of the local map, rad. Saddle points are good to a few tenths of a
+# pixel, which over one square of 10 px is about this.
 ANGLE_PRIOR = 0.03
+# Logarithm of the blur: a factor of 1.6 about the first guess.
 LOG_BLUR_PRIOR = 0.5
 # What a quadratic or cubic map through few, one-sided neighbours misses of a strong distortion
 # grows as the third power.
 SAGITTA_PRIOR_PX = 0.5
+# Side of the squares for which that holds: about a quarter of a 512 px image.
 LARGE_SQUARE_PX = 130.0
 # Shading over half a square, relative to the contrast of the image.
 GRADIENT_PRIOR = 0.15
+# Least deviation of a gradient that the neighbours predict: just below the step of an 8-bit image,
+# 1 / 255 of its range.
 GRADIENT_LEAST = 0.003
 # Growth of the bright squares times contrast, px.
 GROWTH_PRIOR = 0.3
-# Spreads that are tried, relative to the loose ones above, and how far the fit of the largest one
-# accepted may be behind the best: one standard deviation.
+# Spreads that are tried, relative to the loose ones above.
 SPREADS: Array = np.geomspace(0.02, 1.0, 14)
+# Loss of log-likelihood against the best spread up to which a larger one is taken: one standard
+# deviation.
 LIKELIHOOD_LOSS = 0.5
+# Squared score at which an outlier's weight ends: three standard deviations.
 OUTLIER = 9.0
+# Parameters that share one spread.
 GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)
 # Parameters with a value that is common to all corners of an image.
 COMMON = (LOG_BLUR, GROWTH.start, GROWTH.start + 1)

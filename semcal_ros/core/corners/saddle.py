@@ -19,7 +19,11 @@ __all__ = ["LatticeStatus", "SaddlePoints", "find_saddles", "prepare_image", "sc
 # is quadratic in the contrast, so corners with a third of the contrast of the strong ones still
 # count.
 RELATIVE_THRESHOLD = 0.1
+# Rank of the response that stands for the strong saddles: as many corners as a usable image has at
+# least, so that a few specks brighter than the board do not set the threshold.
 STRONG_RANK = 12
+# Bounds the time. Squares of 11 px, small ones for a calibration, have 2200 corners in a 512 px
+# image.
 MAX_POINTS = 6000
 
 
@@ -116,7 +120,10 @@ def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64],
     return rows[order].astype(np.int64), columns[order].astype(np.int64)
 
 
+# The squares of one colour cover half of the image: where more is at a limit of the grey values,
+# neither colour is free of it.
 SATURATED_MAX = 0.5
+# Twelve corners of the smallest squares that can be found, 6 px, take about as many pixels.
 SMALLEST_SIDE = 32
 
 
