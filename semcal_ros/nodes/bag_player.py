@@ -1,4 +1,4 @@
-"""Executable ``bag_player``: a recording on its own topics, at any rate, without a ROS installation's tools."""
+"""Executable ``bag_player``: replays a recording on its own topics, at any rate, without ROS command-line tools."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ __all__ = ["BagPlayer", "main"]
 
 
 class _Pacer:
-    """Position in a recording that advances with a wall clock, which is an argument.
+    """Position in a recording that advances with a wall clock; wall times are arguments.
 
     Parameters
     ----------
     rate
         Seconds of recording per second.
     paused
-        Whether it stands still at first.
+        Whether the position stands still at first.
     """
 
     def __init__(self, rate: float = 1.0, *, paused: bool = False) -> None:
@@ -47,14 +47,14 @@ class _Pacer:
         self._wall_s = None
 
     def advance(self, wall_s: float) -> int:
-        """Position at a wall time that does not go back, ns."""
+        """Return the position at a wall time, ns; wall times must not decrease."""
         if self._wall_s is not None and not self.paused:
             self.position_ns += round((wall_s - self._wall_s) * self.rate * 1e9)
         self._wall_s = wall_s
         return self.position_ns
 
     def wait_s(self, target_ns: int, at_most_s: float) -> float:
-        """Seconds of wall time until a position is reached, limited; the limit itself while paused."""
+        """Return the wall time until a position is reached, s, at most the limit; the limit while paused."""
         if self.paused:
             return at_most_s
         return min(max(target_ns - self.position_ns, 0) * 1e-9 / self.rate, at_most_s)
@@ -89,9 +89,10 @@ _TICK_S = 0.02
 _ACK_S = 10.0
 # Discovery takes a second, and several on a busy machine; afterwards the replay begins in any case.
 _DISCOVERY_S = 10.0
-# The replay's thread looks at its end every _TICK_S; longer only a read of the disk can take.
+# The replay's thread checks every _TICK_S whether it should end; only a read from disk can take
+# longer.
 _END_S = 5.0
-# Of each topic: a burst of messages with nearly the same log time goes out at once.
+# Queue length per topic: a burst of messages with nearly the same log time goes out at once.
 _DEPTH = 10
 
 
@@ -128,11 +129,11 @@ class BagPlayer(SemNode):
         self.closing.callback(self._end_replay)
 
     def idle(self) -> bool:
-        """A replay takes no frames in."""
+        """Return True: a replay receives no frames."""
         return True
 
     def conditions(self) -> list[str]:
-        """As in the base class; also whether the replay is paused."""
+        """Extend the base class: also report whether the replay is paused."""
         return super().conditions() + ["paused"] * self._pacer.paused
 
     def _end_replay(self) -> None:
@@ -157,7 +158,7 @@ class BagPlayer(SemNode):
         return publishers
 
     def _make_publisher(self, topic: BagTopic) -> Any:
-        """Publisher of a topic, or None, counted, where its type is not installed."""
+        """Make the publisher of a topic; count and return None if its type is not installed."""
         try:
             message_type = message_class(topic.type)
         except ConfigError as error:
@@ -247,7 +248,7 @@ class BagPlayer(SemNode):
                 self._wait_for_discovery(publisher, message.log_time_ns)
 
     def _wait_for_discovery(self, publisher: Any, position_ns: int) -> None:
-        """Wait until the subscribers have discovered this node as well, which its knowing of them does not prove.
+        """Wait until the subscribers have discovered this node: that it knows them does not prove it.
 
         A latched message reaches them however late they discover it, and only then do they acknowledge it.
         """
@@ -257,7 +258,7 @@ class BagPlayer(SemNode):
             self._pacer.seek(position_ns)
 
     def _wait_until(self, target_ns: int) -> bool:
-        """Wait for a position of the recording; False if the replay shall end."""
+        """Wait for a position of the recording; return False if the replay must end."""
         while True:
             with self._changed:
                 if self._ended:
@@ -276,7 +277,7 @@ class BagPlayer(SemNode):
             self._clock_publisher.publish(message)
 
     def _flush(self) -> None:
-        """Give reliable subscribers the time to get the last messages."""
+        """Give reliable subscribers time to receive the last messages."""
         for publisher in [] if self._ended else self._publishers_by_topic.values():
             publisher.wait_for_all_acked(Duration(seconds=_ACK_S))
 

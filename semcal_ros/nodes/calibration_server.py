@@ -197,7 +197,7 @@ class CalibrationServer(StreamNode):
             return self._running
 
     def _finish(self, running: CalibrationProcess, *, done: bool) -> bool:
-        """Allow the next one; False if this one was cancelled."""
+        """Allow the next calibration; return False if this one was cancelled."""
         with self._lock:
             wanted = self._running is running
             if wanted:

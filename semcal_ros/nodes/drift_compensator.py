@@ -1,4 +1,4 @@
-"""Executable ``drift_compensator``: the stream without drift, and the drift; it needs no calibration."""
+"""Executable ``drift_compensator``: publishes the stream without drift, and the drift; it needs no calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["DriftCompensator", "main"]
 class DriftCompensator(StreamNode):
     """Publishes ``image_stabilized``, ``drift`` and ``drift_velocity``.
 
-    Metres come from the display width of the configuration; the distortion stays in the images.
+    The scale in metres comes from the configured display width; the distortion stays in the images.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class DriftCompensator(StreamNode):
             self._drifts.publish(drift, frame)
 
     def conditions(self) -> list[str]:
-        """As in the base class; also whether the drift is only predicted."""
+        """Extend the base class: also report whether the drift is only predicted."""
         return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
 
 

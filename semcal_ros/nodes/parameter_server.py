@@ -1,4 +1,4 @@
-"""Executable ``parameter_server``: the calibration at any magnification, by topics and as ordinary parameters."""
+"""Executable ``parameter_server``: serves the calibration at any magnification, on topics and as parameters."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _SIZE = (
         "image_height", 0, "Height of the live frames; 0: that of the calibration.", "px", 0, 65536
     ),
 )
-# To discover other publishers of a calibration, and to receive theirs once one is discovered.
+# Time to discover other publishers of a calibration, and to receive a calibration once one is discovered.
 _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
-# How often the end of that time is checked: six times within the shorter one.
+# How often the end of these times is checked: six times within the shorter one.
 _TICK_S = 0.5
 
 
 class ParameterServer(SemNode):
     """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like.
 
-    A calibration that another node publishes is taken over, and published again for late subscribers.
+    A calibration that another node publishes is taken over and republished for late subscribers.
     """
 
     def __init__(self) -> None:
@@ -65,19 +65,19 @@ class ParameterServer(SemNode):
             self.config, self.endpoints, self.reporter, self._on_reading
         )
         self._reload = self.endpoints.trigger_service("~/reload", self._on_reload)
-        # A server that is started again must not set everybody back to its file while another node, such as
-        # calibration_server, still holds what has come into force since.
+        # A restarted server must not set all nodes back to its file while another node, such as calibration_server,
+        # still holds a calibration that has come into force since.
         self._listened_s = 0.0
         self._listening = self.create_timer(
             _TICK_S, self._publish_start, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
     def idle(self) -> bool:
-        """A magnification that does not change is no trouble."""
+        """Return True: a constant magnification is normal."""
         return True
 
     def conditions(self) -> list[str]:
-        """As in the base class; also whether there is no calibration."""
+        """Extend the base class: also report a missing calibration."""
         missing = self._calibration.current is None
         return super().conditions() + ["uncalibrated"] * missing
 
@@ -108,7 +108,7 @@ class ParameterServer(SemNode):
         self._update()
 
     def _update(self) -> None:
-        """Publish camera and projection if the magnification is another one than last time."""
+        """Publish camera and projection if the magnification differs from the last one."""
         source = self._calibration
         if source.current is None or self._reading is None:
             return
@@ -137,7 +137,7 @@ class ParameterServer(SemNode):
         fill_projection(projection, camera)
         self._projection.publish(projection)
         self.reporter.count_published(None)
-        # A node that describes every single image knows better; two sources would break its pairs.
+        # A node that publishes the camera of every image takes precedence; two sources would break its pairs.
         if self.count_publishers(self._info.topic_name) > 1:
             return
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.frame_id)
@@ -164,7 +164,7 @@ class ParameterServer(SemNode):
     # -- continuous parameters -----------------------------------------------------------------------
 
     def _continuous(self, name: str) -> Parameter:
-        """Value of ``kind@magnification``; not set, with a warning that says why, where there is none."""
+        """Return the value of ``kind@magnification``; if there is none, log why and return a parameter not set."""
         try:
             if self._calibration.current is None:
                 raise InvalidValueError(
@@ -178,7 +178,7 @@ class ParameterServer(SemNode):
         return Parameter(name, Parameter.Type.DOUBLE_ARRAY, value)
 
     def get_parameter(self, name: str) -> Parameter:
-        """As for any node; continuous parameters are computed."""
+        """Extend the base class: continuous parameters are computed."""
         if is_continuous_parameter(name):
             return self._continuous(name)
         return super().get_parameter(name)
@@ -201,7 +201,7 @@ class ParameterServer(SemNode):
         )
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """As for any node; continuous parameters are refused."""
+        """Extend the base class: continuous parameters are refused."""
         for parameter in parameter_list:
             if is_continuous_parameter(parameter.name):
                 reason = f"{parameter.name} is computed from the calibration and cannot be set"

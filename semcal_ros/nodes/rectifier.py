@@ -1,4 +1,4 @@
-"""Executable ``rectifier``: the stream without distortion, with the camera of each frame."""
+"""Executable ``rectifier``: publishes the stream without distortion, with the camera of each frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RectifierNode(CalibratedStreamNode):
         self.receive_frames(
             self._on_frame,
             topic="image_stabilized" if stabilized else None,
-            # The stabilised image has no data bar any more.
+            # The stabilised image no longer has a data bar.
             databar_rows=0 if stabilized else None,
         )
 

@@ -27,7 +27,7 @@ class StreamCorrector(CalibratedStreamNode):
         self.receive_frames(self._on_frame)
 
     def on_calibration(self) -> None:
-        """A keyframe in the coordinates of the old calibration is of no use."""
+        """Reset the drift: a keyframe in the coordinates of the old calibration is useless."""
         self._drift.reset()
 
     def _on_frame(self, frame: StreamFrame) -> None:
@@ -46,7 +46,7 @@ class StreamCorrector(CalibratedStreamNode):
             self._drifts.publish(drift, frame)
 
     def conditions(self) -> list[str]:
-        """As in the base class; also whether the drift is only predicted."""
+        """Extend the base class: also report whether the drift is only predicted."""
         return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
 
 

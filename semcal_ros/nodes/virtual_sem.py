@@ -1,4 +1,4 @@
-"""Executable ``virtual_sem``: a live microscope with a stage and a magnification knob, for trying everything out."""
+"""Executable ``virtual_sem``: a simulated live microscope with a stage and a magnification knob."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class VirtualSem(SemNode):
         self._timer = self.create_timer(self._period_s(), self._take_frame)
 
     def idle(self) -> bool:
-        """It takes no frames in."""
+        """Return True: this node receives no frames."""
         return True
 
     # -- set-up ------------------------------------------------------------------------------------
@@ -179,14 +179,14 @@ class VirtualSem(SemNode):
         return (self.get_clock().now().nanoseconds - self._start_ns) * 1e-9
 
     def _announce(self) -> None:
-        """Publish the magnification if it is not the published one; the frame that is being scanned shows both."""
+        """Publish the magnification if it has changed; the frame that is being scanned shows both."""
         if self._scene.magnification != self._announced:
             self._announced = self._scene.magnification
             self._magnification.publish(Float64(data=self._announced))
             self.reporter.note("magnification", self._announced)
 
     def _take_frame(self) -> None:
-        # The frame that has just been completed: what the stamp means is when its first pixel was scanned.
+        # The frame that has just been completed: the stamp is the time at which its first pixel was scanned.
         start_s = self._now_s() - self._scene.microscope.timing.acquisition_time_s
         try:
             frame = self._scene.frame(start_s)

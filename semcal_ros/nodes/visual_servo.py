@@ -1,4 +1,4 @@
-"""Executable ``visual_servo``: brings a target on the stage to a pose in the sem frame, at whatever magnification."""
+"""Executable ``visual_servo``: brings a target on the stage to a pose in the sem frame, at any magnification."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ __all__ = ["VisualServo", "main"]
 
 # Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
-# The stage stops after this many intervals, and at least this time, without a frame: one lost frame is no reason.
+# The stage stops after this many intervals, and at least this time, without a frame: one lost frame does not stop it.
 _SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
-# Stamps further away than this are from another clock: no frame takes that long to arrive.
+# Stamps that differ from now by more are from another clock: no frame takes that long to arrive.
 _OTHER_CLOCK_S = 30.0
-# A target that is not found may have left the picture if the drift is more than this part of its width: more than
+# A target that is not found may have left the image if the drift exceeds this fraction of its width: more than
 # markers at the edge can hide.
 _HIDDEN = 0.03
 # Least time between two resets while the target is still found, in addition to two frame intervals:
@@ -49,8 +49,8 @@ class VisualServo(SemNode):
     """Takes rectified images with their camera and drift, and publishes velocities of the stage.
 
     The stage stands still unless every one of these holds: ``~/start`` was called; frames come; the frame has a
-    camera; the target is found in it and has the size which that camera says; the magnification has not changed
-    since; the picture follows the stage.
+    camera; the target is found in the image with the size that this camera implies; the magnification has not
+    changed since; the image follows the stage.
     """
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class VisualServo(SemNode):
             self.endpoints.trigger_service("~/start", self._on_start),
             self.endpoints.trigger_service("~/stop", self._on_stop),
         ]
-        # A simulated clock may stand still; the stage must not go on for that.
+        # A simulated clock may stand still; the stage must not keep moving because of it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog = self.create_timer(_TICK_S, self._watch, clock=steady)
 
@@ -116,7 +116,7 @@ class VisualServo(SemNode):
         return "the stage stands still"
 
     def _on_magnification(self, reading: MagnificationReading) -> None:
-        """The frame that is being scanned shows two magnifications and will not come."""
+        """Stop: the frame that is being scanned shows two magnifications and will not arrive."""
         before, self._magnification_value = self._magnification_value, reading.value
         if before is not None and before != reading.value:
             self._halt("the magnification has changed")
@@ -151,7 +151,7 @@ class VisualServo(SemNode):
         return self.get_clock().now().nanoseconds * 1e-9
 
     def _times(self, stamp_ns: int) -> tuple[float, float | None]:
-        """Centre of a frame's acquisition, and now; None where the stamp is of another clock."""
+        """Return the centre of a frame's acquisition, and now; None if the stamp is of another clock."""
         scan = self.config.scan
         centre_offset_s = 0.0 if scan is None else scan.centre_offset_s
         now_s = self._now_s()
@@ -196,7 +196,7 @@ class VisualServo(SemNode):
         )
 
     def _keep_in_view(self, frame: ServoFrame, step: ServoStep) -> None:
-        """Reset the corrector when its picture, which it holds in place, has left the field."""
+        """Reset the corrector when the image that it holds in place has drifted out of the field of view."""
         if self._reset is None or not frame.projections or not self._reset.service_is_ready():
             return
         px_per_m = float(np.linalg.norm(frame.projections[-1][:2, :2], 2))
@@ -228,12 +228,12 @@ class VisualServo(SemNode):
         note("servo_resets", self._resets)
 
     def conditions(self) -> list[str]:
-        """As in the base class; also why the stage stands still."""
+        """Extend the base class: also report why the stage stands still."""
         standing = self._active and self._state not in ("servoing", "converged")
         return super().conditions() + [self._state] * standing
 
     def idle(self) -> bool:
-        """It has no stream of its own before it is started."""
+        """Return whether the control has not been started: it expects no stream before."""
         return not self._active
 
 

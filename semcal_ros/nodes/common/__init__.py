@@ -1,1 +1,1 @@
-"""What every node shares: parameters, quality of service, services, orderly ends."""
+"""What every node shares: parameters, quality of service, services, orderly shutdown."""

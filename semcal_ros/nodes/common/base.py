@@ -1,4 +1,4 @@
-"""What all nodes of the suite share: configuration, parameters, statistics, diagnostics and an orderly end."""
+"""What all nodes of the suite share: configuration, parameters, statistics, diagnostics, shutdown."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ class SemNode(Node):
     config
         The configuration that the parameter names.
     parameters, endpoints, reporter
-        Values of the parameters; what makes publishers, subscriptions and services; what counts and logs.
+        The values of the parameters; the factory of publishers, subscriptions and services; the counters and
+        the log.
     closing
-        What to end before the node is destroyed, the last one first. A node that could not be made completely is
-        destroyed too, and then ends what it had made.
+        What to close before the node is destroyed, in reverse order. A node whose constructor failed is destroyed
+        too, and closes what it had opened.
 
     Raises
     ------
@@ -57,7 +58,7 @@ class SemNode(Node):
     """
 
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
-        # First: the middleware may destroy a node that is still being made.
+        # First: the middleware may destroy a node whose constructor is still running.
         self.closing = ExitStack()
         super().__init__(name, namespace=DEFAULT_NAMESPACE)
         self.parameters = Parameters(self, (CONFIG, *declarations))
@@ -74,18 +75,18 @@ class SemNode(Node):
         )
 
     def destroy_node(self) -> None:
-        """As in the base class, after what :attr:`closing` holds."""
+        """Close what :attr:`closing` holds, then destroy the node as the base class does."""
         self.closing.close()
         super().destroy_node()
 
     # -- diagnostics -------------------------------------------------------------------------------
 
     def conditions(self) -> list[str]:
-        """What is not as it should be at present, in a few words each."""
+        """Return what is wrong at present, a few words each."""
         return self.endpoints.conditions()
 
     def idle(self) -> bool:
-        """Whether this node has no stream whose silence would be news."""
+        """Return whether this node has no stream whose silence would be worth reporting."""
         return False
 
     def _summary(self) -> DiagnosticSummary:
@@ -103,7 +104,7 @@ class SemNode(Node):
         return replace(summary, level=level, message=message)
 
     def status(self) -> DiagnosticStatus:
-        """The current state as a message."""
+        """Return the current state as a message."""
         status = DiagnosticStatus()
         name = f"{self.get_fully_qualified_name()}: stream"
         fill_diagnostic_status(status, name, self.config.name, self._summary())

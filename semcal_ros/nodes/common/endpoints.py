@@ -1,4 +1,4 @@
-"""The publishers, subscriptions and services of a node, made alike and watched together."""
+"""The publishers, subscriptions and services of a node, created alike and monitored together."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["Endpoints"]
 
 
 class Endpoints:
-    """Makes what connects a node with others; everything that it makes lives as long as the node.
+    """Creates what connects a node with others; everything it creates lives as long as the node.
 
     Parameters
     ----------
     node
-        The ROS node that owns what is made.
+        The ROS node that owns what is created.
     """
 
     def __init__(self, node: Node) -> None:
@@ -50,11 +50,11 @@ class Endpoints:
         return subscription
 
     def stream_publisher(self, message_type: Any, topic: str) -> Any:
-        """Publisher of what belongs to single frames."""
+        """Create a publisher of messages that belong to single frames."""
         return self._publisher(message_type, topic, stream_output())
 
     def latched_publisher(self, message_type: Any, topic: str) -> Any:
-        """Publisher whose last message reaches late subscribers too."""
+        """Create a publisher whose last message also reaches late subscribers."""
         return self._publisher(message_type, topic, latched())
 
     def _publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:
@@ -65,7 +65,7 @@ class Endpoints:
         return publisher
 
     def guard(self, callback: Callable[[], None]) -> GuardCondition:
-        """A condition that any thread may trigger, and whose callback the executor of the node runs."""
+        """Create a condition that any thread may trigger; the node's executor runs its callback."""
         return self._node.create_guard_condition(callback)
 
     def trigger_service(
@@ -75,16 +75,16 @@ class Endpoints:
         group: CallbackGroup | None = None,
         on_answer: Callable[[bool, str], None] | None = None,
     ) -> Any:
-        """A std_srvs/Trigger service, which does something and answers with a sentence.
+        """Create a std_srvs/Trigger service, which does something and answers with a sentence.
 
         Parameters
         ----------
         name, group
             Where it is served.
         handler
-            Does the work and returns the answer; what it raises of :data:`NODE_ERRORS` is the reason of a refusal.
+            Does the work and returns the answer; an exception of :data:`NODE_ERRORS` becomes the reason of a refusal.
         on_answer
-            Called with success and answer.
+            Called with the success flag and the answer.
         """
 
         def answer(_request: Any, response: Any) -> Any:
@@ -106,16 +106,16 @@ class Endpoints:
     # -- watching ----------------------------------------------------------------------------------
 
     def check_publishers(self) -> None:
-        """See who publishes on the topics subscribed to; to be called now and then."""
+        """Check who publishes on the subscribed topics; call it periodically."""
         for subscription in self._subscriptions:
             subscription.check_publishers()
 
     def subscriber_counts(self) -> dict[str, int]:
-        """How many subscribers each topic of this node has."""
+        """Return the number of subscribers of each topic of this node."""
         return {topic: p.get_subscription_count() for topic, p in self._publishers.items()}
 
     def conditions(self) -> list[str]:
-        """What is not as it should be with the topics subscribed to, in a few words each."""
+        """Return what is wrong with the subscribed topics, a few words each."""
         weak = [f"{s.topic} without {s.downgraded}" for s in self._subscriptions if s.downgraded]
         foreign = [(s.topic, s.foreign_types) for s in self._subscriptions if s.foreign_types]
         return weak + [f"{types} on {topic}" for topic, types in foreign]

@@ -1,4 +1,4 @@
-"""Work beside the callbacks of a node, whose results come back between them."""
+"""Work in a thread beside a node's callbacks; its results are delivered between callbacks."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class _Guard(Protocol):
 class LatestWorker(Generic[Item, Result]):
     """Works on the newest item that was submitted; older ones that have not begun are skipped.
 
-    Items are compared: the newer one is the greater.
+    Items are compared with each other: the newer one is the greater.
 
     Parameters
     ----------
     make_guard
-        Makes a condition that any thread may trigger, and whose callback the executor of a node runs, such as
+        Creates a condition that any thread may trigger and whose callback a node's executor runs, such as
         :meth:`~semcal_ros.nodes.common.endpoints.Endpoints.guard`.
     work
-        Runs in a thread of its own; must not raise.
+        Runs in its own thread; must not raise.
     on_result
         Called with each result, like any callback of the node.
     """
@@ -49,7 +49,7 @@ class LatestWorker(Generic[Item, Result]):
         self._guard = make_guard(self._hand_over)
 
     def submit(self, item: Item) -> None:
-        """Work on the item, unless a newer one is waiting or comes before the work begins."""
+        """Submit an item; it is skipped if a newer one is waiting or arrives before the work begins."""
         with self._lock:
             self._waiting = item if self._waiting is None else max(self._waiting, item)
             if self._busy:

@@ -1,4 +1,4 @@
-"""Parameters of a node: declared once with description, unit and range, checked with a reason, applied live."""
+"""Parameters of a node: declared once with description, unit and range, refused with a reason, applied live."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ParameterDeclaration:
     fixed
         Only read when the node starts.
     confined
-        Names a file, which must lie inside of :data:`DIRECTORY` once the node runs.
+        The parameter names a file, which must lie inside :data:`DIRECTORY` once the node runs.
     """
 
     name: str
@@ -70,7 +70,7 @@ class ParameterDeclaration:
 
     @property
     def expected(self) -> str:
-        """What is accepted, for messages."""
+        """What is accepted, as a text for messages."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         kind = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
@@ -80,7 +80,7 @@ class ParameterDeclaration:
         return f"{text} ({self.unit})" if self.unit else text
 
     def descriptor(self) -> ParameterDescriptor:
-        """Descriptor for ``declare_parameter``."""
+        """Return the descriptor for ``declare_parameter``."""
         text = f"{self.description} Accepted: {self.expected}."
         descriptor = ParameterDescriptor(description=text, read_only=self.fixed)
         # A statically typed double would refuse `rate:=5`.
@@ -95,7 +95,7 @@ class ParameterDeclaration:
         return descriptor
 
     def convert(self, value: Any) -> Any:
-        """``value`` in the type of the parameter; raises :class:`InvalidValueError` if it is not accepted."""
+        """Convert a value to the parameter's type; raises :class:`InvalidValueError` if it is not accepted."""
         wanted = type(self.default)
         if self.is_float and type(value) is int:
             value = float(value)
@@ -154,7 +154,7 @@ class Parameters:
     """
 
     def __init__(self, node: Node, declarations: Iterable[ParameterDeclaration]) -> None:
-        # The last one of a name counts: a node may change a default.
+        # The last declaration of a name counts: a node may change a default.
         self._declared = {declaration.name: declaration for declaration in declarations}
         self._values: dict[str, Any] = {}
         self._checks: dict[str, Check] = {}
@@ -167,7 +167,8 @@ class Parameters:
                 declaration.name, declaration.default, declaration.descriptor()
             )
             self._values[declaration.name] = declaration.convert(given.value)
-        # Files named at start are trusted: whoever starts the node has its rights. Callers of services are not.
+        # Files named at start are trusted, since the user who starts the node has its rights. Callers of
+        # services are not.
         trusted = [self._values[name] for name in confined if self._values[name]]
         self._allowed = AllowedPaths(self._values.get(DIRECTORY.name, ""), trusted)
         node.add_on_set_parameters_callback(self._on_set)
@@ -177,11 +178,11 @@ class Parameters:
         return self._values[name]
 
     def allowed_path(self, path: str) -> Path:
-        """The file behind a name, links resolved; raises :class:`InvalidValueError` if it lies elsewhere."""
+        """Resolve a file name and its links; raises :class:`InvalidValueError` if the file lies outside."""
         return self._allowed.resolve(path)
 
     def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
-        """Call ``apply(value)`` after each accepted change, and ``check(value)``, which may raise, before."""
+        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after."""
         self._applies[name] = apply
         if check is not None:
             self._checks[name] = check

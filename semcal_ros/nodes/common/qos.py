@@ -22,9 +22,9 @@ __all__ = [
     "value_input",
 ]
 
-# Of the middleware, which counts in signed integers of 32 bit.
+# Limit of the middleware, which counts in signed 32 bit integers.
 _LARGEST_DEPTH = 2**31 - 1
-# As many as parameter services keep: of the usual ten, requests of busy clients would be lost and never answered.
+# As many as parameter services keep: with the usual ten, requests of busy clients would be lost and never answered.
 _WAITING_REQUESTS = 1000
 
 
@@ -38,35 +38,35 @@ def _profile(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 
 
 def image_input() -> QoSProfile:
-    """A few images wait while one is being processed, so that a hiccup loses none.
+    """Return the quality for images: a few wait while one is processed, so that a short delay loses none.
 
-    Those that have waited for too long are passed over by :class:`~semcal_ros.nodes.frames.stream.FrameInput`.
+    Images that have waited too long are skipped by :class:`~semcal_ros.nodes.frames.stream.FrameInput`.
     """
     return _profile(10, DurabilityPolicy.VOLATILE)
 
 
 def value_input(depth: int = 100) -> QoSProfile:
-    """Every value counts, the last one before the node started too."""
+    """Return the quality for values: each one counts, including the last one before the node started."""
     return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def stream_output(depth: int = 8) -> QoSProfile:
-    """Images and what goes with each of them."""
+    """Return the quality for images and for the messages that go with each of them."""
     return _profile(depth, DurabilityPolicy.VOLATILE)
 
 
 def latched() -> QoSProfile:
-    """The last value is kept for late subscribers."""
+    """Return the quality for a value that is kept for late subscribers."""
     return _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def service_queue() -> QoSProfile:
-    """Quality of a service that keeps all requests of busy clients."""
+    """Return the quality of a service that keeps all requests of busy clients."""
     return QoSProfile(depth=_WAITING_REQUESTS)
 
 
 def overridable() -> QoSOverridingOptions:
-    """Options that declare ``qos_overrides.<topic>.<publisher|subscription>.<policy>`` parameters."""
+    """Return options that declare ``qos_overrides.<topic>.<publisher|subscription>.<policy>`` parameters."""
     kinds = (
         QoSPolicyKind.HISTORY,
         QoSPolicyKind.DEPTH,
@@ -83,7 +83,7 @@ def _check_depth(profile: QoSProfile) -> SetParametersResult:
 
 
 def relax(profile: QoSProfile, refused: QoSPolicyKind) -> QoSProfile | None:
-    """The profile without the demand that a publisher does not meet; None if it demands nothing of that kind."""
+    """Return the profile without the demand that a publisher does not meet; None if there is no such demand."""
     reliability, durability = profile.reliability, profile.durability
     if refused == QoSPolicyKind.RELIABILITY:
         reliability = ReliabilityPolicy.BEST_EFFORT

@@ -16,12 +16,12 @@ __all__ = ["NODE_ERRORS", "Reporter"]
 NODE_ERRORS = (SemcalError, cv2.error)
 """What a message can cause; a node counts it, reports it and goes on."""
 
-# Often enough to be seen by somebody who begins to look, seldom enough to leave the rest of the log readable.
+# Often enough for a user who opens the log, seldom enough to leave the rest of it readable.
 _LOG_AGAIN_S = 10.0
-# Different warnings within that time, so that one whose numbers change does not flood the log.
+# Different warnings within this time, so that one whose numbers change does not flood the log.
 _LOGGED_AT_ONCE = 100
-# A stamp further away than this is from another clock, such as a replay without simulated time: no stream is an hour
-# late, and recordings are older.
+# A stamp that differs by more is from another clock, such as that of a replay without simulated time: no stream is
+# an hour late, and recordings are older.
 _OTHER_CLOCK_S = 3600.0
 
 
@@ -33,7 +33,7 @@ class Reporter:
     logger
         The logger of the node.
     clock
-        The clock of the node, which stamps are compared with.
+        The clock of the node; stamps are compared with it.
     """
 
     def __init__(self, logger: Any, clock: Clock) -> None:

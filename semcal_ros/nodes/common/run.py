@@ -1,4 +1,4 @@
-"""Start, spin and end of every executable."""
+"""How every executable starts, spins and ends."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ __all__ = ["DeferredSignals", "run_node"]
 
 
 class DeferredSignals:
-    """From now on SIGINT and SIGTERM are only noted, until :meth:`follow` is called.
+    """Notes SIGINT and SIGTERM from its creation on; :meth:`follow` acts on them.
 
-    ROS itself would shut the middleware down at once, and ``destroy_node`` could publish nothing any more. To be made
-    in the main thread, once ROS is up.
+    ROS itself would shut the middleware down at once, and ``destroy_node`` could no longer publish anything. Create it
+    in the main thread after ROS has been initialised.
     """
 
     def __init__(self) -> None:
@@ -47,16 +47,16 @@ class DeferredSignals:
             signal.signal(number, self._note)
 
     def _note(self, _number: int, _frame: Any) -> None:
-        # Raised here, it would come out anywhere, where something else may swallow it.
+        # An exception raised here would surface at an arbitrary place, where other code may swallow it.
         self._asked = True
 
     def follow(self) -> None:
-        """End the spinning if that was asked for; to be called by a timer, which also lets Python hear of signals."""
+        """Stop spinning if a signal asked for it. A timer calls this, which also lets Python handle signals."""
         if self._asked:
             raise ExternalShutdownException
 
 
-# A thread that computes beside the stream must not keep the interpreter for long when a frame has come.
+# A thread that computes beside the stream must not hold the interpreter for long when a frame arrives.
 _SWITCH_S = 5e-4
 
 _START_ERRORS = (
@@ -80,7 +80,7 @@ def run_node(
     factory
         Makes the node.
     args
-        Command line; that of the process without it.
+        Command line; the process's own by default.
     threads
         Number of callbacks that may run at once.
 
@@ -99,7 +99,7 @@ def run_node(
         except _START_ERRORS as error:
             print(" ".join(str(error).split()), file=sys.stderr)
             return 2
-        # What goes wrong from here on is not a matter of what the node was given.
+        # Errors from here on are not caused by the node's arguments.
         return 0 if node is None else _spin(node, threads)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
@@ -109,7 +109,7 @@ def run_node(
 
 @contextmanager
 def _refusals() -> Iterator[None]:
-    """Turn what ROS refuses at the start, such as a process without its enclave, into an error of the suite."""
+    """Turn what ROS refuses at start, such as a process without its enclave, into an error of the suite."""
     was_up = rclpy.utilities.ok()
     try:
         yield
@@ -120,7 +120,7 @@ def _refusals() -> Iterator[None]:
 
 
 def _make(factory: Callable[[], Node]) -> Node | None:
-    """The node, or None where a signal has shut the middleware down while it was being made."""
+    """Make the node; return None if a signal shut the middleware down meanwhile."""
     try:
         with _refusals():
             return factory()

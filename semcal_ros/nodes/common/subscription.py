@@ -1,4 +1,4 @@
-"""A subscription that asks for less when a publisher does not offer what it asks for."""
+"""A subscription that requests a lower quality of service when a publisher does not offer the requested one."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["AdaptiveSubscription", "MessageCounter", "MessageInfo", "published_n
 MessageInfo = Mapping[str, Any]
 Callback = Callable[[Any, MessageInfo], None]
 
-# Reported by a middleware that does not number its messages.
+# The value reported by a middleware that does not number its messages.
 _NO_NUMBER = 2**64 - 1
 
 
 def published_ns(info: MessageInfo) -> int:
-    """When the message was published, ns; when it was received if the middleware does not say."""
+    """Return when the message was published, ns, or when it was received if the middleware does not say."""
     return int(info["source_timestamp"] or info["received_timestamp"])
 
 
 class MessageCounter:
-    """Counts lost messages, and publishers that begin, from the numbers that each publisher gives its messages.
+    """Counts lost messages and restarts of publishers from the numbers that each publisher gives its messages.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class MessageCounter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last message: the next one follows none."""
+        """Forget the last message, so that the next one counts as the first."""
         self._last_number: int | None = None
         self._publishers = 0
 
@@ -54,19 +54,19 @@ class MessageCounter:
         Parameters
         ----------
         number
-            Its number; None if the middleware gives none.
+            Its number; None if the middleware does not number messages.
         publishers
-            How many publishers the topic has at present.
+            Number of publishers of the topic at present.
         """
         if number is None or number == _NO_NUMBER:
             return
         missed = 0 if self._last_number is None else number - self._last_number - 1
-        # A publisher that was killed still counts for a while, so its successor is one more; one that left is
-        # followed by smaller numbers. Several publishers at once number their messages independently.
+        # A killed publisher still counts for a while, so its successor raises the number of publishers; after
+        # one that left in order, smaller message numbers follow. Several publishers number independently.
         another = publishers > self._publishers or (missed < 0 and publishers <= 1)
         if self._last_number is not None and another:
             self.restarts += 1
-        # With no publisher at all, the last one has ended since.
+        # Without any publisher, the last one has ended since.
         elif missed > 0 and publishers <= 1:
             self.lost += missed
         self._publishers = publishers
@@ -74,7 +74,7 @@ class MessageCounter:
 
 
 class AdaptiveSubscription:
-    """Subscribes as requested, then with less after an incompatible-QoS event: else nothing would arrive.
+    """Subscribes as requested, then with fewer demands after an incompatible-QoS event: else nothing would arrive.
 
     When the last publisher is gone, :meth:`check_publishers` returns to the requested quality.
 
@@ -119,7 +119,7 @@ class AdaptiveSubscription:
 
     @property
     def downgraded(self) -> str:
-        """The demands that were dropped, such as ``"reliability"``; empty while there are none."""
+        """The demands that were dropped, such as ``"reliability"``; empty if none were."""
         if self._profile is self._requested:
             return ""
         kinds = ("reliability", "durability")
@@ -145,7 +145,7 @@ class AdaptiveSubscription:
 
     def _subscribe(self, options: Any = None) -> Any:
         self._counter.reset()
-        # rclpy passes the information too, which its annotations do not say.
+        # rclpy also passes the message information, which its annotations omit.
         callback: Any = self._on_message
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         return self._node.create_subscription(
@@ -170,14 +170,14 @@ class AdaptiveSubscription:
     def take_waiting(self) -> None:
         """Run the callback for everything that has already arrived.
 
-        An executor serves one message per topic and turn; without this, a newer image would be handled before the
+        An executor serves one message per topic and turn; otherwise a newer image would be handled before the
         values published ahead of it.
         """
         while (taken := self.take()) is not None:
             self._callback(*taken)
 
     def take(self) -> tuple[Any, MessageInfo] | None:
-        """The next message that has already arrived and its information; None where none has."""
+        """Return the next message that has already arrived, with its information, or None."""
         handle = self._subscription.handle
         with handle:
             taken = handle.take_message(self._type, self._raw)
@@ -190,7 +190,7 @@ class AdaptiveSubscription:
     # -- quality of service ------------------------------------------------------------------------
 
     def _on_incompatible(self, event: Any) -> None:
-        # The subscription must not be destroyed inside of its own event.
+        # The subscription must not be destroyed inside its own event.
         self._refused.append(QoSPolicyKind(event.last_policy_kind))
         self._guard.trigger()
 
@@ -209,10 +209,10 @@ class AdaptiveSubscription:
             )
 
     def check_publishers(self) -> None:
-        """See who publishes; to be called now and then.
+        """Check who publishes; call it periodically.
 
         Warns of publishers of another type, which the middleware ignores silently, and returns to the requested
-        quality once nobody publishes any more.
+        quality once there are no publishers left.
         """
         publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
         foreign = {p.topic_type for p in publishers} - {self._type_name}
@@ -229,7 +229,7 @@ class AdaptiveSubscription:
 
     @property
     def foreign_types(self) -> str:
-        """Other types that are published on the topic; empty while there are none."""
+        """The other types published on the topic; empty if there are none."""
         return ", ".join(sorted(self._foreign_types))
 
     @property

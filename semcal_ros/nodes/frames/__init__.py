@@ -1,1 +1,1 @@
-"""Frames in, with their magnification and calibration; images and drift out."""
+"""Input of frames with their magnification and calibration; output of images and drift."""

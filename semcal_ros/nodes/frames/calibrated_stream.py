@@ -36,14 +36,14 @@ class CalibratedStreamNode(StreamNode):
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._out_of_range = False
-        # The latest: most frames have the magnification of the one before.
+        # Only the latest: most frames have the magnification of the frame before.
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
 
     def on_calibration(self) -> None:
-        """Called when another calibration has come into force, but not for the one given at start."""
+        """React to a new calibration in force; not called for the calibration given at start."""
 
     def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
-        """As in the base class, with magnifications on the scale of the calibration in force."""
+        """Extend the base class: magnifications are on the scale of the calibration in force."""
         super().receive_frames(
             on_frame, magnification_config=lambda: self.calibration.config, **options
         )
@@ -52,7 +52,7 @@ class CalibratedStreamNode(StreamNode):
         self.rectifier = Rectifier(value)
 
     def camera(self, frame: StreamFrame, magnification: float) -> ScanCamera | None:
-        """Calibrated camera of a frame, or None while there is no calibration."""
+        """Return the calibrated camera of a frame, or None while there is no calibration."""
         current, seen_at = self.calibration.current, (magnification, *frame.size)
         if self._camera is None or self._camera[0] is not current or self._camera[1] != seen_at:
             self._camera = current, seen_at, self.calibration.camera(*seen_at)
@@ -62,7 +62,7 @@ class CalibratedStreamNode(StreamNode):
         return camera
 
     def conditions(self) -> list[str]:
-        """As in the base class; also whether the calibration is missing or does not reach."""
+        """Extend the base class: also report a missing calibration, or one that does not cover the magnification."""
         found = super().conditions()
         if self.calibration.current is None:
             found.append("uncalibrated")

@@ -1,4 +1,4 @@
-"""The calibration in force: the latest of all that came from files and from the topic."""
+"""The calibration in force: the latest one from a file or from the topic."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 __all__ = ["CalibrationInput", "calibration_digest"]
 
 _TOPIC = "topic"
-# How far the clock that the middleware stamps with may be from that of this process.
+# Largest accepted difference between the middleware's clock and that of this process.
 _CLOCK_STEP_NS = 1_000_000
-# More than can be on their way at once.
+# More than can be in transit at once.
 _KEPT_DIGESTS = 16
-# Several nodes publish calibrations, one of them perhaps this one: with a depth of 1, the own message that comes back
-# would push out one of another node that has not been taken yet.
+# Several nodes publish calibrations, perhaps including this one: with a depth of 1, its own message that comes back
+# would displace another node's message that has not been taken yet.
 _QUEUE = 10
 
 
 def calibration_digest(text: str) -> str:
-    """First 12 hexadecimal digits of the SHA-256 of a calibration's text in UTF-8."""
+    """Return the first 12 hexadecimal digits of the SHA-256 of a calibration's text in UTF-8."""
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -57,7 +57,7 @@ class _Loaded:
 
 @dataclass(frozen=True, order=True)
 class _Arrived:
-    """A text from the topic, not yet parsed; ordered by when it was published."""
+    """A text from the topic, not yet parsed; ordered by publication time."""
 
     since_ns: int
     text: str
@@ -79,10 +79,10 @@ def _parse(arrived: _Arrived) -> _Loaded | SemcalError:
 class CalibrationInput:
     """Holds the last good calibration; a bad one is refused, counted, and leaves the old one in force.
 
-    The latest wins: a message counts from when it was published, a file from when it was named or reloaded. The file
-    given at start is older than anything on the topic, so that a node that is started again finds its way back.
+    The latest wins: a message counts from its publication, a file from when it was named or reloaded. The file
+    given at start is older than anything on the topic, so that a restarted node returns to the calibration in force.
 
-    Texts are parsed beside the stream, and take effect between two frames.
+    Texts are parsed beside the stream and take effect between two frames.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class CalibrationInput:
     parameters
         Parameters among which is :data:`~semcal_ros.nodes.common.parameters.CALIBRATION`.
     endpoints, reporter
-        Where to subscribe, and what logs and counts.
+        Where to subscribe, and the log and counters.
     on_change
         Called after each change; not for the file given at start.
 
@@ -140,7 +140,7 @@ class CalibrationInput:
         return bool(self._published_digests)
 
     def camera(self, magnification: float, width: int, height: int) -> ScanCamera | None:
-        """Camera for frames of that size, or None while there is no calibration; raises as ``Calibration.at``."""
+        """Return the camera for frames of this size, or None without a calibration; raises as ``Calibration.at``."""
         if self.current is None:
             return None
         return self.current.at(magnification).resized(width, height)
@@ -183,15 +183,15 @@ class CalibrationInput:
         return self._loaded is not None and since_ns < self._loaded.since_ns
 
     def _is_own(self, text: str, since_ns: int) -> bool:
-        # A node that publishes what it takes over must not take over what it publishes: with two calibrations
-        # on their way it would publish them in turns for ever.
+        # A node that republishes what it takes over must not take over its own messages: with two calibrations
+        # in transit it would publish them in turns for ever.
         return any(
             start <= since_ns <= end and calibration_digest(text) == digest
             for start, end, digest in self._published_digests
         )
 
     def _is_same(self, text: str, since_ns: int) -> bool:
-        """Whether the text is in force already, which then counts from now on; no reason to start the drift again."""
+        """Return whether the text is already in force; it then counts from now on and the drift is not reset."""
         if self._loaded is None or text != self._loaded.text:
             return False
         self._loaded = replace(self._loaded, since_ns=since_ns)

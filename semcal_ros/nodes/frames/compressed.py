@@ -1,8 +1,8 @@
-"""The same images once more, compressed, on the topic and with the parameters of image_transport's `compressed`.
+"""Compressed copies of the images, on the topic and with the parameters of image_transport's `compressed`.
 
-Names: https://github.com/ros-perception/image_transport_plugins, compressed_publisher.cpp. There, a node in a namespace
-gets them with a dot in front (`.image_rect.compressed.format`), which newer releases correct (pull request 188); here
-they have none.
+Names: https://github.com/ros-perception/image_transport_plugins, compressed_publisher.cpp. There, the
+parameters of a node in a namespace begin with a dot (`.image_rect.compressed.format`), which newer releases correct
+(pull request 188); here they do not.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["CompressedOutput", "compressed_parameters"]
 
 
 def compressed_parameters(topic: str) -> tuple[ParameterDeclaration, ...]:
-    """Parameters of the compressed images of ``topic``, for a node to declare."""
+    """Return the parameters of the compressed images of ``topic``, for a node to declare."""
     return (
         ParameterDeclaration(
             f"{topic}.compressed.format",
@@ -48,7 +48,7 @@ def compressed_parameters(topic: str) -> tuple[ParameterDeclaration, ...]:
 
 @dataclass(frozen=True, order=True)
 class _Job:
-    """An image of its own, and how to compress it; jobs are compared by their numbers."""
+    """A copy of an image, and how to compress it; jobs are ordered by their numbers."""
 
     number: int
     image: NDArray[Any] = field(compare=False)
@@ -64,20 +64,20 @@ class _Done(NamedTuple):
 
 
 class CompressedOutput:
-    """Publishes ``<topic>/compressed`` while somebody subscribes to it.
+    """Publishes ``<topic>/compressed`` while it has subscribers.
 
-    A thread of its own compresses, so that the images themselves do not wait; it takes the newest image and skips those
-    that came in between. The thread touches nothing of the node but the publisher, which may be used from any thread;
-    counts and errors come back to the executor.
+    A separate thread compresses, so that the images themselves do not wait; it takes the newest image and skips those
+    that came in between. Of the node, the thread uses only the publisher, which any thread may use; counts and errors
+    are passed back to the executor.
 
     Parameters
     ----------
     parameters
         Parameters among which are :func:`compressed_parameters` of the topic.
     endpoints, reporter
-        Where to publish, and what counts.
-    topic
-        Topic of the images as they are.
+        Where to publish, and the counters.
+        topic
+        Topic of the uncompressed images.
 
     Notes
     -----
@@ -99,7 +99,7 @@ class CompressedOutput:
         self._work = LatestWorker[_Job, _Done](endpoints.guard, self._compress, self._report)
 
     def publish(self, image: NDArray[Any], frame: StreamFrame) -> None:
-        """Compress an image that was made from ``frame`` beside the stream; its memory may be used again afterwards."""
+        """Compress, beside the stream, an image made from ``frame``; its memory may be reused after the call."""
         if self._publisher.get_subscription_count() == 0:
             return
         self._submitted += 1
@@ -113,7 +113,7 @@ class CompressedOutput:
         return self._parameters[f"{self._prefix}.{name}"]
 
     def close(self) -> None:
-        """Wait for the image that is being compressed; none goes out after it."""
+        """Wait for the image that is being compressed; no image is published after it."""
         with self._in_hand:
             self._ended = True
 

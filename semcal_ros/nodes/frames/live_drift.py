@@ -1,4 +1,4 @@
-"""Drift tracking as the nodes use it: in line or beside the stream, reset by service and by a new calibration."""
+"""Drift tracking in the nodes: inline or beside the stream, reset by service and by a new calibration."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ _MODE = ParameterDeclaration(
 )
 DRIFT_PARAMETERS = (*_RESTARTING, _DETAIL, _MODE)
 
-# Turns (see LoadMonitor.turn_s) over which a forecast may reach: a few are normal, since measurements beside the
-# stream rest twice as long as they take; many more are a leap of the clock or a pause.
+# Turns (see LoadMonitor.turn_s) that a forecast may span: a few are normal, since measurements beside the stream
+# pause for twice as long as they take; many more mean a clock jump or a pause.
 _FAR = 20.0
-# Rest between measurements beside the stream, in times of one: they take a third of a processor at most.
+# Pause between measurements beside the stream, relative to the duration of one: they take at most a third of a CPU.
 _REST = 2.0
 
 
@@ -79,7 +79,7 @@ class FrameDrift:
     estimate
         The drift at the centre of the frame.
     measured
-        The latest frame whose drift was measured: this one or an earlier one.
+        The latest frame whose drift was measured: this frame or an earlier one.
     """
 
     estimate: DriftEstimate
@@ -92,7 +92,7 @@ class FrameDrift:
 
     @property
     def raster(self) -> RasterDrift:
-        """The drift during the frame, for a rectifier."""
+        """Return the drift during the frame, for a rectifier."""
         return self.estimate.raster
 
 
@@ -106,7 +106,7 @@ class LiveDrift:
     parameters
         Parameters among which are :data:`DRIFT_PARAMETERS`.
     endpoints, reporter
-        Where to serve ``~/reset``, and what counts and logs.
+        Where to serve ``~/reset``, and the counters and the log.
 
     Notes
     -----
@@ -136,9 +136,9 @@ class LiveDrift:
         return "the next frame has zero drift"
 
     def reset(self) -> None:
-        """The next frame has zero drift."""
+        """Reset the drift: the next frame has zero drift."""
         values = self._parameters
-        # A new one: the old one may be at work beside the stream.
+        # A new tracker: the old one may be in use beside the stream.
         self._tracker = DriftTracker(
             DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
         )
@@ -149,11 +149,11 @@ class LiveDrift:
         self._rest_until_s = 0.0
 
     def close(self) -> None:
-        """End what runs beside the stream."""
+        """Stop what runs beside the stream."""
         self._beside.close()
 
     def estimate(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
-        """Drift at a frame; raises as :meth:`DriftTracker.update`."""
+        """Estimate the drift at a frame; raises as :meth:`DriftTracker.update`."""
         if frame.interval_s is not None:
             self._load.add_interval(frame.interval_s)
         time_s, centre_s = self._times(frame)
@@ -185,14 +185,14 @@ class LiveDrift:
         return rested and self._beside.is_ready()
 
     def _is_far(self, centre_s: float) -> bool:
-        """Whether a forecast would reach over a leap of the clock or a pause, of which the filter knows nothing."""
+        """Return whether a forecast would span a clock jump or a pause, which the filter does not model."""
         latest = self._latest
         return latest is not None and centre_s - latest.predictor.time_s > _FAR * self._load.turn_s
 
     def _times(self, frame: StreamFrame) -> tuple[float, float]:
-        """Start and centre of a frame's acquisition, in s since the first one."""
+        """Return the start and the centre of a frame's acquisition, in s since the first frame."""
         if self._origin_ns is None:
-            # Seconds since 1970 in a float are only good to 0.2 us.
+            # Seconds since 1970 as a float resolve only 0.2 us.
             self._origin_ns = frame.stamp_ns
             self._reporter.note("drift_since", f"{frame.stamp_ns * 1e-9:.9f}")
         scan = self._config.scan
@@ -205,13 +205,13 @@ class LiveDrift:
         return mode == "every_frame" or (mode == "auto" and self._load.keeps_up)
 
     def _collect(self, *, wait: bool) -> None:
-        """Take in what was measured beside the stream, once it is ready."""
+        """Take over the result of a measurement beside the stream once it is ready."""
         if self._at_work is None or not (wait or self._at_work.done()):
             return
         done, self._at_work = self._at_work, None
         try:
             self._keep(done.result())
-            # The rest of the time is for other nodes.
+            # The pause leaves the processor to other nodes.
             self._rest_until_s = time.monotonic() + _REST * self._load.cost_s
         except NODE_ERRORS as error:
             self._complain(str(error))
@@ -231,7 +231,7 @@ class LiveDrift:
             self.reset()
 
     def _complain(self, reason: str) -> None:
-        # Its frame has gone out: it does not count as rejected.
+        # The frame was already published: it does not count as rejected.
         self._failed += 1
         self._reporter.note("drift_frames_failed", self._failed)
         self._reporter.warn_seldom(f"drift: {reason}")

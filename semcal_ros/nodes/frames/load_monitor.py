@@ -1,4 +1,4 @@
-"""Whether a stream leaves the time to measure the drift of every frame before it goes on."""
+"""Decides whether a stream leaves enough time to measure the drift of every frame before publishing it."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["LoadMonitor"]
 
-# Of the newest value in a running mean: it follows a change within about ten frames and hides a single slow one.
+# Weight of the newest value in a running mean: the mean follows a change within about ten frames
+# and hides a single slow one.
 _WEIGHT = 0.1
-# Intervals after which their mean counts; the first one may hold the start of the publisher.
+# Number of intervals after which their mean counts; the first interval may include the publisher's start.
 _SETTLED = 2
-# Parts of the interval: rectifying and publishing need the rest. Not measured every frame any more above the first,
-# again below the second; the gap between them keeps a stream at the limit from switching with every frame.
+# Fractions of the interval: rectifying and publishing need the rest. Above the first, not every frame is measured any
+# more; below the second, every frame is again. The gap keeps a stream at the limit from switching with every frame.
 _TOO_MUCH, _LITTLE_ENOUGH = 0.6, 0.4
 
 
 class LoadMonitor:
     """Compares the time that a measurement takes with the interval between frames.
 
-    Both are running means. Before there are enough frames to tell, every one is measured.
+    Both are running means. Until there are enough frames to decide, every frame is measured.
 
     Examples
     --------
@@ -56,7 +57,7 @@ class LoadMonitor:
         return math.nan if self._cost_s is None else self._cost_s
 
     def add_interval(self, interval_s: float) -> None:
-        """The next frame was published ``interval_s`` after the one before.
+        """Add the interval between the publications of two successive frames, s.
 
         Raises
         ------
@@ -68,7 +69,7 @@ class LoadMonitor:
         self._decide()
 
     def add_cost(self, cost_s: float) -> None:
-        """A measurement took ``cost_s``; raises as :meth:`add_interval`."""
+        """Add the duration of a measurement, s; raises as :meth:`add_interval`."""
         self._cost_s = _mean(self._cost_s, _check(cost_s))
         self._decide()
 

@@ -1,4 +1,4 @@
-"""Which magnification a frame was taken at."""
+"""The magnification at which a frame was taken."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["MagnificationInput"]
 
-# More changes than a frame can be late for: minutes of a knob that is turned all the time, in 100 KB.
+# More changes than can precede a late frame: minutes of a knob turned continuously, in 100 KB.
 _KEPT = 4096
-# Smaller steps back are frames that came late; a replay that starts again steps back by more.
+# Smaller steps back are late frames; a replay that restarts steps back by more.
 _CLOCK_STEP_NS = 1_000_000_000
 # Fast DDS offers a latched value once more every 3 s, should the first offer have come before the match.
 _PATIENCE_S = 4.0
@@ -34,17 +34,17 @@ _PATIENCE_S = 4.0
 class MagnificationInput:
     """History of the magnification topic.
 
-    A value is valid from its stamp on. Message types without a header count from when they were
-    published, as do then the frames: the order in which the microscope publishes decides, whatever
-    the order of arrival and the rate of a replay. A message that cannot be used makes the
-    magnification unknown until the next good one.
+    A value is valid from its stamp on. Messages without a header count from their publication, and
+    so do the frames then: the order in which the microscope publishes decides, whatever the order of
+    arrival and the rate of a replay. An unusable message makes the magnification unknown until the
+    next usable one.
 
     Parameters
     ----------
     config
         What the topic carries.
     endpoints, reporter
-        Where to subscribe, and what counts unusable messages.
+        Where to subscribe, and the counter of unusable messages.
     on_reading
         Called with each good reading.
     group
@@ -92,12 +92,12 @@ class MagnificationInput:
     def at(
         self, stamp_ns: int, sent_ns: int, image_width_px: int, config: MicroscopeConfig
     ) -> float | None:
-        """Magnification of a frame, or None while it is not known.
+        """Return the magnification of a frame, or None while it is unknown.
 
         Parameters
         ----------
         stamp_ns, sent_ns
-            Header stamp of the frame, and when the microscope published it.
+            Header stamp of the frame, and its publication time at the microscope.
         image_width_px
             Width of the frame.
         config
@@ -106,7 +106,7 @@ class MagnificationInput:
         Raises
         ------
         MessageError
-            The magnification is out of all reason for frames of this width.
+            The magnification is absurd for frames of this width.
         """
         self._subscription.take_waiting()
         if self._has_stamp:
@@ -117,8 +117,8 @@ class MagnificationInput:
         return replace(reading, config=config).magnification(image_width_px)
 
     def doubt(self, since_ns: int) -> None:
-        """The microscope was started again after ``since_ns`` and may have another magnification, which it will soon
-        publish. If it does not, the old one stays valid.
+        """Doubt the magnification: the microscope was restarted after ``since_ns`` and may soon publish another one.
+        Otherwise the old one stays valid.
         """
         self._doubted = time.monotonic() + _PATIENCE_S, since_ns
 
@@ -131,7 +131,7 @@ class MagnificationInput:
         return self._doubted is not None
 
     def _forget_if_back(self, stamp_ns: int) -> None:
-        """The clock went back, but no magnification has come yet: the history is from another time."""
+        """Forget the history if the clock went back and no magnification has arrived since."""
         newest_ns = self._history.newest_ns
         went_back = stamp_ns < self._last_ns - _CLOCK_STEP_NS
         if went_back and newest_ns is not None and newest_ns > stamp_ns + _CLOCK_STEP_NS:
@@ -139,9 +139,9 @@ class MagnificationInput:
         self._last_ns = stamp_ns
 
     def changed_during(self, stamp_ns: int, sent_ns: int) -> bool:
-        """Whether the magnification changed while a frame was being scanned, as far as that is known.
+        """Return whether the magnification changed during a frame's scan, as far as that is known.
 
-        To be called after :meth:`at`, with its arguments.
+        Call it after :meth:`at`, with the same arguments.
         """
         sent = None if self._has_stamp else sent_ns
         interval = scan_interval_ns(stamp_ns, sent, self._config)

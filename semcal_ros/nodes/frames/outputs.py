@@ -25,7 +25,7 @@ __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 
 
 class ImageOutput:
-    """Publishes images on one topic, from memory that is used again for each, and compressed beside it.
+    """Publishes images on one topic, from memory that is reused for each image, and compressed copies beside it.
 
     The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
     """
@@ -40,18 +40,18 @@ class ImageOutput:
         self._pixels: NDArray[Any] = np.empty(0)
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
-        """Where to write the pixels of the image made from ``frame``."""
+        """Return the memory for the pixels of the image made from ``frame``."""
         self._pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
         return self._pixels
 
     def publish(self, frame: StreamFrame) -> None:
-        """Publish what was written."""
+        """Publish the image in the memory."""
         self._publisher.publish(self._message)
         self._reporter.count_published(frame.stamp_ns)
         self._compressed.publish(self._pixels, frame)
 
     def close(self) -> None:
-        """Wait for the thread that compresses; before the node is destroyed."""
+        """Wait for the compressing thread; call it before the node is destroyed."""
         self._compressed.close()
 
 
@@ -62,7 +62,7 @@ class RectifiedOutput:
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
         self._info = endpoints.stream_publisher(CameraInfo, "camera_info")
         self._message = CameraInfo()
-        # What the message describes, but for its header.
+        # What the message describes, apart from its header.
         self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
@@ -74,8 +74,8 @@ class RectifiedOutput:
         self._image.close()
 
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
-        """Publish the rectified image; ``camera`` is None where there is none for it."""
-        # The description first: a consumer that has the image can then use it at once.
+        """Publish the rectified image; ``camera`` is None if the image has no camera."""
+        # The camera_info first: a subscriber that has the image can then use it at once.
         if self._info.get_subscription_count():
             self._describe(camera, frame)
             self._info.publish(self._message)
@@ -90,7 +90,7 @@ class RectifiedOutput:
 
 
 class DriftOutput:
-    """Publishes ``drift`` and ``drift_velocity``, and notes how the tracking goes."""
+    """Publishes ``drift`` and ``drift_velocity``, and notes the state of the tracking."""
 
     def __init__(self, endpoints: Endpoints, reporter: Reporter) -> None:
         self._reporter = reporter
@@ -104,7 +104,7 @@ class DriftOutput:
     def publish(self, drift: FrameDrift, frame: StreamFrame) -> None:
         """Publish the drift, in m, at the centre of a frame."""
         pose, twist = self._messages
-        # A few matrices per frame, which nobody may want.
+        # A few matrices per frame, filled only for a subscriber.
         if self._drift.get_subscription_count():
             fill_drift(pose, drift.estimate.drift_m, drift.estimate.covariance, frame.header)
             self._drift.publish(pose)

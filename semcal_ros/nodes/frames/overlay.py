@@ -1,4 +1,4 @@
-"""A picture of what the corner search found."""
+"""An image of the corners that were detected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _REFUSED_BGR = (0, 0, 255)  # pure red
 def corner_overlay(
     image: NDArray[Any], corners_xy: ArrayLike, refused: str = ""
 ) -> NDArray[np.uint8]:
-    """The image in grey with a circle around every corner.
+    """Draw the image in grey with a circle around every corner.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""When the microscope published the frames that another node has worked on."""
+"""Publication times, at the microscope, of frames that another node has processed."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
 __all__ = ["SourceTimestamps"]
 
-# Frames: seconds of any stream, longer than another node holds one.
+# Number of frames: seconds of any stream, longer than another node holds a frame.
 _KEPT = 256
-# Encapsulation, and the stamp with which std_msgs/Header and so every image begins.
+# Bytes of the encapsulation; after it comes the stamp, with which std_msgs/Header and so every image begins.
 _ENCAPSULATION = 4
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
 
 
 class SourceTimestamps:
-    """Publication time of the original of a frame, by header stamp.
+    """Publication times of original frames, by header stamp.
 
     A magnification without a stamp is matched by the order of publication. A frame that another node made, such as
-    ``image_stabilized``, was published later than its original, perhaps after the next magnification; so the originals
-    are watched, but only their first bytes are read.
+    ``image_stabilized``, was published later than its original, perhaps after the next magnification. So this class
+    subscribes to the originals, but reads only their first bytes.
 
     Parameters
     ----------
     endpoints
         Where to subscribe.
     source
-        The originals, whose type begins with a header; None where the frames are the originals.
+        The originals, whose type begins with a header; None if the frames are the originals.
     """
 
     def __init__(self, endpoints: Endpoints, source: ImageConfig | None) -> None:
@@ -57,7 +57,7 @@ class SourceTimestamps:
             self._times.popitem(last=False)
 
     def published_ns(self, stamp_ns: int, info: MessageInfo) -> int:
-        """When the original of a frame was published, ns; when the frame itself was, if the original did not come."""
+        """Return when the original of a frame was published, ns; if it did not arrive, when the frame itself was."""
         if self._originals is not None:
             # The frame may be handled before originals that arrived ahead of it.
             self._originals.take_waiting()

@@ -1,4 +1,4 @@
-"""Frames with their magnification, as the stream nodes take them in."""
+"""Input of frames with their magnification for the stream nodes."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ __all__ = ["FrameInput", "StreamFrame", "StreamNode", "is_late", "nominal_camera
 # The camera stays the same from frame to frame as long as the magnification does.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
 
-# Images that have waited for longer than both make way for newer ones. 1.5 intervals: the next image is there by then,
-# and the node is not merely half an interval behind. 40 ms: a person does not see that an image is later, and in a
-# fast stream the turns of other processes delay images by as much without the node being too slow.
+# Images that have waited longer than both are skipped for newer ones. 1.5 intervals: the next image has arrived by
+# then, and the node is not merely half an interval behind. 40 ms: a person does not notice such a delay, and in a fast
+# stream the scheduling of other processes delays images by as much without the node being too slow.
 _LATE_S, _LATE_INTERVALS = 0.04, 1.5
-# Images per turn of the executor; then timers and services have theirs.
+# Images per turn of the executor; then timers and services get their turn.
 _AT_ONCE = 8
 
 _MIXED = ParameterDeclaration(
@@ -67,7 +67,7 @@ class StreamFrame:
     mixed
         Whether the magnification changed while the frame was being scanned.
     interval_s
-        Mean interval since the frame before was published, lost ones counted; None for the first frame.
+        Mean interval between publications since the frame before, lost frames included; None for the first frame.
     """
 
     image: NDArray[Any]
@@ -85,9 +85,9 @@ class StreamFrame:
 
 
 def is_late(waited_s: float, interval_s: float) -> bool:
-    """Whether an image that has waited makes way for a newer one, at that interval between frames.
+    """Return whether a waiting image is skipped for a newer one, given the interval between frames.
 
-    It must have waited for more than 40 ms *and* for more than 1.5 intervals.
+    The image must have waited for more than 40 ms *and* for more than 1.5 intervals.
     """
     return waited_s > max(_LATE_S, _LATE_INTERVALS * interval_s)
 
@@ -98,18 +98,18 @@ class FrameInput:
     Parameters
     ----------
     config
-        Where images and magnifications are, and what they mean.
+        Topics of images and magnifications, and what they mean.
     parameters
         Parameters among which is ``mixed_frames``.
     endpoints, reporter
-        Where to subscribe, and what counts and logs.
+        Where to subscribe, and the counters and the log.
     on_frame
-        Called with each frame; what it raises of :data:`NODE_ERRORS` is counted.
+        Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted.
     magnification_config
-        Returns the configuration by which magnifications are read; ``config`` without.
+        Returns the configuration with which magnifications are read; by default ``config``.
     topic, databar_rows
-        Where the images are, if they are not the microscope's own but made from these, and how many rows at the
-        bottom are text; those of the configuration without.
+        Topic of the images if they are derived from the microscope's, and the number of text rows at their bottom;
+        by default those of the configuration.
     group
         Callback group of both subscriptions.
     """
@@ -135,7 +135,7 @@ class FrameInput:
         self._databar_rows = source.databar_rows if databar_rows is None else databar_rows
         # Before the images, so that a late-joining node knows the magnification of its first frame.
         self._magnification = MagnificationInput(config, endpoints, reporter, group=group)
-        # What another node of the suite made from the microscope's images is not compressed.
+        # Images that another node of the suite derives from the microscope's are not compressed.
         kind = message_class(IMAGE_TYPE if topic else source.type)
         self._source = SourceTimestamps(endpoints, source if topic else None)
         self._images = endpoints.subscribe(
@@ -152,9 +152,9 @@ class FrameInput:
         self._mixed = 0
 
     def _on_images(self, message: Any, info: MessageInfo) -> None:
-        """Work on the images that have come, oldest first, but skip late ones if there are newer ones.
+        """Process the images that have arrived, oldest first, but skip late ones if there are newer ones.
 
-        Images that wait are taken without going back to the executor, whose turns cost more. A user who has chosen a
+        Waiting images are taken without returning to the executor, whose turns cost more. A user who has chosen a
         longer queue wants every image.
         """
         taken: tuple[Any, MessageInfo] | None = (message, info)
@@ -217,14 +217,14 @@ class FrameInput:
         return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
 
     def _check_transport(self, image_bytes: int) -> None:
-        """See whether this process is set up for images of that size."""
+        """Check whether this process is set up for images of this size."""
         if image_bytes != self._image_bytes:
             self._image_bytes = image_bytes
             rmw = get_rmw_implementation_identifier()
             self._transport = transport_advice(image_bytes, os.environ, rmw)
 
     def conditions(self) -> list[str]:
-        """Whether the images are too large for the transport, in a few words."""
+        """Return, in a few words, whether the images are too large for the transport."""
         return [self._transport] * bool(self._transport)
 
 
@@ -244,13 +244,13 @@ class StreamNode(SemNode):
         self._is_waiting = False
 
     def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
-        """Begin to take in frames, at the end of the constructor; ``options`` are those of :class:`FrameInput`."""
+        """Start receiving frames, at the end of the constructor; ``options`` are those of :class:`FrameInput`."""
         self.frames = FrameInput(
             self.config, self.parameters, self.endpoints, self.reporter, on_frame, **options
         )
 
     def known_magnification(self, frame: StreamFrame) -> float | None:
-        """The magnification of a frame; counts a frame without."""
+        """Return the magnification of a frame; count a frame without one."""
         self._is_waiting = frame.magnification is None
         if frame.magnification is None:
             self._waiting += 1
@@ -261,7 +261,7 @@ class StreamNode(SemNode):
         return frame.magnification
 
     def conditions(self) -> list[str]:
-        """As in the base class; also a missing magnification, and images too large for the transport."""
+        """Extend the base class: also report a missing magnification and images too large for the transport."""
         waiting = ["waiting for magnification"] if self._is_waiting else []
         transport = [] if self.frames is None else self.frames.conditions()
         return super().conditions() + waiting + transport

@@ -1,4 +1,4 @@
-"""Rectified frames with their camera and drift, as visual servoing takes them in."""
+"""Input of rectified frames with their camera and drift for visual servoing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ServoFrame:
     k
         (3, 3) K of its camera_info; zero without a camera.
     drift_m
-        (2,) what was taken out of it.
+        (2,) drift that was removed from the image, m.
     projections
         (3, 4) latest P_g, the oldest first.
     header, stamp_ns
@@ -64,13 +64,13 @@ class ServoInput:
     Parameters
     ----------
     endpoints, reporter
-        Where to subscribe, and what counts.
+        Where to subscribe, and the counters.
     on_frame
-        Called with each frame; what it raises of :data:`NODE_ERRORS` is counted, and then ``on_error`` called.
+        Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted and passed to ``on_error``.
     on_error
         Called with the reason why a frame cannot be used.
     with_drift
-        Whether a frame needs a drift; without, nothing was taken out of it.
+        Whether a frame needs a drift; otherwise no drift was removed from the image.
     """
 
     def __init__(
@@ -122,12 +122,12 @@ class ServoInput:
     def _insert(self, part: str, stamp_ns: int, message: Any) -> None:
         waiting = self._parts[part]
         waiting[stamp_ns] = message
-        # In the order of arrival: stamps go back where a clock does.
+        # In order of arrival: stamps go back when a clock does.
         while len(waiting) > _WAITING:
             del waiting[next(iter(waiting))]
 
     def _drain(self) -> None:
-        """Take in all that has come, then work on the newest frame that has all its parts."""
+        """Take all waiting messages, then process the newest frame that has all its parts."""
         self._draining = True
         try:
             for subscription in self._inputs:

@@ -1,4 +1,4 @@
-"""What visual servoing publishes: the velocity of the stage, and how far the target is from its goal."""
+"""What visual servoing publishes: the velocity of the stage, and the distance of the target from its goal."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class StageOutput:
         self.twist = np.array(twist)
 
     def close(self) -> None:
-        """Stop the stage and wait until it has received that."""
+        """Stop the stage and wait until it has received the zero velocity."""
         self.send(np.zeros(3))
         self._publisher.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
 
@@ -60,7 +60,7 @@ class ErrorOutput:
         self._publisher = endpoints.stream_publisher(PoseWithCovarianceStamped, "~/error")
 
     def publish(self, step: ServoStep, header: Any) -> None:
-        """Publish what was measured; nothing where nothing was."""
+        """Publish the measured error; nothing if nothing was measured."""
         if not np.all(np.isfinite(step.error_covariance)):
             return
         message = PoseWithCovarianceStamped()

@@ -121,13 +121,13 @@ SERVO_PARAMETERS = (*_GOAL, *_LAW, *_STAGE)
 
 
 def read_goal(settings: Parameters) -> PlanePose:
-    """The goal as the parameters have it."""
+    """Read the goal from the parameters."""
     angle_rad = math.radians(settings["goal_rotation_deg"])
     return PlanePose(settings["goal_x_m"], settings["goal_y_m"], angle_rad)
 
 
 def read_servo_settings(settings: Parameters) -> ServoSettings:
-    """The control law as the parameters have it."""
+    """Read the settings of the control law from the parameters."""
     return ServoSettings(
         gain_hz=settings["gain"],
         speed_limit_m_s=1e-6 * settings["speed_limit_um_s"],

@@ -1,1 +1,1 @@
-"""Work in processes of its own beside a node."""
+"""Work in separate processes beside a node."""

@@ -1,6 +1,6 @@
-"""A calibration in a process of its own, so that the stream goes on and a stop need not wait for it.
+"""A calibration in a separate process, so that the stream continues and a shutdown need not wait for it.
 
-What runs in the process imports no ROS.
+The process does not import ROS.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ __all__ = [
     "without_images",
 ]
 
-# How often a running calibration asks whether it is still wanted: as fast as a person sees a stop.
+# How often a running calibration asks whether it is still wanted: a person notices no delay at a stop.
 _POLL_S = 0.1
-# A stage is published when it changes, but not more often than can be read, and as a sign of life in between.
+# A stage is published when it changes, though not more often than can be read, and as a sign of life in between.
 _OFTEN_S, _SELDOM_S = 0.2, 1.0
-# A third of the weight of a live node (sched(7)), where both want the same processor: those keep up, and it still
-# gets on.
+# A third of the weight of a live node (sched(7)) where both want the same processor: live nodes keep up, and the
+# calibration still advances.
 _NICE = 5
 
-# What numerics raise on degenerate views.
+# What numerical code raises on degenerate views.
 _NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
 class CalibrationJob:
-    """Everything that a calibration needs; the images of the views are not among it."""
+    """Everything that a calibration needs; the images of the views are not needed."""
 
     views: tuple[FoundView, ...]
     display_width_m: float
@@ -52,7 +52,7 @@ class CalibrationJob:
 
 @dataclass(frozen=True)
 class Stage:
-    """What a calibration is at, and the fraction of the work that is done."""
+    """The current stage of a calibration, and the fraction of the work that is done."""
 
     name: str
     fraction: float
@@ -60,7 +60,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class JobResult:
-    """The text of the calibration file and a summary, or the reason why there is none."""
+    """The text of the calibration file and a summary, or the reason of the failure."""
 
     text: str
     summary: str
@@ -106,13 +106,13 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
 
 
 def serve(channel: Channel) -> None:
-    """Take one job; answer with its stages and at last with its result."""
+    """Receive one job; answer with its stages and finally with its result."""
     job: CalibrationJob = channel.receive()
     channel.send(_calibrate(job, lambda name, fraction: channel.send(Stage(name, fraction))))
 
 
 def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:
-    """The views with their pixels left out, which a calibration does not need."""
+    """Return the views without their pixels, which a calibration does not need."""
     nothing = np.zeros((1, 1), dtype=np.uint8)
     return tuple(FoundView(v.name, v.magnification, nothing, v.detection) for v in views)
 
@@ -129,11 +129,11 @@ class CalibrationProcess:
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since this object was created."""
         return time.monotonic() - self._started_s
 
     def cancel(self) -> None:
-        """End it at once; a run that has not begun will not begin."""
+        """Stop the calibration at once; a run that has not begun will not begin."""
         with self._lock:
             self._cancelled = True
             if self._process is not None:
@@ -147,9 +147,9 @@ class CalibrationProcess:
         Parameters
         ----------
         still_wanted
-            Asked some times a second; with False the calibration is given up.
+            Called a few times a second; if it returns False, the calibration is cancelled.
         on_progress
-            Called with the stage when that changes, though at most five times a second, and once a second anyway.
+            Called with the stage when it changes, at most five times a second, and at least once a second.
         """
         with self._lock:
             if self._cancelled:
@@ -182,7 +182,7 @@ class CalibrationProcess:
 
 
 class _Progress:
-    """Hands on stages at a bounded rate; the fraction never goes back, even where work begins again."""
+    """Forwards stages at a bounded rate; the fraction never decreases, even if work starts again."""
 
     def __init__(self, on_progress: Callable[[Stage], None]) -> None:
         self._on_progress = on_progress
@@ -202,7 +202,7 @@ class _Progress:
 
 
 def _describe(error: ChildProcessEnded) -> str:
-    """Why there is no result, and what to do."""
+    """Say why there is no result, and what to do."""
     do = "call again"
     if error.status == -signal.SIGKILL:
         do = "call again; if nobody ended it, memory ran out: use fewer views, or residual off"

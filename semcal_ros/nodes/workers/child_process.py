@@ -1,4 +1,4 @@
-"""A Python process that works for a node, and ends with it, however that ends."""
+"""A Python process that works for a node and ends with it, however the node ends."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ __all__ = ["Channel", "ChildProcess", "ChildProcessEnded"]
 
 # A fork would copy the threads' locks of rclpy and of the middleware in whatever state they are.
 _SPAWN = multiprocessing.get_context("spawn")
-# The matrices are small; more threads would only take the other processors from the live nodes.
+# The matrices are small; more threads would only take processors away from the live nodes.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
 # A killed process is gone within milliseconds; longer means that the kernel cannot end it, and waiting does not help.
 _END_S = 2.0
-# As much as Linux allows everybody (pipe(7)); of 64 KiB, the usual size, a frame takes dozens of turns of both sides.
+# As much as Linux allows any user (pipe(7)); at the usual 64 KiB, both sides take dozens of turns for a frame.
 _PIPE_BYTES = 1024 * 1024
 
 
 class ChildProcessEnded(Exception):
-    """The process has ended, or was ended, before it answered; ``status`` is its exit status."""
+    """The process ended, or was stopped, before it answered; ``status`` is its exit status."""
 
     def __init__(self, status: int | None) -> None:
         if status is None:
@@ -44,8 +44,8 @@ class ChildProcessEnded(Exception):
 class Channel:
     """One end of a pair of pipes that carry any picklable object; for one thread at a time and direction.
 
-    Objects are pickled straight into the pipe and out of it. ``Connection.send`` and ``recv`` would copy them twice
-    more and read in pieces: handing over a frame of 1536 x 1536 took 2.3 to 2.8 ms instead of 1.5 to 1.9, and getting
+    Objects are pickled straight into the pipe and out of it. ``Connection.send`` and ``recv`` would make two more
+    copies and read in pieces: handing over a frame of 1536 x 1536 took 2.3 to 2.8 ms instead of 1.5 to 1.9, and getting
     its tracker back 250 to 500 ms instead of 50 to 100.
     """
 
@@ -65,26 +65,26 @@ class Channel:
         self._output.flush()
 
     def receive(self) -> Any:
-        """The next object; raises :class:`EOFError` or :class:`OSError` if the other side has ended."""
+        """Receive the next object; raises :class:`EOFError` or :class:`OSError` if the other side has ended."""
         try:
             return pickle.load(self._input)
         except pickle.UnpicklingError as error:
             raise EOFError("the other side has ended in the middle of an object") from error
 
     def poll(self, seconds: float) -> bool:
-        """Whether there is something to receive, or the other side has ended, within that time."""
+        """Return whether, within this time, there is something to receive or the other side has ended."""
         return bool(self._ends[0].poll(seconds))
 
     def close(self) -> None:
         """Close this end."""
         for part in (self._output, self._input, *self._ends):
-            # What could not be sent any more is given up.
+            # What can no longer be sent is dropped.
             with contextlib.suppress(OSError):
                 part.close()
 
 
 def _pipe() -> tuple[Any, Any]:
-    """Reading and writing end of a pipe that takes much at once."""
+    """Return the reading and the writing end of a pipe with a large buffer."""
     reader, writer = _SPAWN.Pipe(duplex=False)
     with contextlib.suppress(OSError):
         fcntl.fcntl(writer.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
@@ -92,16 +92,16 @@ def _pipe() -> tuple[Any, Any]:
 
 
 class ChildProcess:
-    """Runs ``serve(channel)`` in a process of its own, with one thread of linear algebra and little weight.
+    """Runs ``serve(channel)`` in a separate process, with one thread of linear algebra and a low priority.
 
-    Ctrl-C does not reach the process: it is for the node, which decides what becomes of the process.
+    Ctrl-C does not reach the process: the node handles it and decides what happens to the process.
 
     Parameters
     ----------
     serve
         A function of a module; the process imports that module, and ends when the function returns.
     nice
-        What is added to the nice value of the node, 0 to 19.
+        Added to the nice value of the node, 0 to 19.
     """
 
     def __init__(self, serve: Callable[[Channel], None], nice: int) -> None:
@@ -112,7 +112,7 @@ class ChildProcess:
         self._process = _SPAWN.Process(target=_run, args=(theirs, nice), daemon=True)
         with _without_interrupts():
             self._process.start()
-        # The process has the only ones left, so that its end can be seen here.
+        # Only the process keeps its ends of the pipes, so that this side notices when the process ends.
         theirs.close()
         self.send(serve)
 
@@ -136,15 +136,15 @@ class ChildProcess:
             raise self._ended() from None
 
     def poll(self, seconds: float) -> bool:
-        """Whether :meth:`receive` has something to return or to raise, within that time."""
+        """Return whether, within this time, :meth:`receive` has something to return or to raise."""
         return self._channel.poll(seconds)
 
     def kill(self) -> None:
-        """End the process at once; from any thread."""
+        """Kill the process at once; any thread may call this."""
         self._process.kill()
 
     def close(self) -> None:
-        """End the process and free what it used; not while another thread sends or receives."""
+        """End the process and free its resources; not while another thread sends or receives."""
         self._process.kill()
         self._process.join(_END_S)
         self._channel.close()
@@ -171,7 +171,7 @@ def _run(channel: Channel, nice: int) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.nice(nice)
-    # Before the first message, with which numpy is imported.
+    # Before the first message, which causes numpy to be imported.
     os.environ.update(_ONE_THREAD)
     # The node may have ended meanwhile.
     with contextlib.suppress(EOFError, OSError):

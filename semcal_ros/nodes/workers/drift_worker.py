@@ -1,6 +1,6 @@
-"""The drift tracker in a process of its own, for streams that must not wait for it.
+"""The drift tracker in a separate process, for streams that must not wait for it.
 
-A thread would do its work under the interpreter's lock, which the frames need.
+A thread would hold the interpreter's lock, which the frames need.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class _Frame:
-    """What :func:`measure_frame` takes."""
+    """The arguments of :func:`measure_frame`."""
 
     image: NDArray[np.generic]
     camera: ScanCamera
@@ -59,10 +59,10 @@ def measure_frame(
 
 
 class DriftProcess:
-    """Holds a tracker in another process, which works on requests one after the other, in the order in which they came.
+    """Holds a tracker in another process, which handles requests one after the other, in order of arrival.
 
-    The process is started with the first request, which takes a second or two, and again with the first request after
-    it has died. Futures raise what the tracker raised, or :class:`ChildProcessEnded` if the process has died; the
+    The process is started by the first request, which takes a second or two, and again by the first request after it
+    has died. Futures raise what the tracker raised, or :class:`ChildProcessEnded` if the process has died; the
     tracker is lost then.
     """
 
@@ -86,12 +86,12 @@ class DriftProcess:
         time_s: float,
         timing: ScanTiming | None,
     ) -> Future[Measurement]:
-        """Measure a frame, from now on with ``tracker``; None stands for the one that the process has."""
+        """Measure a frame, from now on with ``tracker``; None stands for the tracker that the process has."""
         frame = _Frame(image, camera, time_s, timing)
         return self._queue.submit(self._ask, tracker, frame)
 
     def fetch(self) -> Future[DriftTracker]:
-        """The tracker as it is after everything before."""
+        """Request the tracker in its state after all earlier requests."""
         return self._queue.submit(self._ask, None, None)
 
     def close(self) -> None:
@@ -99,7 +99,7 @@ class DriftProcess:
         self._ended = True
         self._queue.shutdown(wait=False, cancel_futures=True)
         if self._process is not None:
-            # What waits for an answer ends with this.
+            # This also ends requests that wait for an answer.
             self._process.kill()
         self._queue.shutdown(wait=True)
         if self._process is not None:
@@ -125,7 +125,7 @@ class DriftProcess:
 
 def serve(channel: Channel) -> None:
     """Answer requests until the node closes its end."""
-    # The stream has the other processors.
+    # The other processors are left to the stream.
     cv2.setNumThreads(1)
     held = DriftTracker()
     while True:
