@@ -1,1 +1,1 @@
-"""Uses of the method: bending of a cantilever, shape from views, visual servoing."""
+"""Applications of the method: bending of a cantilever, shape from views, visual servoing."""

@@ -1,9 +1,9 @@
-"""Drift of what stands still while the cantilever and its pusher move.
+"""Drift of the background while the cantilever and its pusher move.
 
-The tracker takes one shift for the whole picture, so all that moves by itself is smoothed away
-before it looks: the beam (where it is, is known) and every place whose picture changes over the
-recording by more than noise and drift explain. The covered places are fixed to the specimen and
-move with its drift, or their rims would hold the tracker back.
+The tracker fits one shift to the whole image. Everything that moves on its own is therefore
+smoothed away first: the beam, whose position is known, and every area that changes over the
+recording by more than noise and drift explain. The covered areas are fixed to the specimen and
+move with its drift; otherwise their rims would hold the tracker back.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from semcal_ros.core.registration.register import prepare_reference, register
 __all__ = ["Background", "follow_background"]
 
 
-# The first look is at a picture that is reduced to some 256 px, in tiles: their number along each
-# side, their least side, and how many must be matched for their median to be trusted.
+# The rough drift is measured in an image reduced to between 256 and 512 px along its shorter side,
+# by the median shift of its tiles.
 _FIRST_PX = 256
 # Tiles along the shorter side.
 _TILES = 4
@@ -36,34 +36,34 @@ _LEAST_TILE_PX = 64
 _LEAST_TILES = 3
 # A tile is used if the beam covers less than this part of it.
 _MOSTLY = 0.5
-# Cells in which changes are looked for, px. Of n frames chance makes 1 in 10^4 cells exceed the usual
-# range by a factor of 1 + 4 / sqrt(n).
+# Side of the cells in which changes are detected, px. With n frames, chance makes 1 in 10^4 cells
+# exceed the usual range by a factor of 1 + 4 / sqrt(n).
 _CELL_PX = 8
 # Factor of 1 / sqrt(n) in that range.
 _CHANCE = 4.0
-# Error of the rough drift to either side, px: 0.1 px of a picture that was reduced four times.
-# An edge of some slope changes its cells by twice as much without moving by itself.
+# Error of the rough drift to either side, px: 0.1 px of an image reduced four times. It may
+# change the grey levels of a static edge by twice the error times the slope.
 _ROUGH_PX = 0.4
-# A body moves if that many of its cells do, and that share of them.
+# A body counts as moving if at least this many of its cells change ...
 _LEAST_CELLS = 4
-# The share matters for large bodies, of which a few cells exceed the limit by chance.
+# ... and at least this share of them: in a large body a few cells exceed the limit by chance.
 _BODY_SHARE = 0.03
-# Sigma of the rim of what is covered, px: without an edge that the tracker could follow.
+# Sigma of the soft rim of a covered area, px: a sharp rim would be an edge for the tracker.
 _SOFT_PX = 3.0
-# Sigma over which the ground beside covered places fills them, px: several widths of the rim.
+# Sigma over which the surrounding ground fills a covered area, px: several widths of the rim.
 _FILL_PX = 14.0
 
 
 @dataclass(frozen=True)
 class Background:
-    """The drift, and what of the picture it rests on.
+    """The drift, and the part of the image that it was measured in.
 
     Attributes
     ----------
     path
         Drift of all frames.
     weight
-        (h, w) float32 weights of the raw pixels at zero drift: 1 where nothing moves by itself.
+        (h, w) float32 weights of the raw pixels at zero drift: 1 where nothing moves on its own.
     """
 
     path: DriftPath
@@ -83,15 +83,15 @@ def follow_background(
     Parameters
     ----------
     images
-        (h, w) grey pictures of one size.
+        (h, w) grey images of one size.
     times_s
-        Starts of their acquisitions.
+        Start time of each acquisition.
     plane
-        Coordinates of their pixels.
+        Coordinates of the pixels.
     axis
         The cantilever.
     margin_m
-        How far from its edges at rest the beam may come.
+        Largest distance of the moving beam from its edges at rest.
     on_frame
         Called after each frame.
     """
@@ -116,9 +116,9 @@ def follow_background(
 
 
 def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
-    """(n, 2) px: the shift against the first picture that most tiles agree on, to some 0.1 px.
+    """Estimate the shift of each image against the first one, (n, 2) px, to about 0.1 px.
 
-    A pusher moves or covers some of them only, and the median does not care.
+    The shift is the median over the tiles: a pusher moves or covers only some of them.
     """
     shrink = max(1, min(beam.shape) // _FIRST_PX)
     if shrink > 1:
@@ -158,12 +158,12 @@ def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
 
 
 def _soften(beam: Mask) -> Image:
-    """1 outside of the beam, with a soft rim."""
+    """Return a mask that is 1 outside the beam and 0 inside, with a soft rim."""
     return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), _SOFT_PX), np.float32)
 
 
 def _shift_image(image: Image, shift: Array) -> Image:
-    """The image moved by a shift; its border goes on."""
+    """Shift an image; its border pixels are repeated."""
     matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
     size = (image.shape[1], image.shape[0])
     moved = cv2.warpAffine(
@@ -173,7 +173,7 @@ def _shift_image(image: Image, shift: Array) -> Image:
 
 
 def _find_changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
-    """Where the picture changes by itself."""
+    """Find where the image changes on its own."""
     if len(pictures) < 2:
         return np.zeros_like(beam)
     cells = []
@@ -184,7 +184,7 @@ def _find_changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
     middle = np.median(stack, axis=0)
     gy, gx = np.gradient(middle)
     slope = np.hypot(gx, gy) / _CELL_PX
-    # Noise as most of the cells show it, growing with the root of the brightness.
+    # Noise as most cells show it; it grows with the square root of the brightness.
     ground = _average_cells(beam.astype(np.float32)) < 0.5
     level = np.sqrt(np.maximum(middle / max(float(np.median(middle[ground])), 1.0), 0.25))
     usual = float(np.median((change / level)[ground]))
@@ -195,10 +195,10 @@ def _find_changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
 
 
 def _find_moving_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
-    """Bright bodies with several changed cells: all of them, with edges along which they slid."""
+    """Mask bright bodies with several changed cells, with the edges along which they slid."""
     grey = np.clip(255.0 * (middle - middle.min()) / max(float(np.ptp(middle)), 1e-9), 0.0, 255.0)
     level, _ = cv2.threshold(grey.astype(np.uint8), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    # Between cells of one body that the beam separates there are cells of the beam.
+    # The beam may cut a body in two: its cells lie in between.
     bright = ((grey > level) & ground).astype(np.uint8)
     count, labels = cv2.connectedComponents(bright, connectivity=4)
     near = cv2.dilate(strong.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
@@ -211,7 +211,7 @@ def _find_moving_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
 
 
 def _enlarge(cells: Mask, shape: tuple[int, ...]) -> Mask:
-    """Cells as pixels; the border that no whole cell covers is that of the last ones."""
+    """Expand cells to pixels; the last cells extend over the border that no whole cell covers."""
     large = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
     rows, cols = shape[0] - large.shape[0], shape[1] - large.shape[1]
     return np.pad(large, ((0, rows), (0, cols)), mode="edge")
@@ -226,7 +226,7 @@ def _average_cells(picture: Image) -> Array:
 
 
 def _cover(picture: Image, weight: Image) -> Image:
-    """The picture with what moves replaced by the smooth level of what stands still around it."""
+    """Replace moving areas by the smooth level of the static background around them."""
     known = np.asarray(cv2.GaussianBlur(weight, (0, 0), _FILL_PX), dtype=np.float32)
     level = np.asarray(cv2.GaussianBlur(picture * weight, (0, 0), _FILL_PX), dtype=np.float32)
     mean = float((picture * weight).sum() / max(float(weight.sum()), 1.0))

@@ -4,11 +4,11 @@ The displacement across the axis of a clamped beam at the arc length ``s = u L``
 
     D(u) = r0 + r1 u + bending,    bending = d (u^2 + c (u^3 - u^2))
 
-r0 and r1 are what is left of drift and rotation, held by what is known of those; d is the
+r0 and r1 are the remaining drift and rotation, with priors from what is known about both. d is the
 deflection: the bending at u = 1, at the arc length L from the base. c is the shape: 0 is the
 second-order polynomial of Malti et al. (2012), -1/2 a beam that is loaded at its end (Euler and
-Bernoulli). Where it is free it is still the same for all frames, since the beam is pushed at one
-place, so that it costs a single frame little.
+Bernoulli). A free shape is still common to all frames, since the beam is pushed at one place, so
+that fitting it adds little to the uncertainty of a single frame.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ __all__ = [
 
 SHAPES = ("free", "beam", "parabola")
 
-# Of the line of sight's turn between frames, rad: the raster and a clamp are that stable.
+# 1-sigma of the rotation between frames, rad: the raster and a clamp are that stable.
 _TURN_RAD = 1e-5
-# Mean and 1-sigma of a shape that nobody knows: a parabola and a beam loaded at its end are likely.
+# Prior mean and 1-sigma of an unknown shape: both the parabola and the end-loaded beam are likely.
 _PRIOR = (-0.25, 0.35)
 # Keeps divisions from zero, m^2: far below any variance, which is at least 1e-26 (see the prior).
 _TINY = 1e-30
 # Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
 # doi:10.1080/03610927708827533).
 _TUKEY = 4.685
-# Reweighting has settled long before; a linear fit costs little.
+# Rounds of reweighting. It settles long before that, and a linear fit costs little.
 _ROUNDS = 12
 # Least number of edges in a fit: it has four unknowns, and two more show the scatter.
 _LEAST = 6
@@ -57,16 +57,16 @@ class Bending:
     Attributes
     ----------
     deflection_m, sigma_m
-        Bending at the end of the beam, and its 1-sigma without that of the scale.
+        Bending at the end of the beam, and its 1-sigma without the uncertainty of the scale.
     coefficients
         (4,) r0, r1, and the factors of u^2 and u^3 of the bending, in m.
     covariance
-        (2, 2) of the deflection and of the factor of u^3, m^2; the latter is zero where the shape
-        was given.
+        (2, 2) of the deflection and of the factor of u^3, m^2; the second is zero if the shape was
+        given.
     rms_m
-        RMS of what the fit leaves in the blocks that were used.
+        RMS residual of the edges that were used.
     residuals
-        (blocks, 2) what the fit leaves over its 1-sigma; NaN where the edge was not used.
+        (blocks, 2) residuals over their 1-sigma; NaN where the edge was not used.
     used
         (blocks, 2) bool: the edges that were used.
     """
@@ -80,7 +80,7 @@ class Bending:
     used: Mask
 
     def curve(self, u: Array) -> Array:
-        """Bending alone at fractions of the length; it goes on straight beyond the ends."""
+        """Evaluate the bending alone at fractions of the length; straight beyond the ends."""
         return evaluate_bending(self.coefficients[2:], u)
 
 
@@ -93,8 +93,8 @@ class Shape:
     value, sigma
         c and its 1-sigma.
     relative
-        1-sigma of what all deflections are wrong by in proportion to them, because of the ground
-        beside the edges.
+        1-sigma of an error in proportion to the deflection, common to all frames, that the ground
+        beside the edges causes.
     """
 
     value: float
@@ -103,7 +103,7 @@ class Shape:
 
 
 def parse_shape(name: str) -> Shape | None:
-    """The shape of a name in :data:`SHAPES`; None where it is free.
+    """Return the shape for a name in :data:`SHAPES`; None for a free shape.
 
     Raises
     ------
@@ -118,16 +118,16 @@ def parse_shape(name: str) -> Shape | None:
 def fit_common_shape(
     frames: Sequence[Bending], reference_sigma_m: float, reference_count: int
 ) -> Shape:
-    """The shape that several frames have in common.
+    """Fit the shape that several frames have in common.
 
-    The factor of u^3 is c d plus a constant that the noise of the reference makes.
+    The factor of u^3 is c d plus a constant that the noise of the reference causes.
 
     Parameters
     ----------
     frames
         Fits with a free shape.
     reference_sigma_m
-        1-sigma of the factor of u^3 that the noise of the reference makes.
+        1-sigma of the factor of u^3 that the noise of the reference causes.
     reference_count
         Number of frames in the reference.
     """
@@ -153,10 +153,10 @@ def fit_common_shape(
 
 
 def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) -> float:
-    """How many times more the residuals of an edge grow with the deflection than noise explains.
+    """Estimate how much more the residuals of an edge grow with the deflection than noise explains.
 
-    A bright grain beside an edge pulls it in all frames alike; what the reference did to it does
-    not depend on the deflection.
+    A bright grain beside an edge pulls the fitted edge in all frames alike; the effect of the
+    reference does not depend on the deflection.
     """
     if len(frames) < 4:
         return 1.0
@@ -173,13 +173,13 @@ def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count
         return 1.0
     own = reference_count / (reference_count + 1.0)
     ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / own
-    # The fits have taken what two of their terms explain.
+    # The fits have absorbed what their terms explain.
     number = float(usable.sum())
     return float(max(ratio * number / max(number - 4.0, 1.0), 1.0))
 
 
 def evaluate_bending(terms: Array, u: Array) -> Array:
-    """Factors (2,) times u^2 and u^3 within the beam, and its tangent beyond."""
+    """Evaluate factors (2,) times u^2 and u^3 within the beam, and the tangent beyond its end."""
     a, b = terms
     inside = np.clip(u, 0.0, 1.0)
     slope = 2.0 * a + 3.0 * b
@@ -205,14 +205,14 @@ def fit_bending(
     length_m
         Length of the beam.
     offset_sigma_m
-        1-sigma of what drift may have left.
+        1-sigma of the remaining drift.
     shape
         Shape of the bending; None to fit it.
 
     Returns
     -------
     Bending
-        With an infinite sigma where too little of the beam was seen.
+        With an infinite sigma if too little of the beam was seen.
     """
     usable = np.isfinite(sigma_m) & np.isfinite(compute_displacement_m)
     cubic = u**3 - u**2
@@ -242,7 +242,7 @@ def fit_bending(
     whole[: len(terms), : len(terms)] = covariance[2:, 2:]
     b = float(solution[3]) if shape is None else shape.value * d
     if shape is not None and shape.sigma > 0.0:
-        # A wrong shape makes a deflection wrong by what the fit takes its difference for.
+        # A wrong shape biases the deflection by what the fit makes of the difference.
         plain = rows * (weight / sigma**2)[:, None]
         wrong = np.repeat(cubic, 2)[usable.ravel()]
         taken = np.linalg.solve(plain.T @ rows + np.diag(prior), plain.T @ wrong)[2]
@@ -261,9 +261,9 @@ def fit_bending(
 def _fit_robustly(
     rows: Array, seen: Array, sigma: Array, prior: Array
 ) -> tuple[Array, Array, float, Array]:
-    """Reweighted least squares (Tukey's biweight), with the scatter of the residuals as scale.
+    """Fit by reweighted least squares (Tukey's biweight), scaled by the scatter of the residuals.
 
-    The model is linear, so that each round is one small solve. scipy.optimize.least_squares has no
+    The model is linear, so each round is one small solve. scipy.optimize.least_squares has no
     loss that gives outliers no weight at all: with its Cauchy loss, a fit of 60 blocks takes 65 to 80
     ms instead of 8 to 10 ms, and the error is the same with up to a tenth of an edge covered by
     another body, and 5 % larger with a fifth.
@@ -281,7 +281,7 @@ def _fit_robustly(
         # The first rounds do not yet know what is an outlier.
         far = residual / (scale * _TUKEY * (2.0 if turn < 3 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
-    # Rounding of the weights costs a little more than the plain formula tells.
+    # The sandwich formula: the weights cost a little more than the plain inverse says.
     total = weight * plain / scale**2
     meat = (rows * (weight**2 * plain / scale**2)[:, None]).T @ rows + np.diag(prior)
     inverse = np.linalg.inv((rows * total[:, None]).T @ rows + np.diag(prior))
@@ -291,7 +291,7 @@ def _fit_robustly(
 
 
 def locate_end(terms: Array, length_m: float) -> float:
-    """Where along the axis the end of the bent beam is, by its conserved arc length.
+    """Locate the end of the bent beam along the axis, m, from its conserved arc length.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 In each block the grey levels near an edge follow ``low + step * Phi((n - e) / width)``: a straight
 edge under a round beam. Low, step and e are fitted to the raw pixels by least squares, all blocks
-at once, with a taper that moves with the edge, so that no pixel enters or leaves at once. What the
-model lacks, such as a bright rim, shifts all frames alike; deflections are differences.
+at once, with a taper that moves with the edge, so that no pixel enters or leaves abruptly. Features
+that the model lacks, such as a bright rim, shift all frames alike; deflections are differences.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ _LEAST_PIXELS = 12
 _WIDTHS_PX = tuple(0.55 * 1.16**k for k in range(16))
 # Keeps divisions from zero.
 _TINY = 1e-30
-# Both edges of the beam move alike: deviations beyond which one of them is not its own.
+# Both edges of the beam move alike. If their displacements differ by more than this many sigma, one
+# of them belongs to another body.
 _SAME_WIDTH = 4.5
 
 
@@ -51,7 +52,7 @@ class EdgeModel:
     reach_m
         How far from the edge pixels count.
     start_m, block_m, blocks
-        Arc length at which the first block begins, the length of a block, and how many there are.
+        Arc length at which the first block begins, length of a block, and number of blocks.
     half_width_m
         Half the width of the beam.
     """
@@ -76,13 +77,13 @@ class EdgeFit:
     Attributes
     ----------
     across_m
-        (blocks, 2) where the edge is across the axis, at the blocks' centres.
+        (blocks, 2) positions of the edges across the axis, at the centres of the blocks.
     sigma_m
-        (blocks, 2) 1-sigma from the noise of the pixels; infinite where there is no edge.
+        (blocks, 2) 1-sigma from the pixel noise; infinite where there is no edge.
     step
         (blocks, 2) how much brighter the beam is.
     chi2
-        Sum of squares that the model leaves, over all blocks, in squared grey levels.
+        Sum of squared residuals over all blocks, in squared grey levels.
     """
 
     across_m: Array
@@ -93,7 +94,7 @@ class EdgeFit:
 
 @dataclass(frozen=True)
 class StepFit:
-    """One straight edge: its place and 1-sigma in m, and its step in grey levels."""
+    """One straight edge: its position and 1-sigma in m, and its step in grey levels."""
 
     place_m: float
     sigma_m: float
@@ -112,7 +113,7 @@ def fit_edges(
     model
         Blocks and edge.
     predicted_m
-        (blocks, 2) where the edges are expected.
+        (blocks, 2) expected positions of the edges.
     """
     block = np.floor((along_m - model.start_m) / model.block_m).astype(np.intp)
     inside = (block >= 0) & (block < model.blocks)
@@ -136,9 +137,10 @@ def fit_edges(
 def fit_step(
     distance_m: Array, grey: Array, model: EdgeModel, *, rough_m: float | None = None
 ) -> StepFit:
-    """Fit one straight edge to pixels at distances from where it is expected; bright is positive.
+    """Fit one straight edge to pixels, given by their distance from its expected position.
 
-    ``rough_m`` is how far from there it may be; it is searched for, then.
+    Distances are positive on the bright side. With ``rough_m`` the edge is searched for up to that
+    distance from the expected position.
     """
     best: tuple[float, float, float, float] | None = None
     reach = 0.0 if rough_m is None else rough_m
@@ -160,21 +162,21 @@ def fit_step(
 def choose_width(
     along_m: Array, across_m: Array, grey: Array, model: EdgeModel, predicted_m: Array, px_m: float
 ) -> float:
-    """The width of the edges, m, that leaves least; ``px_m`` is the size of a pixel."""
+    """Choose the edge width, m, with the least residuals; ``px_m`` is the size of a pixel."""
     widths = [w * px_m for w in _WIDTHS_PX]
     left = [
         fit_edges(along_m, across_m, grey, replace(model, width_m=w), predicted_m).chi2
         for w in widths
     ]
     k = int(np.clip(np.argmin(left), 1, len(widths) - 2))
-    # Parabola through the least and its neighbours, in the logarithm of the width.
+    # Parabola through the minimum and its neighbours, in the logarithm of the width.
     a, b, c = left[k - 1], left[k], left[k + 1]
     shift = 0.5 * (a - c) / max(a - 2.0 * b + c, _TINY)
     return float(widths[k] * 1.16 ** float(np.clip(shift, -1.0, 1.0)))
 
 
 def _interpolate_line(along: Array, model: EdgeModel, values: Array) -> Array:
-    """Values at the blocks' centres, interpolated and continued to the pixels."""
+    """Interpolate and extrapolate values at the centres of the blocks to the pixels."""
     centres = model.centres_m
     if len(centres) < 2:
         return np.full(along.shape, values[0])
@@ -187,7 +189,7 @@ def _interpolate_line(along: Array, model: EdgeModel, values: Array) -> Array:
 def _fit_blocks(
     block: Indices, distance: Array, grey: Array, model: EdgeModel, count: int
 ) -> tuple[Array, Array, Array, float]:
-    """Place, 1-sigma and step of each block's edge, and the squares that are left."""
+    """Fit position, 1-sigma and step of each block's edge; also the sum of squared residuals."""
     place, slope = np.zeros(count), np.zeros(count)
     low, step = np.zeros(count), np.zeros(count)
     width, reach = model.width_m, model.reach_m
@@ -216,7 +218,7 @@ def _fit_blocks(
         left = grey - low[block] - step[block] * shape - solution[block, 2] * third
         squares = np.asarray(np.bincount(block, taper * left**2, count), dtype=np.float64)
         weight_sum = np.asarray(np.bincount(block, taper, count), dtype=np.float64)
-    # The taper counts pixels at the rim less than they would deserve: its square is their noise.
+    # The taper weights pixels at the rim less than their noise would: noise adds with its square.
     noise = np.bincount(block, taper**2, count) / np.maximum(weight_sum, _TINY)
     variance = squares / np.maximum(weight_sum - 3.0 * noise, 1.0)
     inverse = np.linalg.pinv(information, hermitian=True)
@@ -239,20 +241,21 @@ def _accumulate_normal(
 
 
 def _solve_guarded(matrix: Array, right: Array) -> Array:
-    """Solutions of (n, 3, 3) systems that may be singular."""
+    """Solve (n, 3, 3) systems that may be singular."""
     guard = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + _TINY
     return np.asarray(np.linalg.solve(matrix + guard * np.eye(3), right[..., None])[..., 0])
 
 
 def find_unchanged_width(moved: Array, noise: Array) -> Mask:
-    """(blocks,) where the width is what it was: elsewhere something lies on an edge.
+    """Find the blocks, (blocks,) bool, in which the width of the beam has not changed.
 
-    The neighbours of such blocks are left out, too: it may reach into them a little.
+    In the others something lies on an edge. Their neighbours are left out, too, because that body
+    may reach into them a little.
 
     Parameters
     ----------
     moved, noise
-        (blocks, 2) displacements of both edges, and 1-sigma; infinite where unknown.
+        (blocks, 2) displacements of both edges, and their 1-sigma; infinite where unknown.
     """
     both = np.isfinite(noise).all(axis=1)
     if int(both.sum()) < 4:
@@ -260,7 +263,7 @@ def find_unchanged_width(moved: Array, noise: Array) -> Mask:
     change = moved[:, 1] - moved[:, 0]
     sigma = np.hypot(noise[:, 0], noise[:, 1])
     away = np.zeros(len(moved))
-    # Focus or charging may change the width of all of it.
+    # Focus or charging may change the width of the whole beam.
     away[both] = (change[both] - np.median(change[both])) / sigma[both]
     scale = max(mad_sigma(away[both]), 1.0)
     odd = ~both | (np.abs(away) > _SAME_WIDTH * scale)

@@ -1,4 +1,4 @@
-"""Find the cantilever in a picture: the strongest bright strip between two parallel edges.
+"""Find the cantilever in an image: the strongest bright strip between two parallel edges.
 
 For every direction, the gradient across it is summed along lines (a Radon transform of the signed
 derivative). Texture averages out; a strip leaves a rising and a falling line close together.
@@ -18,9 +18,9 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["Strip", "find_strip"]
 
 
-# Larger pictures are reduced before they are searched.
+# Larger images are reduced to this size before they are searched.
 _SEARCHED_PX = 640
-# All directions are searched in a picture of at most this size.
+# All directions are searched in an image of at most this size.
 _COARSE_PX = 256
 # Sigma of the smoothing before gradients are taken.
 _BLUR_PX = 1.5
@@ -32,13 +32,14 @@ _FINE_RAD = np.deg2rad(np.arange(-2.0, 2.01, 0.2))
 _LEAST_WIDTH_PX = 4
 # Of the shorter side: a wider bright area is not taken for a cantilever.
 _LARGEST_WIDTH = 0.35
-# A strip is one where its edges are at least that strong, relative to where they are strong.
+# The strip extends as far as its edges are at least this strong, relative to their 90 % quantile.
 _EDGE_SHARE = 0.35
-# Of the shorter side: shorter gaps in the edges are dirt or texture and no end.
+# Of the shorter side: shorter gaps in the edges are dirt or texture and not an end.
 _GAP = 0.06
-# Of the picture's side: a strip is longer, and it is out of view if it ends closer to the border.
+# Least length of a strip, of the shorter side of the image.
 _LEAST_LENGTH = 0.2
-# The mean along the strip reaches 4 px beyond its end, and the outer 3 px are not searched.
+# An end closer to the border counts as out of view: the mean along the strip reaches 4 px beyond
+# its end, and the outer 3 px are not searched.
 _BORDER_PX = 7.0
 _GIVE_CLICKS = "give two points on its centre line, the base and the free end, as base and tip"
 
@@ -50,11 +51,11 @@ class Strip:
     Attributes
     ----------
     base_px, tip_px
-        (2,) ends of the centre line, as far as it is in view.
+        (2,) ends of the visible part of the centre line.
     half_width_px
-        Half its width.
+        Half the width of the strip.
     base_seen, tip_seen
-        Whether each end is that of the cantilever and not where it leaves the picture.
+        Whether each end is an end of the cantilever and not the place where it leaves the image.
     """
 
     base_px: Array
@@ -66,7 +67,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class _Lines:
-    """Gradient of a picture that is ready for sums along lines."""
+    """Gradient of an image, prepared for sums along lines."""
 
     gx: Array
     gy: Array
@@ -75,7 +76,7 @@ class _Lines:
     size: tuple[int, int]
 
     def across(self, angle: float) -> tuple[Array, float]:
-        """Sums along lines in a direction, by distance from the origin, and the first distance."""
+        """Sum along lines in a direction: sums by distance from the origin, and the first distance."""
         c, s = np.cos(angle), np.sin(angle)
         distance = self.y * c - self.x * s
         first = float(np.floor(distance.min()))
@@ -94,15 +95,15 @@ def find_strip(
     Parameters
     ----------
     image
-        (h, w) grey picture in which nothing touches the cantilever.
+        (h, w) grey image in which nothing touches the cantilever.
     base_px, tip_px
         (2,) raw pixels of the two ends of the centre line, good to a few pixels; they may lie
-        outside of the picture where the end is out of view. None finds them.
+        outside the image where the end is out of view. None finds them.
 
     Raises
     ------
     InvalidValueError
-        If there is no strip, or it cannot be told which of its ends is the free one.
+        If there is no strip, or its base and free end cannot be told apart.
     """
     if (base_px is None) != (tip_px is None):
         raise InvalidValueError("one end of the cantilever", expected="both or none")
@@ -132,7 +133,7 @@ def find_strip(
 def _prepare_lines(smooth: Array) -> _Lines:
     gy, gx = np.gradient(smooth)
     y, x = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
-    # The border of the picture is no edge.
+    # The border of the image is not an edge.
     inner = np.zeros(smooth.shape, dtype=bool)
     inner[3:-3, 3:-3] = True
     take = inner.ravel()
@@ -142,7 +143,7 @@ def _prepare_lines(smooth: Array) -> _Lines:
 
 
 def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
-    """Rising line, and falling line after it, of which the weaker is strongest."""
+    """Find a rising line and a falling line after it, of which the weaker one is strongest."""
     best = (0.0, 0, 0)
     for width in range(low, min(high, len(rise) - 1)):
         pair = np.minimum(rise[:-width], fall[width:])
@@ -153,12 +154,12 @@ def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[floa
 
 
 def _widen(sums: Array) -> Array:
-    """An edge is some pixels wide, and a little bent."""
+    """Sum over three neighbouring lines: an edge is some pixels wide and may be slightly bent."""
     return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
 
 
 def _search_strip(smooth: Array) -> Strip:
-    """The strongest strip in any direction: found in a small picture, then in the large one."""
+    """Find the strongest strip in any direction, first in a small image, then in the large one."""
     shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
     size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
     part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
@@ -166,7 +167,7 @@ def _search_strip(smooth: Array) -> Strip:
     lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
     best, angle, offset = 0.0, 0.0, 0.0
-    # Both senses of a direction are the same strip: rising and falling edge change places.
+    # Half a turn is enough: in the opposite direction the two edges only change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
         sums, first = lines.across(float(turn))
         wide = _widen(sums)
@@ -185,7 +186,7 @@ def _search_strip(smooth: Array) -> Strip:
 
 
 def _find_pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, float, float]:
-    """Direction, distance from the origin and half width of the strip around a point."""
+    """Find direction, distance from the origin and half width of the strip around a point."""
     reach = int(_LARGEST_WIDTH * min(lines.size))
     best, found = 0.0, (nominal, 0.0, 0.0)
     for angle in nominal + _FINE_RAD:
@@ -209,12 +210,12 @@ def _find_pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float,
 
 
 def _follow_clicks(smooth: Array, base: Array, tip: Array) -> Strip:
-    """The strip around two points; what they say of its ends holds."""
+    """Find the strip around two points, whose positions along it are taken as its ends."""
     if not float(np.hypot(*(tip - base))) > 10.0:
         raise InvalidValueError("base and tip at the same place", expected="two ends of a beam")
     nominal = float(np.arctan2(tip[1] - base[1], tip[0] - base[0]))
     seen = [_is_inside(p, smooth.shape) for p in (base, tip)]
-    # Of what is in view: a click outside is only good for the direction.
+    # Points in view only: a click outside the image gives no more than the direction.
     points = [p for p, inside in zip((base, tip), seen, strict=True) if inside]
     inwards = [(tip - base) / 20.0, (base - tip) / 20.0]
     point = np.mean(points, axis=0) if points else 0.5 * (base + tip)
@@ -228,7 +229,7 @@ def _follow_clicks(smooth: Array, base: Array, tip: Array) -> Strip:
 
 
 def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """The part of a line that is in view."""
+    """Clip a line to the image."""
     steps = np.linspace(0.0, 1.0, 2001)[:, None]
     points = ends[0] + steps * (ends[1] - ends[0])
     inside = np.flatnonzero(
@@ -250,7 +251,7 @@ def _is_inside(point: Array, shape: tuple[int, ...]) -> bool:
 
 
 def _sample(picture: Array, points: Array) -> Array:
-    """Grey levels at (n, 2) pixels; NaN outside."""
+    """Interpolate grey levels at (n, 2) pixels; NaN outside the image."""
     maps = [np.ascontiguousarray(points[None, :, k], dtype=np.float32) for k in (0, 1)]
     out = cv2.remap(
         picture.astype(np.float32),
@@ -264,7 +265,7 @@ def _sample(picture: Array, points: Array) -> Array:
 
 
 def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip:
-    """Where along its lines the strip begins and ends, and which end is free."""
+    """Find where along its lines the strip begins and ends, and which end is free."""
     c, s = np.cos(angle), np.sin(angle)
     along, across = np.array([c, s]), np.array([-s, c])
     reach = float(np.hypot(*smooth.shape))
@@ -301,12 +302,12 @@ def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip
 
 
 def _get_corners(end: Array, outwards: Array, across: Array, half: float) -> list[Array]:
-    """Points a little beyond both corners of an end: a strip may leave the picture askew."""
+    """Return points just beyond both corners of an end: a strip may leave the image at an angle."""
     return [end + 4.0 * outwards + side * (half + 3.0) * across for side in (-1.0, 1.0)]
 
 
 def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
-    """First and last index of the longest stretch, gaps closed."""
+    """Return the first and last index of the longest run; gaps of up to ``gap`` do not break it."""
     places = np.flatnonzero(good)
     if not places.size:
         return None
@@ -320,7 +321,7 @@ def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
 def _measure_freedom(
     picture: Array, end: Array, outwards: Array, across: Array, half: float
 ) -> float:
-    """How dark it is beyond an end: 1 as beside the strip, 0 as in it; NaN out of view."""
+    """Measure how dark it is beyond an end: 1 as beside the strip, 0 as on it, NaN out of view."""
     spread = np.linspace(-0.5 * half, 0.5 * half, 5)
     beyond = np.linspace(8.0, 8.0 + max(half, 8.0), 9)
 
@@ -336,7 +337,7 @@ def _measure_freedom(
 
 
 def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:
-    """Which end is the base: the one behind which it stays bright, or that is out of view."""
+    """Decide which end is the base: the one that stays bright beyond, or that is out of view."""
     is_tip = [s and f > 0.5 for s, f in zip(seen, free, strict=True)]
     is_base = [s and f <= 0.5 for s, f in zip(seen, free, strict=True)]
     if is_tip[0] == is_tip[1] and is_base[0] == is_base[1]:

@@ -1,7 +1,7 @@
-"""Where in the specimen every pixel of a raw frame looks, and which way the cantilever lies there.
+"""Map every pixel of a raw frame to the specimen plane, and describe the cantilever's axis there.
 
-Edges are measured in the raw pixels, whose noise is independent; their places are freed of
-distortion and drift afterwards. So nothing is interpolated.
+Edges are measured in the raw pixels, whose noise is independent; their positions are corrected for
+distortion and drift afterwards. So no grey level is interpolated.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from semcal_ros.core.rectification.raw_positions import RasterDrift
 __all__ = ["Axis", "PlaneMap", "evaluate_drift"]
 
 
-# Distance of the nodes at which the distortion is undone: a hundredth of the pixels. Distortion is
-# smooth, so that a spline between them interpolates the others.
+# Spacing of the nodes at which the distortion is undone: a hundredth of the pixels. Distortion is
+# smooth, so a spline through the nodes gives the others.
 _NODE_SPACING_PX = 10.0
 # Degree of that spline, the highest that FITPACK has.
 _DEGREE = 5
@@ -34,7 +34,7 @@ class Axis:
     Attributes
     ----------
     origin_m
-        (2,) point of the centre line from which arc lengths are counted: the base, where it is in
+        (2,) point of the centre line from which arc lengths are measured: the base, if it is in
         view.
     direction
         (2,) unit vector towards the free end.
@@ -59,14 +59,14 @@ class Axis:
         return np.array([-self.direction[1], self.direction[0]])
 
     def coordinates(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-        """Along the axis and across it, in m, of points in the sem frame."""
+        """Convert points in the sem frame to coordinates along and across the axis, m."""
         x, y = x_m - self.origin_m[0], y_m - self.origin_m[1]
         along = x * self.direction[0] + y * self.direction[1]
         across = y * self.direction[0] - x * self.direction[1]
         return along, across
 
     def point(self, along_m: Array, across_m: Array) -> Array:
-        """(n, 2) points in the sem frame; inverse of :meth:`coordinates`."""
+        """Convert coordinates to (n, 2) points in the sem frame; inverse of :meth:`coordinates`."""
         along, across = np.asarray(along_m), np.asarray(across_m)
         return np.asarray(
             self.origin_m + along[:, None] * self.direction + across[:, None] * self.normal
@@ -81,7 +81,7 @@ class PlaneMap:
     camera
         Camera at the size of the frames.
     timing
-        Raster timing; None takes frames as instants.
+        Raster timing; None treats each frame as an instant.
 
     Raises
     ------
@@ -112,15 +112,15 @@ class PlaneMap:
         return float(np.sqrt(x * y))
 
     def sem_of(self, xy_px: Array) -> Array:
-        """(n, 2) sem-frame points of raw pixels (n, 2), without drift."""
+        """Convert raw pixels (n, 2) to sem-frame points (n, 2), without drift."""
         return self.camera.sem_from_ideal(self.camera.undistort(xy_px))[:, :2]
 
     def raw_of(self, xy_m: Array) -> Array:
-        """(n, 2) raw pixels of sem-frame points (n, 2), without drift."""
+        """Convert sem-frame points (n, 2) to raw pixels (n, 2), without drift."""
         return self.camera.project(np.column_stack([xy_m, np.zeros(len(xy_m))]))
 
     def specimen(self, pixels: Indices, drift: RasterDrift) -> tuple[Array, Array]:
-        """Coordinates, relative to where the specimen was at zero drift, of pixels by flat index."""
+        """Return the specimen coordinates of pixels (flat indices), with the drift removed."""
         since = self.since_s.ravel()[pixels]
         square = self.square_s2.ravel()[pixels]
         x_moved, y_moved = evaluate_drift(drift, since, square)
@@ -128,8 +128,8 @@ class PlaneMap:
 
 
 def evaluate_drift(drift: RasterDrift, since_s: Array, square_s2: Array) -> tuple[Array, Array]:
-    """Drift along x and y at times after the centre of the acquisition, whose mean squares over
-    the passes are ``square_s2``.
+    """Evaluate the drift along x and y at times after the centre of the acquisition, whose mean
+    squares over the passes are ``square_s2``.
     """
     position, velocity, turn = drift.position, drift.velocity, drift.acceleration
     return (
@@ -139,7 +139,7 @@ def evaluate_drift(drift: RasterDrift, since_s: Array, square_s2: Array) -> tupl
 
 
 def _compute_times(width: int, height: int, timing: ScanTiming | None) -> tuple[Array, Array]:
-    """(h, w) each: time after the centre of the acquisition, and its mean square over passes."""
+    """Compute times after the centre of the acquisition and their mean squares, (h, w) each."""
     if timing is None:
         return np.zeros((height, width)), np.zeros((height, width))
     rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]

@@ -1,4 +1,4 @@
-"""How well several magnifications agree about the same poses."""
+"""Repeatability of the deflections of the same poses across several magnifications."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Repeatability:
     deflection_m, sigma_m
         (m, p) means over the frames of each pose, in calibrated metres, and 1-sigma.
     by_length_m, by_length_sigma_m
-        The same in metres of the known length; NaN where that is not in view.
+        The same in metres of the known length; NaN where base and end are not both in view.
     spread_m, by_length_spread_m
         (p,) standard deviation among the magnifications (NaN for one); that of the reference pose
         is zero by definition.
     rms_spread_m, by_length_rms_spread_m
         Root of its mean square over the poses but the first.
     expected_spread_m
-        What the 1-sigmas make one expect for ``rms_spread_m``.
+        Value of ``rms_spread_m`` that the 1-sigmas predict.
     """
 
     magnifications: tuple[float, ...]
@@ -48,14 +48,14 @@ class Repeatability:
 
 
 def group_frames(frames: int, poses: int | None) -> list[list[int]]:
-    """Frames of each pose: ``frames`` in the order of time, cut into ``poses`` equal parts.
+    """Group ``frames`` frames, in the order of time, into ``poses`` equal parts.
 
-    None makes each frame a pose of its own.
+    With None each frame is a pose of its own.
 
     Raises
     ------
     InvalidValueError
-        If the frames cannot be cut so.
+        If the frames cannot be divided equally.
     """
     count = frames if poses is None else poses
     if count < 1 or frames % count:
@@ -129,7 +129,7 @@ def _average_poses(
                 parts_m = [(f.deflection_m, f.sigma_m) for f in chosen]
             values, sigmas = np.array(parts_m).T
             value[row, column] = float(weight @ values)
-            # A share of the noise is that of the reference, and the scale is common to all.
+            # Part of the noise is the reference's; the error of the scale is common to all frames.
             noise = np.array([f.noise_m for f in chosen])
             share = 1.0 / (len(parts[0]) + 1.0)
             common = float(weight @ (sigmas**2 - noise**2)) + share * float(weight @ noise**2)
@@ -145,7 +145,7 @@ def _compute_spread(value: Array) -> Array:
 
 
 def _compute_rms(values: Array) -> float:
-    """Over all poses but the first, which is the reference."""
+    """Compute the RMS over all poses but the first, which is the reference."""
     rest = values[1:]
     known = rest[np.isfinite(rest)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")

@@ -37,19 +37,20 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 
 
-# Steps of an edge relative to the reference within which it is the same edge.
+# Range of an edge's step over that in the reference within which it counts as the same edge.
 _SAME_STEP = (0.5, 1.6)
-# Relative difference between measured and given length that is noted: a choice, well above the
-# uncertainty of a calibrated scale and of both ends.
+# Relative difference between measured and given length above which there is a note: a choice, well
+# above the uncertainty of a calibrated scale and of both ends.
 _WRONG_LENGTH = 0.03
-# Largest deflection that is looked for where the user gives none, of the length: the search passes
-# over whatever lies beside the beam, so that a wider one finds other bodies.
+# Largest deflection in the search if the user gives none, as a fraction of the length. The search
+# covers the area beside the beam, and a wider one may find other bodies.
 _LARGEST = 0.04
-# A fit beyond this many times the largest deflection has found something else than the beam.
+# A fit beyond this many times the largest deflection has found something other than the beam.
 _ABSURD = 1.5
 # Points of the centre line in the results, for drawing.
 _LINE_POINTS = 65
-# Where the background was not tracked, the base alone tells what moved.
+# 1-sigma of the offset, m, where the background was not tracked: so large that the base alone
+# determines the offset.
 _UNTRACKED_M = 1e-7
 
 
@@ -60,14 +61,14 @@ class SeriesSettings:
     Attributes
     ----------
     length_m
-        Its length, from its maker.
+        Length of the cantilever, from its maker.
     shape
-        One of :data:`~semcal_ros.applications.cantilever.bending.SHAPES`; ``"free"`` is fitted, the same
-        for all frames.
+        One of :data:`~semcal_ros.applications.cantilever.bending.SHAPES`; ``"free"`` fits one shape
+        to all frames.
     base_px, tip_px
         (2,) raw pixels of both ends of the centre line in the first frame; None finds them.
     largest_m
-        Deflections beyond that are not looked for; None: a 25th of the length.
+        Largest deflection in the search; None: a 25th of the length.
     """
 
     length_m: float
@@ -85,13 +86,13 @@ class SeriesSettings:
 
     @property
     def reach_m(self) -> float:
-        """Largest deflection that is looked for."""
+        """Largest deflection in the search, m."""
         return _LARGEST * self.length_m if self.largest_m is None else self.largest_m
 
 
 @dataclass(frozen=True)
 class Deflection:
-    """One frame.
+    """The deflection in one frame.
 
     Attributes
     ----------
@@ -100,13 +101,13 @@ class Deflection:
         seen from the base (where rows grow downwards), and its 1-sigma: noise, drift, reference,
         and the scale of the calibration.
     noise_m
-        The 1-sigma without that of the scale, which all frames of the magnification share.
+        The 1-sigma without the error of the scale, which all frames of the magnification share.
     by_length_m, by_length_sigma_m
         The same in metres of the known length; NaN where base and end are not both in view.
     tip_px
         (2,) raw pixel of the end of the beam in this frame.
     line_px
-        (n, 2) raw pixels of the centre line in this frame, as far as it is in view.
+        (n, 2) raw pixels of the visible part of the centre line in this frame.
     bending
         The fit.
     """
@@ -130,7 +131,7 @@ class Series:
     magnification
         Magnification g.
     undeformed
-        The beam at undeformed.
+        The undeformed beam.
     frames
         One result for each frame.
     shape
@@ -138,7 +139,7 @@ class Series:
     drift
         Drift of the background.
     notes
-        What a person should know.
+        Remarks for the user.
     """
 
     magnification: float
@@ -164,14 +165,14 @@ def measure_series(
     Parameters
     ----------
     images
-        (h, w) raw grey pictures of one size, in the order of time; nothing touches the cantilever
+        (h, w) raw grey images of one size, in the order of time; nothing touches the cantilever
         in the first one.
     times_s
-        Starts of their acquisitions.
+        Start time of each acquisition.
     camera
         Calibrated camera of the magnification.
     timing
-        Raster timing; None takes frames as instants.
+        Raster timing; None treats each frame as an instant.
     settings
         The cantilever.
     reference
@@ -182,7 +183,7 @@ def measure_series(
     Raises
     ------
     InvalidValueError
-        If pictures differ in size, or no cantilever is found.
+        If the images differ in size, or no cantilever is found.
     """
     _check(images, times_s, reference)
     height, width = images[0].shape
@@ -215,7 +216,7 @@ def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequ
 
 
 def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
-    """The strip in the sem frame, with arc lengths as far as they are known yet."""
+    """Convert the strip to the sem frame, with provisional arc lengths."""
     ends = plane.sem_of(np.stack([strip.base_px, strip.tip_px]))
     seen_m = float(np.hypot(*(ends[1] - ends[0])))
     direction = (ends[1] - ends[0]) / seen_m
@@ -246,7 +247,7 @@ def _collect_notes(
 
 
 class _SeriesMeasurement:
-    """The pictures of a series, and what is done to each."""
+    """The images of a series and the measurement of each."""
 
     def __init__(
         self,
@@ -262,7 +263,7 @@ class _SeriesMeasurement:
         self._seen: dict[int, tuple[Array, Array]] = {}
 
     def _near_beam(self, axis: Axis) -> Indices:
-        """Flat indices of the pixels that may show the beam in any frame."""
+        """Return flat indices of the pixels that may show the beam in any frame."""
         along, across = axis.coordinates(self._plane.x_m, self._plane.y_m)
         moved = float(np.max(np.hypot(*self._path.drift_m.T), initial=0.0))
         room = 5.0 * REACH_PX * self._plane.pixel_m + moved
@@ -272,7 +273,7 @@ class _SeriesMeasurement:
         return np.flatnonzero(near)
 
     def sample(self, axis: Axis, frame: int) -> PixelSamples:
-        """Pixels in coordinates of the axis, freed of drift, and their grey levels."""
+        """Return pixels in coordinates of the axis, corrected for drift, and their grey levels."""
         x, y = self._plane.specimen(self._pixels, self._path[frame].raster)
         grey = self._images[frame].ravel()[self._pixels].astype(np.float64)
         return (*axis.coordinates(x, y), grey)
@@ -280,7 +281,7 @@ class _SeriesMeasurement:
     def deflections(
         self, undeformed: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
     ) -> tuple[list[Deflection], Shape]:
-        """All frames in the order of time, each begun where the one before was; their shape."""
+        """Measure all frames in the order of time, each starting from the last; fit their shape."""
         edges, free = [], []
         terms = np.zeros(2)
         for frame in range(len(self._images)):
@@ -300,7 +301,7 @@ class _SeriesMeasurement:
         return [self._result(k, one, undeformed) for k, one in enumerate(bent)], shape
 
     def _nearby(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> Array:
-        """A bending to start from: that with the largest contrast between beam and surroundings."""
+        """Find a bending to start from: the one with most contrast along the beam's edges."""
         model, reach = undeformed.model, self._settings.reach_m
         along, across, grey = samples
         line = evaluate_bending(np.array([1.5, -0.5]), along / self._settings.length_m)
@@ -324,7 +325,7 @@ class _SeriesMeasurement:
         return terms if abs(found - now) < step else found * np.array([1.5, -0.5])
 
     def _edges(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> EdgeFit:
-        """Edges of a frame, looked for again where the first look has found the beam."""
+        """Fit the edges of a frame, then twice again around the bending that was found."""
         length, model = self._settings.length_m, undeformed.model
         u = model.centres_m / length
         fit = fit_edges(*samples, model, undeformed.across_m + evaluate_bending(terms, u)[:, None])
@@ -347,14 +348,14 @@ class _SeriesMeasurement:
         reference: tuple[int, ...],
         shape: Shape | None,
     ) -> Bending:
-        """Bending against the reference."""
+        """Fit the bending of a frame against the reference."""
         length, normal, path = self._settings.length_m, undeformed.axis.normal, self._path
         covariance = path.covariance[:, :2, :2]
         before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
         offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
         if not path.trusted[frame]:
             offset = max(offset, _UNTRACKED_M)
-        # The reference against itself has its own noise only.
+        # A single reference frame, compared with itself, has only its own noise.
         alone = frame in reference and len(reference) == 1
         noise = fit.sigma_m if alone else np.hypot(fit.sigma_m, undeformed.sigma_m)
         ratio = fit.step / np.maximum(undeformed.step, 1e-12)
@@ -365,7 +366,7 @@ class _SeriesMeasurement:
         u = undeformed.model.centres_m / length
         found = fit_bending(u, moved, noise, length, offset, shape)
         if abs(found.deflection_m) > _ABSURD * self._settings.reach_m:
-            # Not the beam: as if nothing had been seen.
+            # This is not the beam: treat the frame as if nothing had been seen.
             return fit_bending(u, moved, np.full_like(noise, np.inf), length, offset, shape)
         return found
 

@@ -1,4 +1,4 @@
-"""The beam at rest: its axis, its edges, and where its base and its free end are."""
+"""The beam at rest: its axis, its edges, and the positions of its base and its free end."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ __all__ = ["REACH_PX", "PixelSamples", "UndeformedBeam", "measure_undeformed_bea
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 
-#: How far from an edge pixels count.
+#: Distance from an edge up to which pixels are used, px.
 REACH_PX = 6.0
 # Width (1-sigma) of an edge to begin with, until it is fitted.
 _EDGE_PX = 1.1
 # Length of a block along the beam: as long as the pixels that count reach across an edge.
 _BLOCK_PX = 12.0
-# Blocks with both edges: a fit with four unknowns needs some more.
+# Least number of blocks with both edges: a fit with four unknowns needs some more.
 _LEAST_BLOCKS = 6
-# Edges of a narrow beam must not see each other.
+# Largest reach, in half widths: the fit of one edge of a narrow beam must not include the other.
 _REACH_OF_HALF_WIDTH = 1.5
-# The ends are searched for around where the strip seemed to end.
+# The ends are searched for up to this distance from the ends of the strip.
 _END_SEARCH_PX = 14.0
 # The holder's edge is fitted between these distances from the beam: beyond the blur of the beam's
 # own edge, and no further than the holder may be taken for straight.
@@ -49,16 +49,16 @@ class UndeformedBeam:
     Attributes
     ----------
     axis
-        Its axis, with arc lengths counted from the base.
+        Axis of the beam, with arc lengths measured from the base.
     model
-        Blocks along it and the edges' width.
+        Blocks along the axis and the width of the edges.
     across_m, sigma_m, step
-        (blocks, 2) edges: place across the axis, 1-sigma, and grey levels by which the beam is
+        (blocks, 2) edges: position across the axis, 1-sigma, and grey levels by which the beam is
         brighter.
     length_m, length_sigma_m
-        Length in calibrated metres; NaN where base and end are not both in view.
+        Length in calibrated metres and its 1-sigma; NaN if base and end are not both in view.
     notes
-        What a person should know.
+        Remarks for the user.
     """
 
     axis: Axis
@@ -79,9 +79,9 @@ def measure_undeformed_beam(
     Parameters
     ----------
     rough
-        Its axis, good to a few px.
+        Axis of the beam, good to a few px.
     views
-        Pixels of the reference frames in the coordinates of that axis.
+        Pixels of the reference frames in the coordinates of the rough axis.
     length_m
         Length of the beam.
     px_m
@@ -90,7 +90,7 @@ def measure_undeformed_beam(
     Raises
     ------
     InvalidValueError
-        If no end of it is in view, or too little of its edges.
+        If neither end of the beam is in view, or too little of its edges.
     """
     axis, width_m = _align_axis(rough, views, px_m)
     moved = [_change_axis(view, rough, axis) for view in views]
@@ -109,7 +109,7 @@ def measure_undeformed_beam(
 
 
 def average_edges(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
-    """Mean edges of several frames, their 1-sigma, and their steps, (blocks, 2) each."""
+    """Average the edges of several frames: positions, 1-sigma and steps, (blocks, 2) each."""
     weight = np.stack([1.0 / fit.sigma_m**2 for fit in fits])
     total = weight.sum(axis=0)
     known = total > 0.0
@@ -121,13 +121,13 @@ def average_edges(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
 
 
 def _predict_straight_edges(model: EdgeModel) -> Array:
-    """(blocks, 2) edges of a straight beam."""
+    """Return the (blocks, 2) edges of a straight beam."""
     return np.asarray(np.ones((model.blocks, 1)) * np.array([-1.0, 1.0]) * model.half_width_m)
 
 
 def _place_blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
     first, last = axis.visible_m
-    # The ends of the beam are edges of their own.
+    # Blocks keep clear of the ends of the beam, which are edges themselves.
     inset = REACH_PX * px_m
     count = max(int((last - first - 2.0 * inset) / (_BLOCK_PX * px_m)), 1)
     size = (last - first - 2.0 * inset) / count
@@ -136,13 +136,13 @@ def _place_blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
 
 
 def _change_axis(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
-    """A view in the coordinates of another axis."""
+    """Convert a view to the coordinates of another axis."""
     points = before.point(view[0], view[1])
     return (*now.coordinates(points[:, 0], points[:, 1]), view[2])
 
 
 def _align_axis(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
-    """The axis along the middle of both edges, and the width of these."""
+    """Fit the axis midway between both edges, and the width of the edges."""
     axis, width_m = rough, _EDGE_PX * px_m
     for turn in range(4):
         model = _place_blocks(axis, width_m, px_m)
@@ -162,7 +162,7 @@ def _refine_axis(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> A
     if int(good.sum()) < 3:
         return axis
     middle, half = across.mean(axis=1)[good], 0.5 * (across[:, 1] - across[:, 0])[good]
-    # What lies on an edge here and there must not turn the axis.
+    # A body that lies on an edge must not turn the axis.
     deviation = half - np.median(half)
     usual = np.abs(deviation) < 4.0 * max(mad_sigma(deviation), 1e-12)
     along = model.centres_m[good][usual]
@@ -184,7 +184,7 @@ def _refine_axis(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> A
 def _locate_ends(
     axis: Axis, views: list[PixelSamples], width_m: float, length_m: float, px_m: float
 ) -> tuple[Axis, float, float, list[str]]:
-    """The axis with arc lengths from the base; the length in view and its 1-sigma; notes."""
+    """Locate both ends: axis with arc lengths from the base, length and its 1-sigma, notes."""
     notes: list[str] = []
     model = _place_blocks(axis, width_m, px_m)
     first, last = axis.visible_m
@@ -236,7 +236,7 @@ def _average_steps(steps: list[StepFit]) -> StepFit:
 
 
 def _fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
-    """Edge of the holder on both sides of the beam; distances grow into the holder."""
+    """Fit the edge of the holder on both sides of the beam; distances grow into the holder."""
     along, across, grey = view
     away = np.abs(across) - model.half_width_m
     beside = (away > _BESIDE_PX * px_m) & (away < _BESIDE_REACH_PX * px_m)
@@ -244,7 +244,7 @@ def _fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: floa
 
 
 def _fit_end_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
-    """Edge of the free end; distances grow into the beam."""
+    """Fit the edge of the free end; distances grow into the beam."""
     along, across, grey = view
     middle = np.abs(across) < max(model.half_width_m - _BESIDE_PX * px_m, 0.5 * model.half_width_m)
     return fit_step(at_m - along[middle], grey[middle], model, rough_m=_END_SEARCH_PX * px_m)

@@ -1,7 +1,8 @@
 """Shape of a specimen from many calibrated views of it: tracks, factorization, adjustment, surface.
 
-After section 4.4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, with the calibrated camera of every
-view at its own magnification. Nothing in here knows that the specimen is a ball, except :mod:`.sphere`.
+After section 4.4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, with the calibrated
+camera of every view at its own magnification. Only :mod:`.sphere` and :mod:`.ball` assume that the
+specimen is a ball.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Bundle adjustment of points and poses with the calibrated camera of every view.
 
-Unknown are the points and, for each view, a rotation and a translation; the cameras are given. Residuals are
-undistorted pixels, whitened by what each observation is worth, under a robust loss. Points are eliminated by the
-Schur complement; derivatives are analytic. Heights hardly show in parallel projection, so those of the views have
-a prior about that of the reference view, and the points have a very weak one about their middle, which keeps them
-from moving along the beam.
+Unknowns are the points and, for each view, a rotation and a translation; the cameras are given.
+Residuals are in undistorted pixels, whitened by the covariance of each observation, under a robust
+loss. Points are eliminated by the Schur complement; derivatives are analytic. Heights hardly show
+in parallel projection, so those of the views have a prior around that of the reference view, and
+the points have a very weak prior around their middle, which keeps them from moving along the beam.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ __all__ = ["Adjustment", "adjust"]
 
 
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
-_LEAST_SCALE = 1e-6  # of observations without errors
-_POINT_SPREAD = 3.0  # 1-sigma of the points' heights about their middle, in their spread
-# Relative to the diagonal: the usual start of Levenberg and Marquardt.
+_LEAST_SCALE = 1e-6  # least scale of the residuals, for observations without errors
+_POINT_SPREAD = 3.0  # prior 1-sigma of the points' heights, in units of their spread
+# Relative to the diagonal: the usual start of the Levenberg-Marquardt method.
 _FIRST_DAMPING = 1e-3
-# Steps are then 1e-10 of a plain one: no lower cost can be found within rounding.
+# Beyond this damping a step is lost in rounding: no lower cost can be found.
 _LAST_DAMPING = 1e10
 
 
@@ -42,15 +42,15 @@ class Adjustment:
     points_m
         (points, 3) m.
     residuals
-        (n, 2) undistorted px, observed less predicted.
+        (n, 2) undistorted px, observed minus predicted.
     weights
-        (n,) of the robust loss, 1 for a good observation.
+        (n,) weights of the robust loss, 1 for a good observation.
     sigma
-        Factor by which the observations are worse than their root of information says.
+        Factor by which the observations are worse than their information says.
     cost
         Sum of the robust loss, in units of the observations' own information.
     point_covariance_m2
-        (points, 3, 3), about the middle of all points, with the axes of the reference view.
+        (points, 3, 3) relative to the middle of all points, in the axes of the reference view.
     pose_covariance
         (views, 6, 6) of rotation vector (rad, in the sem frame) and translation (m); zero for the
         reference view.
@@ -77,7 +77,7 @@ class Adjustment:
     _inverse_poses: Array
 
     def propagate_variance(self, gradient: Array) -> float:
-        """Variance of a function of the points with the (points, 3) gradient, poses' errors included."""
+        """Variance of a function of the points with the (points, 3) gradient, poses included."""
         direct = np.einsum("pi,pij,pj->", gradient, self._inverse_points, gradient, optimize=True)
         moved = np.einsum("pij,pj->pi", self._inverse_points, gradient).ravel()
         through = self._coupling @ moved
@@ -98,7 +98,7 @@ class _State:
 
 
 class _Problem:
-    """Residuals, derivatives and normal equations, in units of length in which the specimen is about 1."""
+    """Residuals, derivatives and normal equations; lengths in units of the specimen's size."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class _Problem:
         self.beam = np.array([0.0, 0.0, 1.0])
 
     def residuals(self, state: _State) -> tuple[Array, Array, Array]:
-        """Errors in px (n, 2), turned points and points in the sem frame (n, 3)."""
+        """Compute errors in px (n, 2), rotated points and points in the sem frame (n, 3)."""
         seen = self.observed
         turned = np.einsum("nij,nj->ni", state.rotations[seen.view], state.points[seen.point])
         moved = turned + state.translations[seen.view]
@@ -146,8 +146,8 @@ class _Problem:
         return _compute_loss(white) + 0.5 * float(priors)
 
     def normal(self, state: _State, sigma: float) -> tuple[Array, Array, Array, Array, Array]:
-        """Blocks of the normal equations: poses (v, 6, 6), points (p, 3, 3), coupling (6v, 3p) and
-        the two right sides.
+        """Form the blocks of the normal equations: poses (v, 6, 6), points (p, 3, 3), coupling
+        (6v, 3p) and the two right-hand sides.
         """
         seen = self.observed
         error, turned, moved = self.residuals(state)
@@ -203,13 +203,13 @@ def adjust(
     cameras
         Camera of every view.
     rotations, translations_m, points_m
-        Start, (views, 3, 3), (views, 3), (points, 3).
+        Initial values, (views, 3, 3), (views, 3), (points, 3).
     reference
-        View whose pose is held.
+        View whose pose is held fixed.
     height_sigma_m
-        1-sigma of the heights of the views about that of the reference view, m.
+        1-sigma of the heights of the views relative to the reference view, m.
     max_iterations, tolerance
-        Ends when the cost falls by less than this fraction.
+        The iteration ends at this number, or when the cost falls by less than this fraction.
     """
     unit_m = float(np.sqrt(np.mean(np.var(points_m, axis=0)))) or 1.0
     problem = _Problem(observations, cameras, unit_m, height_sigma_m, reference)
@@ -224,7 +224,7 @@ def adjust(
     free = np.setdiff1d(np.arange(6 * len(cameras)), held)
     iterations, converged, sigma = 0, False, _estimate_scale(problem, state)
     for _ in range(3):
-        # The scale of the residuals belongs to the robust loss: settle both in turns.
+        # The robust loss depends on the scale of the residuals: estimate both in turn.
         state, taken, converged = _descend(problem, state, sigma, free, max_iterations, tolerance)
         iterations += taken
         better = _estimate_scale(problem, state)
@@ -290,7 +290,7 @@ def _invert(blocks: Array) -> Array:
 def _form_schur_complement(
     pose: Array, inverse: Array, coupling: Array, free: Indices
 ) -> tuple[Array, Array]:
-    """Schur complement on the free pose parameters, and coupling @ inverse of the points."""
+    """Form the Schur complement on the free pose parameters, and coupling @ inverse points."""
     part = coupling[free]
     by_point = np.swapaxes(part.reshape(len(free), -1, 3), 0, 1) @ inverse
     moved = np.swapaxes(by_point, 0, 1).reshape(part.shape)
@@ -301,7 +301,7 @@ def _form_schur_complement(
 
 
 def _estimate_scale(problem: _Problem, state: _State) -> float:
-    """Robust scale of the whitened residuals, corrected for the parameters that they determine."""
+    """Estimate the robust scale of the whitened residuals, corrected for degrees of freedom."""
     white = problem.whiten(problem.residuals(state)[0])
     size = 2.0 * len(white)
     spent = 3.0 * len(state.points) + 6.0 * problem.views
@@ -321,7 +321,7 @@ def _multiply_outer(a: Array, b: Array) -> Array:
 
 
 def _sum_by_index(values: Array, index: Indices, count: int) -> Array:
-    """Sums of values (n, ...) over equal indices."""
+    """Sum values (n, ...) over equal indices."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(index, weights=column, minlength=count) for column in flat.T]
     summed = np.stack(columns, axis=1).reshape(count, *values.shape[1:])
@@ -341,7 +341,7 @@ def _finish(
     inverse = _invert(_damp(point, 1e-12))
     reduced, moved = _form_schur_complement(pose, inverse, coupling, free)
     poses = invert_scaled(reduced, rcond=1e-14)
-    # About the middle of the points: where the whole lies along the beam is not determined.
+    # Relative to the middle of the points: their common position along the beam is not determined.
     through = moved.reshape(len(free), -1, 3)
     through = through - through.mean(axis=1, keepdims=True)
     spread = (poses @ through.reshape(len(free), -1)).reshape(through.shape)

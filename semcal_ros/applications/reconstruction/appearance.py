@@ -1,9 +1,9 @@
-"""Pictures in which the specimen's texture counts and its shading does not.
+"""Images that keep the texture of the specimen and remove its shading.
 
-The yield of secondary electrons grows with the slope of the surface, so shading stays where the slope is while
-the texture turns with the specimen: followed features would be pulled against the movement, most near the limb.
-Texture multiplies shading; after a square root (which also makes shot noise uniform) and with the local mean and
-contrast divided out, what remains is texture.
+The yield of secondary electrons grows with the slope of the surface, so shading stays with the
+slope while the texture turns with the specimen: tracked features would be pulled against the
+movement, most of all near the limb. Texture multiplies shading; after a square root (which also makes shot
+noise uniform) and with the local mean and contrast divided out, only texture remains.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from semcal_ros.core.arrays import Image, mad_sigma
 
 __all__ = ["Appearance", "convert_for_tracking", "prepare_appearance"]
 
-# Of a difference of neighbours across the diagonal, sum of squares of its kernel.
+# Second difference along both axes. Its squares sum to 1, so that it keeps the sigma of the noise.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """A picture ready to be compared with others.
+    """An image prepared for comparison with others.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Appearance:
     smoothing_px: float
 
     def corner_response(self, block: int = 7) -> tuple[Image, float]:
-        """Smaller eigenvalue of the structure tensor, and what noise alone gives on average."""
+        """Compute the smaller eigenvalue of the structure tensor, and its mean for noise alone."""
         response = cv2.cornerMinEigenVal(self.smooth, block, ksize=3)
         # Sobel of size 3 is 8 derivatives; OpenCV divides by 4 and the block, and sums over the block.
         gradient = self.noise**2 / (8.0 * math.pi * self.smoothing_px**4)
@@ -56,32 +56,32 @@ class Appearance:
 def prepare_appearance(
     image: NDArray[Any], *, smoothing_px: float = 1.0, local_px: float = 6.0
 ) -> Appearance:
-    """Texture of a grey picture (h, w) of any depth."""
+    """Extract the texture of a grey image (h, w) of any depth."""
     grey = np.sqrt(np.maximum(image.astype(np.float32), 0.0))
     noise = _estimate_noise(grey)
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), smoothing_px), dtype=np.float32)
     high = smooth - _blur_widely(smooth, local_px)
     power = _blur_widely(high * high, local_px)
-    # Where there is noise only, it is not blown up to look like texture.
+    # Where there is only noise, it must not be amplified to look like texture.
     floor = noise**2 / (4.0 * math.pi * smoothing_px**2)
     texture = high / np.sqrt(power + np.float32(floor + 1e-12))
     return Appearance(smooth, np.asarray(texture, dtype=np.float32), noise, smoothing_px)
 
 
 def convert_for_tracking(appearance: Appearance) -> NDArray[np.uint8]:
-    """The texture as 8-bit picture, as OpenCV's tracker takes it."""
+    """Convert the texture to an 8-bit image for OpenCV's tracker."""
     levels = np.rint(128.0 + 40.0 * appearance.texture)
     return np.asarray(np.clip(levels, 0, 255), dtype=np.uint8)
 
 
 def _blur_widely(image: Image, sigma_px: float) -> Image:
-    """Two running means, which look like a Gaussian of that sigma and cost the same at any width."""
+    """Apply two running means, close to a Gaussian of this sigma; any width costs the same."""
     side = 2 * round(0.5 * math.sqrt(6.0 * sigma_px**2)) + 1
     once = cv2.blur(image, (side, side))
     return np.asarray(cv2.blur(once, (side, side)), dtype=np.float32)
 
 
 def _estimate_noise(grey: Image) -> float:
-    """Noise of a pixel from second differences, which smooth texture hardly reaches (Immerkaer 1996)."""
+    """Estimate pixel noise from second differences, free of most texture (Immerkaer 1996)."""
     rough = cv2.filter2D(grey, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
     return mad_sigma(rough)

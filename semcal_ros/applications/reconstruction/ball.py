@@ -1,9 +1,11 @@
-"""The diameter of a ball with an interval that can be relied on, and its mesh.
+"""Diameter of a ball with a reliable interval, and its mesh.
 
-Three errors add up. *Noise*: the fit to the adjusted points, with the poses' errors. Neighbouring patches share pixels,
-so the variance is multiplied by how many points share one; it is also measured by leaving out groups of views in turn
-(jackknife), and the larger figure counts. *Shape*: the points' departure from a sphere. *Scale*: nm per pixel of the
-calibration, and the height of the ball above or below the reference plane, which parallel projection does not show.
+Three errors add up. *Noise*: the fit to the adjusted points, with the errors of the poses.
+Neighbouring patches share pixels, so the variance is multiplied by the number of points that share
+one; it is also measured by leaving out groups of views in turn (jackknife), and the larger value
+counts. *Shape*: the departure of the points from a sphere. *Scale*: nm per pixel of the
+calibration, and the height of the ball above or below the reference plane, which parallel
+projection does not show.
 """
 
 from __future__ import annotations
@@ -35,17 +37,17 @@ class Ball:
     sphere
         The fit to the points.
     mesh
-        Triangles over its moving-least-squares surface, where it was seen.
+        Triangles over its moving-least-squares surface, where the ball was seen.
     diameter_m
-        m.
+        Diameter, m.
     noise_sigma_m, shape_sigma_m, scale_sigma_m
         Parts of the 1-sigma of the diameter, see the module, m.
     interval_m
         95 % interval of the diameter, m.
     groups
-        Groups of views of the jackknife.
+        Number of groups of views in the jackknife.
     coverage
-        Part of the sphere that the mesh covers.
+        Fraction of the sphere that the mesh covers.
     """
 
     sphere: SphereFit
@@ -81,9 +83,9 @@ def measure_ball(
     height_sigma_m
         1-sigma of the height of the ball about the reference plane of the calibration, m.
     groups
-        Number of groups of views of the jackknife.
+        Number of groups of views in the jackknife.
     confidence
-        Of the interval.
+        Confidence level of the interval.
 
     Raises
     ------
@@ -121,7 +123,7 @@ def measure_ball(
 
 
 def _count_sharing(structure: Structure) -> float:
-    """How many points share the noise of a patch: two windows at a distance correlate as Gaussians do."""
+    """Count the points that share the noise of a patch; windows correlate as Gaussians do."""
     wide = 2.0 * structure.patch_sigma_m
     tree = cKDTree(structure.points_m)
     pairs = tree.sparse_distance_matrix(tree, 3.0 * wide, output_type="ndarray")
@@ -129,7 +131,7 @@ def _count_sharing(structure: Structure) -> float:
 
 
 def _run_jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
-    """1-sigma of the diameter from leaving out every group of views once."""
+    """Estimate the 1-sigma of the diameter by leaving out each group of views once."""
     done, seen = structure.adjustment, structure.observations
     # Neighbouring views share little but their noise is independent: interleave.
     group = np.arange(len(structure.cameras)) % groups
@@ -158,7 +160,7 @@ def _run_jackknife(structure: Structure, sphere: SphereFit, groups: int) -> floa
 
 
 def _compute_scale_sigma(structure: Structure, height_sigma_m: float) -> float:
-    """Relative 1-sigma of lengths: pixel size and height."""
+    """Compute the relative 1-sigma of lengths, from pixel size and height."""
     camera = structure.cameras[structure.adjustment.reference]
     height = camera.rho * height_sigma_m
     if camera.covariance is None:
@@ -175,7 +177,7 @@ def _mesh_ball(structure: Structure, sphere: SphereFit) -> SurfaceMesh:
 
 
 def _compute_coverage(mesh: SurfaceMesh, sphere: SphereFit) -> float:
-    """Part of the full solid angle (van Oosterom and Strackee 1983)."""
+    """Compute the covered fraction of the full solid angle (van Oosterom and Strackee 1983)."""
     unit = mesh.vertices_m - sphere.centre_m
     unit = unit / np.linalg.norm(unit, axis=1)[:, None]
     a, b, c = (unit[mesh.faces[:, k]] for k in range(3))

@@ -1,8 +1,9 @@
 """Affine epipolar geometry of two views.
 
-Under parallel projection the fundamental matrix has five entries, ``a x' + b y' + c x + d y + e = 0``, and the maximum
-likelihood estimate is a plane fit in the joint image space (Hartley and Zisserman, Multiple View Geometry, 2nd ed.,
-algorithm 14.1). It needs four points and contains no translation: a drift between the views changes ``e`` only.
+Under parallel projection the fundamental matrix has five entries,
+``a x' + b y' + c x + d y + e = 0``, and the maximum likelihood estimate is a plane fit in the joint
+image space (Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 14.1). It needs four
+points and contains no translation: a drift between the views changes only ``e``.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class AffineEpipolar:
         return np.array([[0.0, 0.0, a], [0.0, 0.0, b], [c, d, self.offset]])
 
     def distances(self, first: Array, second: Array) -> Array:
-        """(n,) signed distances of point pairs (n, 2) from the plane."""
+        """Compute the (n,) signed distances of point pairs (n, 2) from the plane."""
         joint = np.hstack([second, first])
         return np.asarray(joint @ self.normal + self.offset, dtype=np.float64)
 
@@ -58,7 +59,7 @@ class AffineEpipolar:
 def fit_epipolar(
     first: Array, second: Array, tolerance: float, *, trials: int = 200, seed: int = 0
 ) -> AffineEpipolar:
-    """Fit the epipolar geometry to pairs of which some are wrong, by RANSAC and a refit.
+    """Fit the epipolar geometry by RANSAC and a refit; some of the pairs may be wrong.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Affine structure of tracks with gaps: a rank-3 factorization that grows view by view.
 
-Tomasi and Kanade (1992), doi:10.1007/BF00129684: the centred tracks of points that are seen in all views are the
-product of (2 views, 3) camera rows and (3, points) coordinates. Here the densest well-conditioned block is
-factorized by the SVD, further views and points are added by linear least squares, and all of it is refined by
-alternation on what was observed, robustly. Translations are unknowns of each view, so drift between views costs
-nothing.
+Tomasi and Kanade (1992), doi:10.1007/BF00129684: the centred tracks of points seen in all views are
+the product of (2 views, 3) camera rows and (3, points) coordinates. Here the block with the most
+significant relief is factorized by the SVD, further views and points are added by linear least
+squares, and the whole is refined by robust alternation over the observations. Translations are
+unknowns of each view, so drift between views does no harm.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class AffineStructure:
     points
         (points, 3) coordinates in an affine frame.
     views_placed, points_placed
-        (views,), (points,) what could be placed; the rest is zero.
+        (views,), (points,) which of them could be placed; the others are zero.
     rms_m
         Robust RMS of the residuals per coordinate, m.
     relief
@@ -67,7 +67,7 @@ class AffineStructure:
 
 
 def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
-    """Affine structure of tracks.
+    """Compute the affine structure of tracks.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def factorize(tracks: Tracks, *, sweeps: int = 30) -> AffineStructure:
 
 
 def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
-    """Views and points of the block with the most relief, and that relief over its noise."""
+    """Choose views and points of the block with the most relief; also relief over noise."""
     best: tuple[float, Indices, Indices, float] | None = None
     n_views = len(tracks.seen)
     for length in (w for w in _WINDOWS if w <= max(n_views, _LEAST_VIEWS)):
@@ -114,7 +114,7 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
 
 
 def _centre_rows(block: Array) -> Array:
-    """(2 views, points) tracks about the mean of each row."""
+    """Return the (2 views, points) tracks with the mean of each row subtracted."""
     table = np.moveaxis(block, 2, 1).reshape(-1, block.shape[1])
     return np.asarray(table - table.mean(axis=1, keepdims=True), dtype=np.float64)
 
@@ -150,17 +150,17 @@ class _GrowingStructure:
     def _scale(self) -> float:
         error, used = self._residuals()
         sigma = mad_sigma(error[used])
-        # A share of the points is fitted exactly, or nearly; keep the scale away from zero.
+        # Some of the points are fitted almost exactly; keep the scale away from zero.
         return max(sigma, 1e-12 * float(np.abs(self.cameras).max()))
 
     def _weights(self) -> Array:
-        """(views, points) Huber weights of what is used."""
+        """Compute (views, points) Huber weights; zero for unused observations."""
         error, used = self._residuals()
         size = np.linalg.norm(error, axis=2) / self.sigma
         return np.where(used, _HUBER / np.maximum(size, _HUBER), 0.0)
 
     def place_views(self, wanted: Mask, weights: Array | None = None) -> None:
-        """Least squares for cameras with enough placed points."""
+        """Fit cameras that see enough placed points by least squares."""
         able = (self.seen & self.points_in).sum(axis=1) >= _LEAST_IN_VIEW
         index = np.flatnonzero(wanted & able)
         if not len(index):
@@ -189,7 +189,7 @@ class _GrowingStructure:
         return np.where(self.seen[views][..., None], self.xy[views], 0.0)
 
     def place_points(self, wanted: Mask) -> None:
-        """Least squares for points that enough placed views see from different sides."""
+        """Fit points that enough placed views see from different sides by least squares."""
         index = np.flatnonzero(
             wanted & ((self.seen & self.views_in[:, None]).sum(axis=0) >= _LEAST_VIEWS)
         )
@@ -217,7 +217,7 @@ class _GrowingStructure:
             open_views = ~self.views_in
             if open_views.any():
                 counts = (self.seen & self.points_in).sum(axis=1) * open_views
-                # The best seen first: they bring points for the others.
+                # Views with the most placed points first: they add points for the others.
                 self.place_views(counts >= max(0.7 * counts.max(), _LEAST_IN_VIEW))
             self.sigma = self._scale()
             if before == (int(self.views_in.sum()), int(self.points_in.sum())):

@@ -1,8 +1,9 @@
-"""Following features through a recording, and keeping the frames that bring something new.
+"""Follow features through a recording, and keep the frames that add information as keyframes.
 
-Every frame is tracked against the last keyframe (Lucas and Kanade in a picture, checked backwards), so errors do
-not add up from frame to frame. A frame becomes a keyframe when the points have moved enough against each other (a
-common shift is drift and tells nothing about depth), when too many are lost, or when the magnification changes.
+Every frame is tracked against the last keyframe (pyramidal Lucas-Kanade, checked backwards), so
+errors do not add up from frame to frame. A frame becomes a keyframe when the points have moved
+enough against each other (a common shift is drift and says nothing about depth), when too many
+are lost, or when the magnification changes.
 """
 
 from __future__ import annotations
@@ -33,32 +34,32 @@ _FEW = 30
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How features are followed.
+    """Settings of the feature tracker.
 
     Attributes
     ----------
     spacing_px
         Least distance between features, px.
     max_features
-        Per frame.
+        Largest number of features per frame.
     window_px, levels
-        Of the pyramid tracker.
+        Window and number of levels of the pyramid tracker.
     backwards_px
-        Largest distance between a feature and where it comes back to.
+        Largest distance between a feature and its position after tracking forth and back.
     parallax_px
-        Median movement against the common shift after which a frame is kept.
+        Median movement relative to the common shift above which a frame is kept.
     lost_fraction
-        Loss of features after which a frame is kept.
+        Fraction of lost features above which a frame is kept.
     epipolar_px
         Largest distance from the epipolar geometry of two keyframes.
     noise_factor
-        How far a feature's contrast is above what noise gives.
+        Least corner response of a feature, over what noise alone gives.
     smoothing_px
-        Sigma of the smoothing before tracking: a fast scan leaves some ten electrons per pixel.
+        Sigma of the smoothing before tracking: a fast scan has only some ten electrons per pixel.
     border_px
-        Features are this far inside of the frame.
+        Least distance of features from the border of the frame.
     room_px
-        Only this far from the features of the last frame is looked at.
+        Only the area up to this distance from the features of the last frame is processed.
     """
 
     spacing_px: float = 5.0
@@ -90,9 +91,9 @@ class TrackKeyframe:
     camera
         Calibrated camera of its magnification and size.
     ids, xy
-        (n,) numbers of the tracks, (n, 2) where they are seen, raw px.
+        (n,) numbers of the tracks, (n, 2) their positions, raw px.
     velocity
-        (2, 3) movement of the image of the specimen in the sem frame, ``v = velocity @ (X, Y, 1)`` in m/s
+        (2, 3) velocity field of the specimen in the sem frame, ``v = velocity @ (X, Y, 1)`` in m/s
         with X, Y in m.
     """
 
@@ -106,7 +107,7 @@ class TrackKeyframe:
 
 
 def project_to_plane(camera: ScanCamera, raw: Array) -> Array:
-    """Sem-frame X, Y (n, 2) in m at height 0 of raw pixels (n, 2); NaN where there are none."""
+    """Project raw pixels (n, 2) to sem-frame X, Y (n, 2) in m at height 0; NaN if impossible."""
     return camera.sem_from_ideal(camera.undistort(raw))[:, :2]
 
 
@@ -132,12 +133,12 @@ class SequenceTracker:
     Parameters
     ----------
     settings
-        How features are followed.
+        Settings of the tracker.
 
     Attributes
     ----------
     keyframes
-        Those so far.
+        Keyframes so far.
     frames
         Number of frames taken.
     """
@@ -151,12 +152,12 @@ class SequenceTracker:
         self._last_time_s = -np.inf
 
     def add(self, image: NDArray[Any], camera: ScanCamera, time_s: float) -> bool:
-        """Track the next frame; True if it became a keyframe.
+        """Track the next frame; return True if it became a keyframe.
 
         Raises
         ------
         InvalidValueError
-            If the image is not grey, is of another size than the camera's, or its time is not after the last.
+            If the image is not grey, not of the camera's size, or not later than the last.
         """
         if image.shape != (camera.height, camera.width):
             raise InvalidValueError(
@@ -185,7 +186,7 @@ class SequenceTracker:
         if reference.after is None and index == reference.frame.index + 1:
             reference.after = motion
         reference.alive = found
-        # What is lost stays where the others would take it, in case that it comes back.
+        # A lost feature moves with the others, in case it comes back.
         common = np.median((now_m - start)[found], axis=0) if found.any() else np.zeros(2)
         reference.latest_m = np.where(found[:, None], now_m, start + common)
         if not self._is_new(reference, found, now_m, camera):
@@ -206,14 +207,14 @@ class SequenceTracker:
         return True
 
     def finish(self) -> list[TrackKeyframe]:
-        """All keyframes, each with the movement during its acquisition."""
+        """Return all keyframes, each with the movement during its acquisition."""
         self._finish_motions()
         return self.keyframes
 
     # -- tracking ---------------------------------------------------------------------------------
 
     def _prepare_frame(self, image: NDArray[Any], camera: ScanCamera) -> Appearance:
-        """The picture as it is compared; plain grey far from where features are expected, to save time."""
+        """Prepare the image for tracking; zero far from the expected features, to save time."""
         box = self._expect_box(camera)
         seen = prepare_appearance(image[box], smoothing_px=self.settings.smoothing_px)
         if seen.smooth.shape == image.shape:
@@ -223,7 +224,7 @@ class SequenceTracker:
         return Appearance(smooth, texture, seen.noise, seen.smoothing_px)
 
     def _expect_box(self, camera: ScanCamera) -> tuple[slice, slice]:
-        """Rows and columns of the features of the last frame, with room to move and to find new ones."""
+        """Return rows and columns around the last features, with room to move and for new ones."""
         reference = self._reference
         everything = (slice(0, camera.height), slice(0, camera.width))
         if reference is None or np.count_nonzero(reference.alive) < _FEW:
@@ -234,7 +235,7 @@ class SequenceTracker:
     def _track(
         self, reference: _Reference, picture: NDArray[np.uint8], camera: ScanCamera
     ) -> tuple[Array, Mask]:
-        """Raw positions (n, 2) of the reference's features in the new frame, and which were found."""
+        """Track the reference's features: raw positions (n, 2), and which were found."""
         if not len(reference.frame.xy):
             return np.empty((0, 2)), np.empty(0, dtype=bool)
         s = self.settings
@@ -246,7 +247,7 @@ class SequenceTracker:
         }
         at = reference.frame.xy.astype(np.float32)
         guess = np.nan_to_num(_project_from_plane(camera, reference.latest_m)).astype(np.float32)
-        # Pyramids of the part where all this happens only.
+        # Pyramids only of the part of the image that contains the features.
         box, corner = _make_box(np.concatenate([at, guess]), camera, s.room_px)
         first, second = (
             np.ascontiguousarray(reference.picture[box]),
@@ -276,7 +277,7 @@ class SequenceTracker:
     def _check_epipolar(
         self, reference: _Reference, found: Mask, now_m: Array, camera: ScanCamera
     ) -> Mask:
-        """Found features that agree with the epipolar geometry of the two keyframes."""
+        """Select the found features that agree with the epipolar geometry of the two keyframes."""
         index = np.flatnonzero(found)
         if len(index) < 12:
             return found
@@ -290,11 +291,11 @@ class SequenceTracker:
     # -- features ---------------------------------------------------------------------------------
 
     def _detect(self, seen: Appearance, taken: Array) -> tuple[Indices, Array]:
-        """Numbers and places (raw px) of new features away from those that are there."""
+        """Detect new features away from existing ones: their numbers and positions (raw px)."""
         s = self.settings
         response, from_noise = seen.corner_response()
         mask = np.zeros(response.shape, dtype=np.uint8)
-        # Where the picture was not looked at it is zero; its edge is no feature.
+        # Parts of the image that were not processed are zero; their edge is not a feature.
         unseen = cv2.dilate((seen.smooth == 0.0).astype(np.uint8), np.ones((15, 15), np.uint8))
         response = np.where(unseen > 0, 0.0, response)
         mask[s.border_px : -s.border_px, s.border_px : -s.border_px] = 255
@@ -334,7 +335,7 @@ class SequenceTracker:
         )
 
     def _finish_motions(self) -> None:
-        """Give the last keyframe its velocity: the mean of those before and after it."""
+        """Set the velocity of the last keyframe: the mean of those before and after it."""
         reference = self._reference
         if reference is None:
             return
@@ -347,7 +348,7 @@ class SequenceTracker:
 def _make_box(
     raw: NDArray[Any], camera: ScanCamera, room: int
 ) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
-    """Rows and columns about raw pixels, and their first corner (x, y)."""
+    """Return rows and columns around raw pixels, and the first corner (x, y)."""
     size = np.array([camera.width, camera.height])
     low = np.clip(np.nanmin(raw, axis=0) - room, 0, size - 1).astype(int)
     high = np.clip(np.nanmax(raw, axis=0) + room, low + 1, size).astype(int)
@@ -360,7 +361,7 @@ def _find_inside(raw: Array, camera: ScanCamera, border: int) -> Mask:
 
 
 def _fit_affine_motion(before_m: Array, after_m: Array, seconds: float) -> Array | None:
-    """(2, 3) affine velocity field of points (n, 2), m/s; None for too few of them."""
+    """Fit a (2, 3) affine velocity field to points (n, 2), m/s; None if there are too few."""
     if len(before_m) < 6 or not np.isfinite(seconds):
         return None
     middle = 0.5 * (before_m + after_m)

@@ -1,8 +1,8 @@
 """A triangle mesh over the part of a round surface that was seen.
 
-Directions from a point inside are triangulated on the unit sphere: the convex hull of the directions is their Delaunay
-triangulation. Triangles that are much larger than their neighbours span what no view showed; they are left out, so the
-mesh is closed only where the data are.
+Directions from a point inside are triangulated on the unit sphere: the convex hull of the
+directions is their Delaunay triangulation. Triangles much larger than the typical spacing span areas that no
+view showed; they are left out, so the mesh has holes where there are no data.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SurfaceMesh:
     sigma_m
         (n,) 1-sigma of the vertices along the normal, m.
     boundary_edges
-        Number of edges with one triangle only: 0 for a watertight mesh.
+        Number of edges with only one triangle: 0 for a watertight mesh.
     """
 
     vertices_m: Array
@@ -120,7 +120,7 @@ def _count_open_edges(faces: Indices) -> int:
 
 
 def _keep_largest_part(faces: Indices, points: int) -> Indices:
-    """The triangles that hang together by edges, of the largest such part."""
+    """Keep the largest set of triangles connected by edges."""
 
     edges = _list_edges(faces)
     order = np.lexsort(edges.T[::-1])

@@ -1,12 +1,12 @@
-"""From affine to metric structure with calibrated parallel projections.
+"""Upgrade affine to metric structure with calibrated parallel projections.
 
-The tracks are in true scale (see :class:`.Tracks`), so the rows of every camera
-become orthonormal: ``M_i Q M_i^T = I`` for one symmetric Q = A A^T. That is linear in the six entries of Q and
-absolute: scale, aspect and skew are those of the calibration. Two things remain open in parallel projection,
+The tracks are in true scale (see :class:`.Tracks`), so the rows of every camera become orthonormal:
+``M_i Q M_i^T = I`` for one symmetric Q = A A^T. That is linear in the six entries of Q and
+absolute: scale, aspect and skew are those of the calibration. Two ambiguities remain in parallel projection,
 whatever the number of views:
 
-- the *bas-relief* direction is weak when the views differ by small rotations; :attr:`MetricUpgrade.condition`
-  tells;
+- the *bas-relief* direction is weak when the views differ by small rotations; see
+  :attr:`MetricUpgrade.condition`;
 - the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well: :func:`mirror_structure`.
 """
 
@@ -24,7 +24,7 @@ from semcal_ros.core.errors import StructureError
 __all__ = ["MetricUpgrade", "mirror_structure", "upgrade_to_metric"]
 
 
-# Turns depth around.
+# Reverses depth.
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 # Rows and columns of the six different entries of Q.
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -43,11 +43,11 @@ class MetricUpgrade:
     points_m
         (points, 3) m.
     condition
-        Singular value ratio of the six equations: below some 1e-3 the relief is hardly determined.
+        Singular value ratio of the six equations: below about 1e-3 the relief is hardly determined.
     orthonormality
         RMS departure of the upgraded camera rows from orthonormal ones, dimensionless.
     positive
-        Whether the linear solution was a possible one; if not, it was found by descent.
+        Whether the linear solution was positive definite; if not, it was made so and refined.
     """
 
     rotations: Array
@@ -59,7 +59,7 @@ class MetricUpgrade:
 
 
 def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
-    """Metric structure of an affine one.
+    """Upgrade an affine structure to a metric one.
 
     Raises
     ------
@@ -108,12 +108,12 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
 
 
 def mirror_structure(rotations: Array, points_m: Array) -> tuple[Array, Array]:
-    """The other structure with the same parallel projections: (views, 3, 3) and (points, 3)."""
+    """Return the other structure with the same projections: (views, 3, 3) and (points, 3)."""
     return _MIRROR @ rotations @ _MIRROR, points_m @ _MIRROR
 
 
 def _form_equations(cameras: Array, size: float) -> tuple[Array, Array]:
-    """Rows and right side of ``M Q M^T = size * I`` in the six entries of Q."""
+    """Form rows and right side of ``M Q M^T = size * I`` in the six entries of Q."""
     i, j = cameras[:, 0], cameras[:, 1]
 
     def row(a: Array, b: Array) -> Array:
@@ -132,7 +132,7 @@ def _make_positive(q: Array) -> Array:
 
 
 def _refine_root(cameras: Array, root: Array, size: float) -> Array:
-    """The root of Q that makes the rows orthonormal in the sense of least squares."""
+    """Refine the root of Q so that the rows are orthonormal in the least-squares sense."""
     lower = np.tril_indices(3)
 
     def error(values: Array) -> Array:
@@ -149,7 +149,7 @@ def _refine_root(cameras: Array, root: Array, size: float) -> Array:
 
 
 def _find_nearest_rotations(rows: Array) -> Array:
-    """Nearest rotations (n, 3, 3) of camera rows (n, 2, 3)."""
+    """Find the nearest rotations (n, 3, 3) to camera rows (n, 2, 3)."""
     u, _, vt = np.linalg.svd(rows, full_matrices=False)
     two = u @ vt
     return np.concatenate([two, np.cross(two[:, 0], two[:, 1])[:, None]], axis=1)
@@ -158,7 +158,7 @@ def _find_nearest_rotations(rows: Array) -> Array:
 def _turn_to_middle_view(
     rotations: Array, translations: Array, points: Array, placed: Mask
 ) -> tuple[Array, Array, Array]:
-    """The same structure with the axes of the middle placed view, so that its depth is the depth."""
+    """Express the structure in the axes of the middle placed view, so that z is its depth."""
     index = np.flatnonzero(placed)
     first = rotations[index[len(index) // 2]]
     return rotations @ first.T, translations, points @ first.T

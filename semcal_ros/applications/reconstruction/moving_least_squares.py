@@ -1,8 +1,8 @@
 """Moving least squares: a smooth surface through a cloud of points.
 
-Alexa et al. (2003), doi:10.1109/TVCG.2003.1175093: about each point, a plane is fitted to its neighbours with
-weights that fall off with distance, then a quadric over that plane; the point moves onto the quadric. Normals and
-curvature are those of the quadric.
+Alexa et al. (2003), doi:10.1109/TVCG.2003.1175093: around each point, a plane is fitted to its
+neighbours with weights that fall off with distance, then a quadric over that plane; the point moves
+onto the quadric. Normals and curvature are those of the quadric.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class LocalSurface:
     sigma_m: Array
 
     def orient(self, directions: Array) -> LocalSurface:
-        """The same with normals that point along the given directions (n, 3)."""
+        """Return the surface with its normals oriented along the given directions (n, 3)."""
         sign = np.where(np.sum(self.normals * directions, axis=1) < 0.0, -1.0, 1.0)
         return LocalSurface(
             self.points_m, self.normals * sign[:, None], self.curvature_1_m * sign, self.sigma_m
@@ -55,26 +55,26 @@ class LocalSurface:
 
 
 def compute_spacing_m(points_m: Array) -> float:
-    """Median distance of a point from its nearest neighbour, m."""
+    """Compute the median distance of a point from its nearest neighbour, m."""
     return float(np.median(cKDTree(points_m).query(points_m, k=2)[0][:, 1]))
 
 
 def fit_local_surface(
     cloud_m: Array, at_m: Array, radius_m: float, *, steps: int = 2
 ) -> LocalSurface:
-    """Surface of a cloud at points near it.
+    """Fit the surface of a cloud at points near it.
 
     Parameters
     ----------
     cloud_m
         (n, 3) points.
     at_m
-        (q, 3) where the surface is wanted.
+        (q, 3) points at which the surface is evaluated.
     radius_m
-        Distance at which a neighbour's weight has fallen to 1/e; it grows where there are fewer than
-        eight neighbours within.
+        Distance at which a neighbour's weight has fallen to 1/e; it grows where fewer than
+        eight neighbours are within it.
     steps
-        How many times a point is moved onto the surface about it.
+        How many times a point is moved onto the surface around it.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def _fit_quadrics(cloud: Array, tree: cKDTree, at: Array, radius: float) -> Loca
     design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
     normal = np.einsum("qk,qki,qkj->qij", weight, design, design)
     right = np.einsum("qk,qki,qk->qi", weight, design, height)
-    # Curvature is damped where the neighbours do not show it.
+    # Curvature is damped where the neighbours do not determine it.
     damping = total[:, None, None] * np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4])
     inverse = np.linalg.inv(normal + damping)
     found = np.einsum("qij,qj->qi", inverse, right)

@@ -1,9 +1,10 @@
-"""Measuring where known surface points are seen, in all views against one template.
+"""Measure the positions of known surface points in all views against one template.
 
-Tracks that were handed from keyframe to keyframe have wandered. With poses, points and normals known to a fraction of a
-pixel, the patch of surface about each point is cut out of every view that faces it, with its foreshortening and bend
-undone. The mean over the other views is the template; what remains to be shifted is measured by least squares. So
-every observation of a point refers to the same texture, and points are found again wherever they are in view.
+Tracks that were passed from keyframe to keyframe have wandered. With poses, points and normals
+known to a fraction of a pixel, the surface patch around each point is cut out of every view that
+faces it, with its foreshortening and bend undone. The mean over the other views is the template;
+the remaining shift is measured by least squares. So every observation of a point refers to the same
+texture, and points are found again wherever they are in view.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ __all__ = [
 def compute_displacement_m(
     frame: TrackKeyframe, scan: ScanTiming | None, raw: Array, xy_m: Array
 ) -> Array:
-    """How far (n, 2) in m the specimen has moved since the centre of the acquisition when raw pixels
-    (n, 2) are seen that show the places ``xy_m`` (n, 2) of the sem frame.
+    """Compute how far the specimen has moved, (n, 2) in m, since the centre of the acquisition when
+    raw pixels (n, 2) are scanned that show the sem-frame points ``xy_m`` (n, 2).
     """
     if scan is None:
         return np.zeros_like(xy_m)
@@ -45,7 +46,7 @@ def compute_displacement_m(
 
 
 def project_to_plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, raw: Array) -> Array:
-    """Sem-frame X, Y (n, 2) in m of raw pixels (n, 2), as they were at the centre of the acquisition."""
+    """Project raw pixels (n, 2) to sem-frame X, Y (n, 2) in m at the centre of the acquisition."""
     seen = project_to_plane(frame.camera, raw)
     return seen - compute_displacement_m(frame, scan, raw, seen)
 
@@ -58,23 +59,23 @@ _GAIN_LEAST = 0.3
 
 @dataclass(frozen=True)
 class PatchSettings:
-    """How patches are compared.
+    """Settings of the comparison of patches.
 
     Attributes
     ----------
     half_px
         Half the width of a patch, px.
     steepest_rad
-        Largest angle between the beam and the normal: beyond, the patch is foreshortened to nothing and
-        touches the bright limb, which does not move with the specimen.
+        Largest angle between the beam and the normal: beyond it, a patch is strongly foreshortened
+        and touches the bright limb, which does not move with the specimen.
     least_correlation
-        With the template.
+        Least correlation with the template.
     largest_shift_px
-        From where the structure expects the point.
+        Largest shift from where the structure predicts the point.
     rounds
-        Resamplings at the shifted place.
+        Number of resamplings at the shifted position.
     floor_px
-        Error that no observation is better than.
+        Least 1-sigma of an observation, added in quadrature.
     """
 
     half_px: int = 7
@@ -87,7 +88,7 @@ class PatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class PosedSurface:
-    """What is known about the structure when patches are cut out.
+    """The structure from which patches are cut out.
 
     Attributes
     ----------
@@ -122,7 +123,7 @@ def measure_patches(
     posed: PosedSurface,
     settings: PatchSettings,
 ) -> Observations:
-    """Observations of every point in every view that faces it and agrees with the template."""
+    """Measure every point in every view that faces it and agrees with the template."""
     size_m = float(np.mean([np.mean(f.camera.pixel_size_m) for f in frames]))
     grid = _make_patch_grid(settings.half_px)
     cuts = [
@@ -199,7 +200,7 @@ def _cut_patches(
 
 
 def _sample_patches(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
-    """(n, grid) patches of unit spread about zero."""
+    """Sample (n, grid) patches, normalised to zero mean and unit standard deviation."""
     if not len(cut.points):
         return np.zeros((0, len(grid)), dtype=np.float32)
     local = grid[None] + shift[:, None]
@@ -221,7 +222,7 @@ class _Matched:
 
 
 def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
-    """Shift of every patch (views, points) against the mean of the others, in patch px."""
+    """Measure the shift of every patch (views, points) against the mean of the others, patch px."""
     views, points, _size = patches.shape
     side = 2 * half + 1
     window = np.exp(-0.5 * np.sum(_make_patch_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
@@ -256,7 +257,7 @@ def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
 
 
 def _average_template(stack: Array) -> Array:
-    """Mean of patches (views, size), those that disagree with most others left out."""
+    """Average patches (views, size) without those that disagree with most others."""
     mean = stack.mean(axis=0)
     for _ in range(2):
         like = stack @ mean / (np.linalg.norm(stack, axis=1) * np.linalg.norm(mean) + 1e-12)

@@ -1,4 +1,4 @@
-"""From keyframes to points, poses and normals with their uncertainty."""
+"""Reconstruct points, poses and normals, with their uncertainty, from keyframes."""
 
 from __future__ import annotations
 
@@ -39,28 +39,28 @@ __all__ = ["Structure", "StructureSettings", "collect_tracks", "mirror_poses", "
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """How structure is computed.
+    """Settings of the reconstruction.
 
     Attributes
     ----------
     patches
         Comparison of patches.
     most_passes
-        How often patches are measured and adjusted at most.
+        Largest number of times that patches are measured and adjusted.
     settled_sigma
-        Enough when a pass moves the points by less than this many of their 1-sigma (RMS).
+        The passes end when one moves the points by less than this many of their 1-sigma (RMS).
     smoothing_px
         Sigma of the smoothing of patches.
     least_track
-        Keyframes in which a feature was followed, at least.
+        Least number of keyframes in which a feature was followed.
     least_views
-        Observations of a point in the end, at least.
+        Least number of observations of a point in the result.
     separation_px
-        Points that are closer than this are one.
+        Points closer than this are merged.
     height_sigma_m
-        1-sigma of the heights of the specimen in the views about each other, m.
+        1-sigma of the differences in height of the specimen between views, m.
     worst_sigma_px
-        Points that are less certain than this in any direction are left out.
+        Largest 1-sigma of a point in any direction; worse points are left out.
     """
 
     patches: PatchSettings = field(default_factory=PatchSettings)
@@ -85,30 +85,30 @@ class Structure:
     adjustment
         Poses, uncertainty, residuals.
     observations
-        What was adjusted.
+        Observations that were adjusted.
     frames
         (views,) numbers of the frames in the recording.
     cameras
         Camera of every view.
     tracked
-        Number of features that were followed long enough to begin with.
+        Number of features that were followed long enough.
     unplaced
         Keyframes that could not be linked to the others.
     relief_condition
-        Of the metric upgrade, see :class:`~semcal_ros.applications.reconstruction.metric_upgrade.MetricUpgrade`.
+        Condition of the metric upgrade, see :class:`.MetricUpgrade`.
     relief_sigma
-        1-sigma of a stretch of the depth of the reference view, relative: what is left of the bas-relief
+        Relative 1-sigma of a stretch of depth in the reference view: the remaining bas-relief
         ambiguity.
     convexity
         Fraction of the points about which the surface bulges towards the gun. It decides between the two
         mirror images: an opaque surface is seen from outside.
     mirror_sigma
         By how many sigma the perspective of the camera prefers this structure to its mirror image;
-        near 0 it cannot tell, and negative values speak against the choice.
+        near 0 it cannot decide, and negative values speak against the choice.
     patch_sigma_m
-        Sigma of the window in which a point was compared: nearer points share pixels and their noise, m.
+        Sigma of the window in which a patch is compared, m: closer points share pixels and noise.
     passes, settled
-        How often patches were measured, and whether the last time moved the points by less than was asked.
+        Number of passes, and whether the last one moved the points by less than ``settled_sigma``.
     """
 
     points_m: Array
@@ -144,16 +144,16 @@ def reconstruct(
     *,
     on_step: Callable[[str], object] = lambda _: None,
 ) -> Structure:
-    """Points and poses from the keyframes of a :class:`.SequenceTracker`.
+    """Reconstruct points and poses from the keyframes of a :class:`.SequenceTracker`.
 
     Parameters
     ----------
     keyframes
         At least three, of a specimen that turns.
     scan
-        Raster timing; without it, movement during a frame is not undone.
+        Raster timing; without it, movement during a frame is not corrected.
     settings
-        How it is done.
+        Settings of the reconstruction.
     on_step
         Called with the name of every step.
 
@@ -199,7 +199,7 @@ def reconstruct(
 def collect_tracks(
     keyframes: Sequence[TrackKeyframe], scan: ScanTiming | None, least: int = 3
 ) -> Tracks:
-    """Tracks through keyframes, in the plane of the specimen, those of at least ``least`` views."""
+    """Collect the tracks seen in at least ``least`` keyframes, in the plane of the specimen."""
     if len(keyframes) < 3:
         raise StructureError(
             f"{len(keyframes)} keyframes", expected="at least 3: the specimen hardly turns"
@@ -221,13 +221,13 @@ def collect_tracks(
 def mirror_poses(
     rotations: Array, translations_m: Array, points_m: Array
 ) -> tuple[Array, Array, Array]:
-    """The structure that parallel projection cannot tell from the given one."""
+    """Return the mirror structure, which parallel projection cannot tell from the given one."""
     turned, points = mirror_structure(rotations, points_m)
     return turned, translations_m * np.array([1.0, 1.0, -1.0]), points
 
 
 class _Refinement:
-    """The structure while it is refined; views and points that fail are dropped on the way."""
+    """The structure during refinement; views and points that fail are dropped on the way."""
 
     def __init__(
         self,
@@ -284,7 +284,7 @@ class _Refinement:
         )
 
     def _measure_change_in_sigma(self, before: Array) -> float:
-        """RMS way of the points from where they were, moved and turned to fit, over their RMS 1-sigma."""
+        """Return the RMS change of the points over their RMS 1-sigma, after a rigid alignment."""
         assert self.adjusted is not None
         centred = self.points - self.points.mean(axis=0), before - before.mean(axis=0)
         _, distance = Rotation.align_vectors(*centred)
@@ -345,7 +345,7 @@ class _Refinement:
         self.looks = [self.looks[int(v)] for v in kept] if self.looks else []
 
     def _merge(self) -> None:
-        """Of points that are closer than a patch can tell apart, keep the one seen most."""
+        """Among points too close for patches to tell apart, keep the one seen most."""
         counts = np.bincount(self.seen.point, minlength=len(self.points))
         near = cKDTree(self.points).query_ball_point(
             self.points, self.settings.separation_px * self.pixel_m
@@ -358,7 +358,7 @@ class _Refinement:
         self._keep(keep, np.ones(len(self.cameras), dtype=bool))
 
     def _surface(self, *, wide: bool = False) -> tuple[Array, Array]:
-        """Normals towards the gun and the mean curvature about them."""
+        """Compute the normals, oriented towards the gun, and the mean curvature."""
         spread = float(np.sqrt(np.mean(np.var(self.points, axis=0))))
         radius = 0.5 * spread if wide else max(3.0 * compute_spacing_m(self.points), 0.2 * spread)
         surface = fit_local_surface(self.points, self.points, radius, steps=1)
@@ -383,7 +383,7 @@ class _Refinement:
             height_sigma_m=self.settings.height_sigma_m,
             max_iterations=8,
         )
-        # Costs are half squared sigmas of each one's own scale; compare on one scale.
+        # Each cost is half a squared sigma on its own scale; compare both on one scale.
         preference = other.cost * other.sigma**2 / done.sigma**2 - done.cost
         _, bulge = self._surface(wide=True)
         return Structure(

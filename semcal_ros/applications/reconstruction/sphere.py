@@ -1,4 +1,4 @@
-"""A sphere through a cloud of points of which some belong to something else."""
+"""Fit a sphere to a cloud of points, some of which belong to other surfaces."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class SphereFit:
     rms_m
         RMS of the inliers' residuals, m.
     covariance_m2
-        (4, 4) of centre and radius if the residuals were independent, m^2.
+        (4, 4) of centre and radius, assuming independent residuals, m^2.
     radius_gradient
-        (n, 3) derivative of the radius by the points.
+        (n, 3) derivative of the radius with respect to the points.
     iterations, converged
         How the fit ended.
     """
@@ -53,14 +53,14 @@ class SphereFit:
 
     @property
     def radius_sigma_m(self) -> float:
-        """1-sigma of the radius if the residuals were independent, m."""
+        """1-sigma of the radius, assuming independent residuals, m."""
         return float(np.sqrt(self.covariance_m2[3, 3]))
 
 
 def fit_sphere(
     points_m: Array, sigma_m: Array | None = None, *, tolerance: float = 0.05, seed: int = 0
 ) -> SphereFit:
-    """Geometric least squares, robust against other surfaces in the cloud.
+    """Fit a sphere by geometric least squares, robust against other surfaces in the cloud.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def fit_sphere(
         Largest distance of an inlier, as a fraction of the median distance of the points from their
         middle.
     seed
-        Of the random search.
+        Seed of the random search.
 
     Raises
     ------
@@ -113,13 +113,13 @@ def fit_sphere(
 
 
 def _compute_weights(sigma: Array) -> Array:
-    """Relative weights, bounded: a few points shall not decide alone."""
+    """Compute relative weights, bounded so that a few points cannot decide alone."""
     bounded = np.clip(sigma, 0.5 * np.median(sigma), None)
     return np.asarray((np.median(bounded) / bounded) ** 2, dtype=np.float64)
 
 
 def _search_sphere(points: Array, tolerance: float, seed: int) -> tuple[Array, float, Mask]:
-    """Centre, radius and inliers of the sphere through four points that most others agree with."""
+    """Find the sphere through four points that most others agree with; also its inliers."""
     rng = np.random.default_rng(seed)
     samples = np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :4]
     four = points[samples]

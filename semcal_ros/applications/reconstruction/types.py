@@ -1,4 +1,4 @@
-"""What the steps of a reconstruction hand to each other."""
+"""Types that the steps of a reconstruction exchange."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Observations", "Tracks", "tabulate_cameras"]
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Where points are seen in views, in the plane of the specimen.
+    """Positions of points in the views, in the plane of the specimen.
 
     Parameters
     ----------
@@ -24,9 +24,9 @@ class Tracks:
         (views, points, 2) sem-frame X and Y at height 0 of the line of sight, m
         (:meth:`~semcal_ros.core.camera.scan_camera.ScanCamera.sem_from_ideal` of undistorted pixels). The calibrated
         intrinsics are divided out, so that every view is a parallel projection in true scale, up to
-        ``1 / (1 + rho Z)``. Anything where not seen.
+        ``1 / (1 + rho Z)``. Arbitrary where not seen.
     seen
-        (views, points) bool.
+        (views, points) whether each view sees each point.
     """
 
     xy_m: Array
@@ -44,7 +44,7 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """The same as a list, in undistorted pixels, with what they are worth.
+    """Observations of points in views as a list, in undistorted pixels, with their weights.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Observations:
     xy
         (n, 2) undistorted px.
     root
-        (n, 2, 2) root of the information: ``root @ error`` has unit covariance, 1/px.
+        (n, 2, 2) root of the information matrix: ``root @ error`` has unit covariance, 1/px.
     """
 
     view: Indices
@@ -65,14 +65,14 @@ class Observations:
         return len(self.view)
 
     def select(self, keep: Mask | Indices) -> Observations:
-        """Some of them."""
+        """Select some of the observations."""
         return Observations(self.view[keep], self.point[keep], self.xy[keep], self.root[keep])
 
     @staticmethod
     def from_tracks(
         tracks: Tracks, cameras: Sequence[ScanCamera], sigma_px: float = 1.0
     ) -> Observations:
-        """All that is seen in tracks, with one standard deviation."""
+        """Convert all that is seen in tracks, with one standard deviation."""
         view, point = np.nonzero(tracks.seen)
         table = tabulate_cameras(cameras)[view]
         x, y = tracks.xy_m[view, point].T
@@ -83,5 +83,5 @@ class Observations:
 
 
 def tabulate_cameras(cameras: Sequence[ScanCamera]) -> Array:
-    """(views, 6) m, aspect, skew, px, py, rho."""
+    """Tabulate (views, 6) m, aspect, skew, px, py, rho."""
     return np.array([camera.parameters[:6] for camera in cameras]).reshape(-1, 6)
