@@ -16,7 +16,7 @@ MAX_TEXT_BYTES = 16 * 1024 * 1024
 
 
 def calibration_text_from_message(message: Any) -> str:
-    """Text of a calibration, not yet parsed.
+    """Return the text of a calibration, not yet parsed.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def calibration_text_from_message(message: Any) -> str:
 
 
 def fill_calibration_text(message: Any, text: str) -> None:
-    """Set the text; raises :class:`InvalidValueError` where a receiver would refuse it."""
+    """Set the text; raises :class:`InvalidValueError` if a receiver would refuse it."""
     try:
         size = len(text.encode("utf-8"))
     except UnicodeEncodeError as error:

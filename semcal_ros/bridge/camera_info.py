@@ -32,9 +32,8 @@ def fill_camera_info(
         The message to fill.
     camera
         The camera of this image, in any size: it is resized to the image's. None means
-        uncalibrated; a parallel projection (``rho <= 0``, or
-        hardly above) has no finite K either. Both leave K, R
-        and P zero, which sensor_msgs defines as "uncalibrated"; the affine-safe matrix of
+        uncalibrated; a parallel projection (``rho <= 0`` or only slightly above) has no finite K
+        either. Both leave K, R and P zero, which sensor_msgs defines as "uncalibrated"; the affine-safe matrix of
         :mod:`semcal_ros.bridge.projection` still describes a parallel projection.
     header
         Header of the image, copied verbatim.

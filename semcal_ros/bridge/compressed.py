@@ -33,7 +33,7 @@ CODECS = {"png": ("mono8", "mono16", "bgr8", "rgb8"), "jpeg": ("mono8", "bgr8", 
 """Codecs and the encodings that each carries; PNG without loss."""
 
 _CODEC_NAMES = {"png": "png", "jpeg": "jpeg", "jpg": "jpeg"}
-# What drivers call grey values that they do not want to call grey.
+# Names that some drivers use for grey values.
 _SAME = {"8UC1": "mono8", "16UC1": "mono16"}
 _FORMATS = "png, jpeg, or such as 'mono16; png compressed ' with " + ", ".join(CODECS["png"])
 
@@ -72,8 +72,8 @@ def image_from_compressed(message: Any) -> tuple[NDArray[Any], str]:
     Raises
     ------
     MessageError
-        The data are empty, damaged, declare an absurd size, or are of another kind than accepted; or ``format`` is not
-        understood or says something else than the data.
+        The data are empty, damaged, declare an absurd size, or are of an unsupported kind; or ``format`` is not
+        understood or contradicts the data.
     """
     require_fields(message, ("format", "data"), "sensor_msgs/msg/CompressedImage")
     data = _read_bytes(message.data)
@@ -100,7 +100,7 @@ def _read_bytes(data: Any) -> NDArray[np.uint8]:
 
 
 def _agree_on_encoding(text: str, picture: PictureHeader) -> tuple[str, bool]:
-    """Encoding of the image, and whether the order of the decoded channels must be reversed for it."""
+    """Return the encoding of the image, and whether its decoded channels must be reversed."""
     original, codec, target = _parse_format(text)
     if codec and codec != picture.codec:
         raise _contradiction(text, picture)
@@ -118,7 +118,7 @@ def _agree_on_encoding(text: str, picture: PictureHeader) -> tuple[str, bool]:
 
 
 def _parse_format(text: str) -> tuple[str, str, str]:
-    """Original encoding, codec and target of a ``format``; empty where it does not say."""
+    """Split a ``format`` into original encoding, codec and target; missing parts are empty."""
     before, separator, after = text.partition(";")
     original = _SAME.get(before.strip(), before.strip()) if separator else ""
     words = (after if separator else before).split()
@@ -146,7 +146,7 @@ def _contradiction(text: str, picture: PictureHeader) -> MessageError:
 def _decode(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
     pixel = ENCODINGS[picture.encoding]
     channels = () if pixel.channels == 1 else (pixel.channels,)
-    # As it is: no conversion of depth or colour, and no turning by an orientation in the metadata.
+    # Unchanged: no conversion of depth or colour, and no rotation by an orientation in the metadata.
     image: Any = None
     try:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -239,7 +239,7 @@ def _check_carried(codec: str, encoding: str) -> None:
 
 
 def _to_opencv_layout(image: NDArray[Any], encoding: str) -> NDArray[Any]:
-    """The image as OpenCV writes it: contiguous, blue first."""
+    """Return the image as OpenCV writes it: contiguous, blue first."""
     pixel = ENCODINGS[encoding]
     shape_fits = image.ndim == 2 if pixel.channels == 1 else image.shape[2:] == (pixel.channels,)
     if not shape_fits or image.size == 0 or image.dtype.newbyteorder("=") != pixel.dtype:

@@ -44,7 +44,7 @@ class CameraSource(Protocol):
         """Lowest and highest calibrated magnification."""
 
     def at(self, magnification: float, /) -> ScanCamera:
-        """Camera at a magnification."""
+        """Return the camera at a magnification."""
 
 
 def is_continuous_parameter(name: str) -> bool:
@@ -58,7 +58,7 @@ def parse_parameter_name(name: str) -> ParameterRequest:
     Raises
     ------
     InvalidValueError
-        The kind is unknown or the magnification is no positive finite decimal number.
+        The kind is unknown or the magnification is not a positive finite decimal number.
     """
     kind, separator, number = name.partition("@")
     if not separator or kind not in PARAMETER_KINDS:
@@ -76,7 +76,7 @@ def parse_parameter_name(name: str) -> ParameterRequest:
 
 
 def continuous_value(kind: str, camera: ScanCamera) -> list[float]:
-    """Value of one kind at the magnification of ``camera``.
+    """Return the value of one kind at the magnification of ``camera``.
 
     Returns
     -------
@@ -125,12 +125,12 @@ def _sigma_px(camera: ScanCamera) -> Array:
 
 
 def read_parameter(name: str, calibration: CameraSource) -> list[float]:
-    """Value of a continuous parameter.
+    """Read a continuous parameter.
 
     Raises
     ------
     InvalidValueError
-        The name is malformed, the magnification is outside of the calibrated range, or the camera
+        The name is malformed, the magnification is outside the calibrated range, or the camera
         has no such value.
     """
     kind, magnification = parse_parameter_name(name)

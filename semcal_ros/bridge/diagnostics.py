@@ -25,7 +25,7 @@ class DiagnosticLevel(IntEnum):
 
 @dataclass(frozen=True)
 class DiagnosticSummary:
-    """What one diagnostic message says: a level, one line, and key/value pairs."""
+    """The content of one diagnostic message: a level, one line, and key/value pairs."""
 
     level: DiagnosticLevel
     message: str
@@ -33,9 +33,9 @@ class DiagnosticSummary:
 
 
 class StreamStatistics:
-    """What happened to the frames of one stream.
+    """Counters, rate and latency of one stream.
 
-    Times are arguments, in seconds of any one clock that does not go back.
+    Times are arguments, in seconds of any one monotonic clock.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class StreamStatistics:
     def publish(self, time_s: float, latency_s: float | None = None) -> None:
         """Count a result that left at ``time_s``.
 
-        ``latency_s`` is the time since the stamp of its frame, or None where it is not known.
+        ``latency_s`` is the time since the stamp of its frame, or None if unknown.
         """
         self._counts["published"] += 1
         self._recent.append((time_s, latency_s))
@@ -110,7 +110,7 @@ class StreamStatistics:
             self._recent.popleft()
 
     def rate_hz(self, now_s: float) -> float:
-        """Results per second over the window."""
+        """Return the results per second over the window."""
         self._forget(now_s)
         if len(self._recent) < 2:
             return 0.0
@@ -118,13 +118,13 @@ class StreamStatistics:
         return (len(self._recent) - 1) / span if span > 0.0 else 0.0
 
     def latency_s(self, now_s: float) -> tuple[float, float] | None:
-        """Mean and largest latency over the window, or None without any."""
+        """Return the mean and the largest latency over the window, or None without any."""
         self._forget(now_s)
         known = [latency for _, latency in self._recent if latency is not None]
         return (sum(known) / len(known), max(known)) if known else None
 
     def summary(self, now_s: float) -> DiagnosticSummary:
-        """State at ``now_s``.
+        """Summarise the state at ``now_s``.
 
         Stale without frames; a warning if frames were lost or refused since the last summary.
         """

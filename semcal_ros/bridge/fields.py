@@ -22,7 +22,7 @@ __all__ = [
 
 
 def require_fields(message: Any, names: tuple[str, ...], type_name: str) -> None:
-    """Raise :class:`MessageError` where ``message`` is of another type than ``type_name``."""
+    """Raise :class:`MessageError` if ``message`` is not of type ``type_name``."""
     missing = [name for name in names if not hasattr(message, name)]
     if missing:
         raise MessageError(
@@ -33,9 +33,9 @@ def require_fields(message: Any, names: tuple[str, ...], type_name: str) -> None
 
 
 def whole_number(value: Any, what: str) -> int:
-    """``value`` as an int, or :class:`MessageError` where it is something else.
+    """Return ``value`` as an int; raise :class:`MessageError` if it is not a whole number.
 
-    A recording may bring a definition of its own for a known type, so that a field has any type.
+    A recording may redefine a known type, so that a field can have any type.
     """
     if not isinstance(value, (int, np.integer)):
         raise MessageError(
@@ -47,7 +47,7 @@ def whole_number(value: Any, what: str) -> int:
 
 
 def byte_memory(message: Any, name: str, size: int) -> NDArray[np.uint8]:
-    """(size,) writeable memory of a ``uint8[]`` field, with anything in it.
+    """Return (size,) writeable, uninitialised memory for a ``uint8[]`` field.
 
     rclpy takes an ``array.array('B')`` without looking at its elements; every other type is checked
     element by element, which costs milliseconds per image. An array that the message already has is
@@ -82,7 +82,7 @@ def assign_floats(message: Any, name: str, values: ArrayLike) -> None:
 
 
 def new_nested(owner: Any, type_name: str, **fields: Any) -> Any:
-    """A message of ``type_name`` from the same family of classes (and the same package) as
+    """Create a message of ``type_name`` from the same family of classes (and the same package) as
     ``owner``.
 
     Parameters

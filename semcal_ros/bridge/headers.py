@@ -33,18 +33,18 @@ class HeaderMessage(Protocol):
 
     @property
     def stamp(self) -> StampMessage:
-        """When."""
+        """Time of the data."""
 
     frame_id: str
 
 
 def stamp_ns_from_msg(message: Any) -> int:
-    """Stamp in ns of a message with a header, of a header, or of a time message.
+    """Return the stamp in ns of a message with a header, of a header, or of a time message.
 
     Raises
     ------
     MessageError
-        There is no stamp, or its numbers are not those of a time: 32-bit seconds, and nanoseconds
+        There is no stamp, or its numbers are not a valid time: 32-bit seconds, and nanoseconds
         below one second.
     """
     stamp = _find_stamp(message)
@@ -64,7 +64,7 @@ def stamp_ns_from_msg(message: Any) -> int:
 
 
 def optional_stamp_ns(message: Any) -> int | None:
-    """As :func:`stamp_ns_from_msg`, or None for a type without a header, such as Float64."""
+    """Return as :func:`stamp_ns_from_msg`, or None for a type without a header, such as Float64."""
     return None if _find_stamp(message) is None else stamp_ns_from_msg(message)
 
 

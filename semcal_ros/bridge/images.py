@@ -52,7 +52,7 @@ _GRAY_CODES = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 
 def image_from_message(message: Any) -> NDArray[Any]:
-    """Pixels of an image message in the byte order of this machine.
+    """Return the pixels of an image message in the byte order of this machine.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def _wide_pixels(rows: NDArray[np.uint8], dtype: np.dtype[Any], big_endian: bool
 
 
 def to_gray(image: NDArray[Any], encoding: str = "bgr8") -> NDArray[Any]:
-    """One-channel image of the same depth.
+    """Convert to a one-channel image of the same depth.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def to_gray(image: NDArray[Any], encoding: str = "bgr8") -> NDArray[Any]:
     Raises
     ------
     InvalidValueError
-        The shape or the encoding is another one.
+        The shape or the encoding is not one of these.
     """
     if image.ndim == 2:
         return image
@@ -182,7 +182,7 @@ def to_gray(image: NDArray[Any], encoding: str = "bgr8") -> NDArray[Any]:
 
 
 def without_databar(image: NDArray[Any], databar_rows: int) -> NDArray[Any]:
-    """View without the rows at the bottom; :class:`MessageError` where no row would be left."""
+    """Return a view without the rows at the bottom; raise :class:`MessageError` if no row is left."""
     if not 0 <= databar_rows < image.shape[0]:
         raise MessageError(
             f"an image of {image.shape[0]} rows with a data bar of {databar_rows} rows",
@@ -217,13 +217,13 @@ def fill_image(message: Any, image: NDArray[Any], encoding: str, header: HeaderM
 def pixel_memory(
     message: Any, like: NDArray[Any], encoding: str, header: HeaderMessage
 ) -> NDArray[Any]:
-    """Set every field of an image message but the pixels, and give their memory to write to.
+    """Set every field of an image message but the pixels, and return the memory for them.
 
     Parameters
     ----------
     message
-        The message. One that is used again for an image of the same size keeps its memory, so what
-        was given for it before changes with it.
+        The message. If it is reused for an image of the same size it keeps its memory, so an array
+        returned for it before changes too.
     like
         Array of the shape and type that the image will have; those of ``encoding``.
     encoding, header
@@ -231,8 +231,8 @@ def pixel_memory(
 
     Returns
     -------
-    Writeable array of the shape of ``like``, in the byte order of this machine, with anything in
-    it.
+    Writeable array of the shape of ``like``, in the byte order of this machine,
+    uninitialised.
 
     Raises
     ------

@@ -84,7 +84,7 @@ class MagnificationReading:
         Raises
         ------
         MessageError
-            The result is outside of :data:`MAGNIFICATION_LIMITS`: most often a wrong unit or
+            The result is outside :data:`MAGNIFICATION_LIMITS`: most often a wrong unit or
             quantity in the configuration.
         """
         source = self.config.magnification
@@ -97,7 +97,7 @@ class MagnificationReading:
 
 
 def check_magnification(magnification: float) -> float:
-    """The argument, or :class:`MessageError` outside of :data:`MAGNIFICATION_LIMITS`."""
+    """Return the argument; raise :class:`MessageError` outside :data:`MAGNIFICATION_LIMITS`."""
     low, high = MAGNIFICATION_LIMITS
     if not low <= magnification <= high:
         raise MessageError(

@@ -1,7 +1,7 @@
-"""What a PNG or JPEG picture is, read from its structure before anything is decoded.
+"""The header of a PNG or JPEG image, read and checked before anything is decoded.
 
-A decoder allocates what the header declares, and some decoders deliver a damaged picture without a word (OpenCV 4.10
-fills the rest of a truncated JPEG with grey). So the structure is checked here, as the standards lay it out: PNG
+A decoder allocates what the header declares, and some decoders return a damaged image silently (OpenCV 4.10
+fills the rest of a truncated JPEG with grey). So the structure is checked here, as the standards define it: PNG
 (ISO/IEC 15948, https://www.w3.org/TR/png-3/, sections 5 and 11), with the checksum of every chunk; JPEG (ITU-T T.81,
 annex B).
 """
@@ -21,7 +21,7 @@ MAX_PIXELS = 2**28
 """Largest accepted picture: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
 
 # Neither codec can hold more pixels in a byte. Deflate expands to at most 1032 times its size (https://zlib.net/zlib_tech.html);
-# a JPEG spends at least one bit on each block of 64 pixels, or of 128 with the strangest subsampling.
+# a JPEG spends at least one bit on each block of 64 pixels, or of 128 with the coarsest subsampling.
 _MAX_PIXELS_PER_BYTE = 1032
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -43,7 +43,7 @@ _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _HUFFMAN_FRAMES = {0xC0, 0xC1, 0xC2}
 # TEM and RST0 to RST7, the markers of table B.1 that stand alone within an image.
 _WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD8)}
-# Every scan costs a pass over the whole picture, however short it is; encoders write about ten.
+# Every scan costs a pass over the whole image, however short it is; encoders write about ten.
 _MAX_SCANS = 100
 
 _OTHERS = {
@@ -58,7 +58,7 @@ _OTHERS = {
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """A picture that is whole as far as its structure tells.
+    """Header of an image whose structure is complete.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class PictureHeader:
 
 
 def read_picture_header(data: memoryview) -> PictureHeader:
-    """Header of a picture, after a look at its structure from the first byte to the last.
+    """Read the header of an image and check its structure from the first byte to the last.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def _read_png(data: memoryview) -> PictureHeader:
 
 
 def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Name and content of each chunk, the end chunk not included."""
+    """Yield the name and content of each chunk except the end chunk."""
     position = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PNG_CHUNKS):
         if position + 12 > len(data):
@@ -185,7 +185,7 @@ def _read_jpeg(data: memoryview) -> PictureHeader:
 
 
 def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
-    """Marker, content and end of each segment up to the first scan."""
+    """Yield the marker, content and end of each segment up to the first scan."""
     position = 2
     while True:
         if position + 4 > len(data):

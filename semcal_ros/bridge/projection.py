@@ -41,7 +41,7 @@ def fill_projection(message: Any, camera: ScanCamera) -> None:
 
 
 def projection_from_message(message: Any) -> Array:
-    """(3, 4) matrix of a message filled by :func:`fill_projection`.
+    """Return the (3, 4) matrix of a message filled by :func:`fill_projection`.
 
     Raises
     ------

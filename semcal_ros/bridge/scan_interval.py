@@ -7,9 +7,9 @@ from semcal_ros.config.config import MicroscopeConfig
 __all__ = ["scan_interval_ns"]
 
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
-# Part of the acquisition at either end in which a change does no harm: less than a row or two.
+# Fraction of the acquisition at either end in which a change is harmless: a row or two at most.
 _MARGIN = 0.01
-# A magnification that is published so shortly before its frame was announced together with it.
+# A magnification published at most this long before a frame was announced together with it.
 _TOGETHER_NS, _TOGETHER_AT_MOST = 20_000_000, 0.25
 # A frame that was published later than this after its scan has a stamp of another clock.
 _LONGEST_WAY_NS = 10 * _NS_PER_S
@@ -18,7 +18,7 @@ _LONGEST_WAY_NS = 10 * _NS_PER_S
 def scan_interval_ns(
     stamp_ns: int, sent_ns: int | None, config: MicroscopeConfig
 ) -> tuple[int, int] | None:
-    """First and last moment of a frame's scan at which a change of magnification spoils it.
+    """Return the first and the last moment of a frame's scan at which a change of magnification spoils it.
 
     The very first and last rows do not count. Where publication times decide, neither do the last
     20 ms (at most a quarter of the scan): many drivers announce a magnification with its frame.
@@ -35,7 +35,7 @@ def scan_interval_ns(
 
     Returns
     -------
-    (start, end), ns; None where it is not known: without raster timing and publication time, or
+    (start, end), ns; None if unknown: without raster timing and publication time, or
     where stamps and publication are on different clocks, as in a replay.
     """
     start_ns = stamp_ns + round(config.start_offset_s * 1e9)

@@ -22,9 +22,9 @@ class ZeroOrderHold(Generic[T]):
     max_length
         Number of values kept; the oldest are dropped.
     jump_ns
-        A value that is older than the newest one by more than this means that the clock went back
-        (a bag that loops, a simulation that restarts): everything before is forgotten. Smaller
-        steps back are late arrivals and are sorted in.
+        A value older than the newest one by more than this means that the clock went back (a bag
+        that loops, a simulation that restarts): the history is cleared. Smaller steps back are
+        late arrivals and are sorted in.
 
     Notes
     -----
@@ -83,11 +83,11 @@ class ZeroOrderHold(Generic[T]):
         return cleared
 
     def at(self, stamp_ns: int) -> T | None:
-        """Value whose stamp is the latest one not after ``stamp_ns``, or None if there is none."""
+        """Return the value with the latest stamp not after ``stamp_ns``, or None."""
         place = bisect_right(self._stamps, stamp_ns)
         return self._values[place - 1] if place else None
 
     def between(self, start_ns: int, end_ns: int) -> list[T]:
-        """Values that began in ``start_ns`` < stamp <= ``end_ns``, oldest first."""
+        """Return the values that began in ``start_ns`` < stamp <= ``end_ns``, oldest first."""
         first, last = bisect_right(self._stamps, start_ns), bisect_right(self._stamps, end_ns)
         return self._values[first:last]

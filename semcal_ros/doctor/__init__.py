@@ -1,1 +1,1 @@
-"""What `semcal doctor` looks at and what it makes of it: observations, and one small check for each."""
+"""The checks of `semcal doctor`: observations, and one small check for each."""

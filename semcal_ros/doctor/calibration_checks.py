@@ -11,12 +11,12 @@ from semcal_ros.doctor.observations import CalibrationSeen, Session
 
 __all__ = ["check_calibration", "describe_calibration", "live_size"]
 
-# A row of a thousand: what rounding leaves of the shape when a size is scaled.
+# One row in a thousand: the change of shape when a scaled size is rounded.
 _ASPECT = 1e-3
 
 
 def live_size(session: Session, config: MicroscopeConfig) -> tuple[int, int] | None:
-    """Width and height of the live images without their data bar, px, or None."""
+    """Return the width and height of the live images without their data bar, px, or None."""
     image = session.image
     if image is None or image.height <= config.image.databar_rows:
         return None
@@ -29,7 +29,7 @@ def describe_calibration(
     magnification: float | None,
     size: tuple[int, int] | None,
 ) -> CalibrationSeen:
-    """What there is to say of a calibration for live images of this size (width, height) and magnification."""
+    """Describe a calibration for live images of this size (width, height) and magnification."""
     low, high = calibration.magnification_range
     sigma, trouble = None, ""
     if magnification is not None:
@@ -57,7 +57,7 @@ def check_calibration(
     magnification: float | None,
     config: MicroscopeConfig,
 ) -> list[Finding]:
-    """Whether the calibration in force is valid for what is in view."""
+    """Check whether the calibration in force is valid for the live images."""
     if seen is None:
         return [
             note(

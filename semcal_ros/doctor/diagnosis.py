@@ -42,7 +42,7 @@ __all__ = ["diagnose", "evaluate"]
 def diagnose(
     config_name: str, calibration: Path | None, namespace: str, seconds: float
 ) -> list[Finding]:
-    """Look at everything and say what was found.
+    """Run all checks and return their findings.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def diagnose(
     Raises
     ------
     ConfigError, CalibrationFileError
-        What was given cannot be used.
+        A given name or file cannot be used.
     """
     config = load_config(config_name)
     given = None if calibration is None else (str(calibration), Calibration.load(calibration))
@@ -83,7 +83,7 @@ def _is_problem(finding: Finding) -> bool:
 
 
 def _observe(config: MicroscopeConfig, namespace: str, seconds: float) -> Session:
-    # Imports ROS, which need not be there.
+    # Imports ROS, which need not be installed.
     from semcal_ros.doctor.live import observe
 
     return observe(config, suite_topics(config, namespace), namespace, seconds)
@@ -96,16 +96,16 @@ def evaluate(
     given: tuple[str, Calibration] | None,
     namespace: str,
 ) -> list[Finding]:
-    """What there is to say of what was heard.
+    """Evaluate what was observed.
 
     Parameters
     ----------
     session, around
-        What was seen.
+        The observations.
     configured
         Name of the configuration, and the configuration.
     given
-        Name of a calibration file, and the calibration; None to look at that of the topic alone.
+        Name of a calibration file, and the calibration; None to check only the one on the topic.
     namespace
         Namespace of the suite.
     """

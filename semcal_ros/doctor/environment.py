@@ -18,17 +18,17 @@ from semcal_ros.doctor.observations import Environment
 __all__ = ["collect_environment"]
 
 _MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
-# The middleware is loaded with rclpy and may end the process at once, so a process of its own does it.
+# Importing rclpy loads the middleware, which may end the process at once: a separate process does it.
 _PROBE = "import rclpy; print(rclpy.__file__); print(rclpy.get_rmw_implementation_identifier())"
 _PROBE_S = 60.0  # importing rclpy takes about a second; this only ends a process that hangs
-_LONGEST = 200  # characters of a reason, which stands in one line
+_LONGEST = 200  # characters of a reason, which must fit on one line
 _RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
 _SHM = Path("/dev/shm")
 _INSTALLATIONS = Path("/opt/ros")
 
 
 def collect_environment() -> Environment:
-    """The state of this machine and process, without a ROS graph; imports what the nodes import."""
+    """Collect the state of this machine and process, without a ROS graph; imports what the nodes import."""
     rclpy_file, rmw, reason = _probe_ros()
     distributions = [found for found in metadata.distributions() if found.metadata["Name"]]
     errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
@@ -71,10 +71,10 @@ def _import_errors(modules: Iterable[str]) -> dict[str, str]:
 def _import_error(module: str) -> str:
     try:
         with warnings.catch_warnings():
-            # What other people's modules warn of at import is not what is asked here.
+            # Warnings of other modules at import do not matter here.
             warnings.simplefilter("ignore")
             import_module(module)
-    except Exception as error:  # a broken installation fails in any way
+    except Exception as error:  # a broken installation may raise any exception
         return _one_line(error)
     return ""
 

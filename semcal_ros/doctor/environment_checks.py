@@ -33,7 +33,7 @@ __all__ = [
     "check_socket_buffers",
 ]
 
-_PYTHON = ((3, 10), (3, 14))  # as the Makefile has it
+_PYTHON = ((3, 10), (3, 14))  # as in the Makefile
 _GET_ROS = (
     "run `make setup` and use .venv/bin/semcal, or install the wheels that requirements/ names, or source the"
     " setup script of a ROS 2 installation"
@@ -49,7 +49,7 @@ _MB = 1024**2  # bytes per MiB
 
 
 def check_python(seen: Environment) -> list[Finding]:
-    """Whether this Python is one that is supported."""
+    """Check whether this version of Python is supported."""
     version = ".".join(map(str, seen.python))
     if _PYTHON[0] <= seen.python <= _PYTHON[1]:
         return [ok("Python", version)]
@@ -59,7 +59,7 @@ def check_python(seen: Environment) -> list[Finding]:
 
 
 def check_packages(seen: Environment) -> list[Finding]:
-    """Whether what this package requires is installed in a fitting version."""
+    """Check whether the requirements of this package are installed in matching versions."""
     found = [
         problem(
             "packages",
@@ -68,7 +68,7 @@ def check_packages(seen: Environment) -> list[Finding]:
             do=f'`python -m pip install "{wanted.name}{wanted.specifier}"`',
         )
         for wanted, have in _unmet(seen, "semcal-ros")
-        # OpenCV has several names; without it this command could not have started.
+        # OpenCV has several package names; without it this command could not have started.
         if not wanted.name.startswith("opencv")
     ]
     if found:
@@ -93,7 +93,7 @@ def _unmet(seen: Environment, distribution: str) -> Iterator[tuple[Requirement, 
 
 
 def check_rclpy(seen: Environment) -> list[Finding]:
-    """Whether ROS 2 can be imported, and how to get it."""
+    """Check whether ROS 2 can be imported; otherwise say how to get it."""
     reason = seen.import_errors.get("rclpy")
     if reason is None:
         missing = [
@@ -112,7 +112,7 @@ def check_rclpy(seen: Environment) -> list[Finding]:
             problem("ROS 2", f"rclpy is not there{here * bool(seen.installations)}", do=_GET_ROS)
         ]
     if _wrong_middleware(seen):
-        return []  # check_rmw says so
+        return []  # check_rmw reports it
     return [
         problem(
             "ROS 2",
@@ -124,7 +124,7 @@ def check_rclpy(seen: Environment) -> list[Finding]:
 
 
 def check_one_ros(seen: Environment) -> list[Finding]:
-    """Whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
+    """Check whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
     rclpy = seen.packages.get("ros-rclpy")
     if rclpy is None:
         return []
@@ -164,7 +164,7 @@ def _wrong_middleware(seen: Environment) -> bool:
 
 
 def check_rmw(seen: Environment) -> list[Finding]:
-    """Which middleware is used."""
+    """Check which middleware is used."""
     if _wrong_middleware(seen):
         return [
             problem(
@@ -189,7 +189,7 @@ def check_rmw(seen: Environment) -> list[Finding]:
 
 
 def check_domain(seen: Environment) -> list[Finding]:
-    """Whether the domain id is valid."""
+    """Check whether the domain id is valid."""
     given = seen.environment.get("ROS_DOMAIN_ID", "")
     if not given:
         return [ok("domain", "ROS_DOMAIN_ID is not set: 0")]
@@ -214,7 +214,7 @@ def check_domain(seen: Environment) -> list[Finding]:
 
 
 def check_discovery(seen: Environment) -> list[Finding]:
-    """Which hosts and processes can be found."""
+    """Check which hosts and processes can be discovered."""
     reach = seen.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     peers = seen.environment.get("ROS_STATIC_PEERS", "")
     if reach and reach not in _RANGES:
@@ -259,7 +259,7 @@ def _memory(seen: Environment) -> SharedMemory | None:
     try:
         return shared_memory(seen.environment)
     except ConfigError:
-        return None  # check_profile says so
+        return None  # check_profile reports it
 
 
 def check_profile(seen: Environment) -> list[Finding]:
@@ -302,7 +302,7 @@ def check_profile(seen: Environment) -> list[Finding]:
 
 
 def check_shared_memory(seen: Environment) -> list[Finding]:
-    """Whether /dev/shm has room for the segment of one more process."""
+    """Check whether /dev/shm has room for the segment of one more process."""
     memory = _memory(seen)
     if memory is None or memory.segment_bytes is None or not seen.rmw.startswith("rmw_fastrtps"):
         return []
@@ -323,7 +323,7 @@ def check_shared_memory(seen: Environment) -> list[Finding]:
 
 
 def check_socket_buffers(seen: Environment) -> list[Finding]:
-    """Whether images can come from other hosts without loss."""
+    """Check whether images from other hosts can arrive without loss."""
     have = seen.receive_buffer_bytes
     if have is None or local_only(seen.environment) or have >= _SOCKET_BYTES:
         return []

@@ -1,4 +1,4 @@
-"""What a check says."""
+"""The findings of checks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Finding", "Severity", "note", "ok", "problem"]
 
 
 class Severity(Enum):
-    """How bad it is: only a problem lets the command fail."""
+    """How serious a finding is: only a problem makes the command fail."""
 
     OK = "ok"
     NOTE = "note"
@@ -23,11 +23,11 @@ class Finding:
     Attributes
     ----------
     level
-        How bad it is.
+        How serious it is.
     subject
-        What was looked at, in a few words.
+        What was checked, in a few words.
     seen, expected, do
-        What was found, what would be well, and the next step; the last two are empty where all is well.
+        What was found, what was expected, and the next step; the last two are empty if all is well.
     """
 
     level: Severity
@@ -46,15 +46,15 @@ class Finding:
 
 
 def ok(subject: str, seen: str) -> Finding:
-    """All is well."""
+    """Make a finding that all is well."""
     return Finding(Severity.OK, subject, seen)
 
 
 def note(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
-    """Worth knowing, but nothing fails for it."""
+    """Make a finding that is worth knowing but breaks nothing."""
     return Finding(Severity.NOTE, subject, seen, expected, do)
 
 
 def problem(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
-    """Something cannot work like this."""
+    """Make a finding that something cannot work."""
     return Finding(Severity.PROBLEM, subject, seen, expected, do)

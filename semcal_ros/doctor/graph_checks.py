@@ -1,4 +1,4 @@
-"""Checks of the ROS graph: nodes, topics, types, quality of service, and who uses which time."""
+"""Checks of the ROS graph: nodes, topics, types, quality of service, and clocks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Topic:
     single
         Whether two publishers would contradict each other.
     keys
-        Where the configuration names it; empty for topics of fixed names.
+        Keys of the configuration that name the topic; empty for fixed names.
     """
 
     name: str
@@ -78,7 +78,7 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
 
 
 def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
-    """Which nodes of the suite run, and whether two have one name."""
+    """Check which nodes of the suite run, and whether two have the same name."""
     found = [
         # Others may not mind.
         (problem if name in graph.suite() else note)(
@@ -213,7 +213,7 @@ def _qualities(
 
 
 def check_parameters(graph: Graph, config: str) -> list[Finding]:
-    """Whether the nodes answer the parameter protocol, and use the configuration that was given here."""
+    """Check whether the nodes answer parameter requests, and use the configuration given here."""
     found = []
     for name, values in graph.parameters.items():
         if values is None:
@@ -239,11 +239,11 @@ def check_parameters(graph: Graph, config: str) -> list[Finding]:
 
 
 def check_simulated_time(graph: Graph) -> list[Finding]:
-    """Whether /clock and the parameters `use_sim_time` fit each other."""
+    """Check whether /clock and the parameters `use_sim_time` are consistent."""
     clocks = [e.node for e in graph.publishers.get(_CLOCK, ())]
     known = {name: values[0] for name, values in graph.parameters.items() if values is not None}
     simulated = [name for name, value in known.items() if value]
-    # What replays is the source of the time and keeps to the real one.
+    # A replaying node is the source of simulated time and itself uses real time.
     real = [name for name, value in known.items() if not value and name not in clocks]
     if simulated and not clocks:
         return [

@@ -1,4 +1,4 @@
-"""Listen to the running system for a while; the one part of this folder that imports ROS."""
+"""Listens to the running system for a while; the only module of this folder that imports ROS."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from semcal_ros.middleware.message_types import message_class
 
 __all__ = ["observe"]
 
-# Before anything is known, nodes need to find each other.
+# Time for discovery, before which nothing is known.
 _DISCOVERY_S = 1.0
 # Longest wait for the parameter services, and again for their answers: a busy node answers late, a
 # stuck one never. Chosen, not measured.
@@ -51,16 +51,17 @@ _PARAMETERS = ("use_sim_time", "config")
 def observe(
     config: MicroscopeConfig, topics: tuple[Topic, ...], namespace: str, seconds: float
 ) -> Session:
-    """What can be heard within some seconds.
+    """Observe the running system for some seconds.
 
     Parameters
     ----------
     config
         The microscope.
     topics
-        What to look at: image and magnification first; to the images among them, and to `calibration`, it listens.
+        The topics to check, image and magnification first; it subscribes to the images among them and to
+        `calibration`.
     namespace
-        That of the suite.
+        Namespace of the suite.
     seconds
         How long to listen, s.
 
@@ -99,7 +100,7 @@ class _Observer:
         self._calibration: str | None = None
         self._statuses: dict[str, Status] = {}
         images, magnification = topics[:2]
-        # What to do with a message, by topic, beside noting that it came.
+        # What to do with a message, by topic, in addition to recording its arrival.
         self._takes: dict[str, Callable[[Any], None]] = {
             images.name: self._take_image,
             magnification.name: self._take_magnification,
@@ -112,14 +113,14 @@ class _Observer:
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEPTH)
 
     def session(self, seconds: float) -> Session:
-        """Listen, ask, and sum up."""
+        """Listen, query the nodes, and return the result."""
         self._spin(lambda: False, _DISCOVERY_S + seconds, each=self._subscribe)
         graph = self._graph()
         answers = self._ask(graph.suite(self._namespace))
         values = {
             name: None if answer is None else (answer[0].bool_value, answer[1].string_value)
             for name, answer in answers.items()
-            # A node that does not know them only has the name of one of the suite.
+            # A node without these parameters merely has the name of a node of the suite.
             if answer is None or len(answer) == len(_PARAMETERS)
         }
         reading, trouble = self._reading()
@@ -160,12 +161,12 @@ class _Observer:
                     topic.name,
                     taking,
                     quality,
-                    # The checks tell what does not fit; the default would log it as well.
+                    # The checks report incompatibilities; the default handler would log them as well.
                     event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
                 )
 
     def _taking(self, name: str) -> Any:
-        # rclpy takes callbacks with the message's info too; its types say otherwise.
+        # rclpy also accepts callbacks with the message's info, though its annotations do not.
         arrivals = self._arrivals.setdefault(name, [])
 
         def take(message: Any, info: Any) -> None:
@@ -198,7 +199,7 @@ class _Observer:
 
     def _describe_image(self) -> ImageSeen | None:
         message, trouble = self._image, ""
-        # Only plain images tell their size without being decoded.
+        # Only uncompressed images show their size without being decoded.
         if message is None or not hasattr(message, "encoding"):
             return None
         try:
@@ -251,7 +252,7 @@ class _Observer:
         return tuple(end for end in found if end.node != own)
 
     def _ask(self, nodes: tuple[str, ...]) -> dict[str, Any]:
-        """Values of :data:`_PARAMETERS` by node; None of those that do not answer."""
+        """Ask for the values of :data:`_PARAMETERS` by node; None for nodes that do not answer."""
         clients = {n: self._node.create_client(GetParameters, f"{n}/get_parameters") for n in nodes}
         self._spin(lambda: all(c.service_is_ready() for c in clients.values()), _ANSWER_S)
         request = GetParameters.Request(names=list(_PARAMETERS))

@@ -1,4 +1,4 @@
-"""What was seen, as plain values: of this machine and process, of the ROS graph, and of the messages."""
+"""The observations, as plain values: of this machine and process, of the ROS graph, and of the messages."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Environment:
     shm_free_bytes
         Room in /dev/shm, or None on a system without it.
     receive_buffer_bytes
-        Largest receive buffer that the kernel grants a socket, or None where it does not say.
+        Largest receive buffer that the kernel grants a socket, or None if unknown.
     """
 
     python: tuple[int, int]
@@ -98,7 +98,7 @@ class Graph:
     Attributes
     ----------
     nodes
-        Fully qualified names; a name that is used twice stands here twice.
+        Fully qualified names; a name that is used twice appears twice.
     publishers, subscriptions
         By topic.
     parameters
@@ -111,7 +111,7 @@ class Graph:
     parameters: Mapping[str, tuple[bool, str] | None] = field(default_factory=dict)
 
     def suite(self, namespace: str | None = None) -> tuple[str, ...]:
-        """Nodes of the suite, each once; those in one namespace if it is given."""
+        """Return the nodes of the suite, each once; those in one namespace if it is given."""
         found = dict.fromkeys(n for n in self.nodes if n.rpartition("/")[2] in SUITE)
         return tuple(n for n in found if namespace in (None, n.rpartition("/")[0]))
 
@@ -145,7 +145,7 @@ class CalibrationSeen:
     source
         File, or topic.
     trouble
-        Why it cannot be used; then nothing else counts.
+        Why it cannot be used; if set, nothing else is valid.
     width, height, display_width_m
         Of the calibration images, px, and the display, m.
     low, high
@@ -176,7 +176,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Session:
-    """What was heard in some seconds.
+    """What was received in some seconds.
 
     Attributes
     ----------

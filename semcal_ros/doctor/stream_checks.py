@@ -1,4 +1,4 @@
-"""Checks of what arrives: images, magnification, stamps, clocks, and what the nodes say of themselves."""
+"""Checks of what arrives: images, magnification, stamps, clocks, and the nodes' own diagnostics."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ __all__ = [
     "rate_hz",
 ]
 
-# Further away than this a stamp is that of another clock, such as a recording's.
+# A stamp that differs by more is from another clock, such as a recording's.
 _OTHER_CLOCK_S = 3600.0
-# Clocks that NTP keeps on one network agree much better.
+# Clocks that NTP synchronises on one network agree much better.
 _SKEW_S = 0.05
 # From publishing to arrival. 4096 x 4096 pixels of 16 bits take 0.27 s at 1 Gbit/s.
 _SLOW_S = 1.0
@@ -39,7 +39,7 @@ _SYNCHRONISE = "synchronise the clocks of the hosts (chrony or NTP)"
 
 
 def rate_hz(arrivals: tuple[Arrival, ...]) -> float | None:
-    """Messages per second, or None for less than two."""
+    """Return the messages per second, or None for fewer than two messages."""
     if len(arrivals) < 2:
         return None
     span_ns = arrivals[-1].received_ns - arrivals[0].received_ns
@@ -52,7 +52,7 @@ def _rate(arrivals: tuple[Arrival, ...]) -> str:
 
 
 def check_images(topic: Topic, session: Session) -> list[Finding]:
-    """Whether usable images arrive; empty without a publisher, which another check reports."""
+    """Check whether usable images arrive; empty without a publisher, which another check reports."""
     if not session.graph.publishers.get(topic.name):
         return []
     arrivals = session.arrivals.get(topic.name, ())
@@ -77,7 +77,7 @@ def check_images(topic: Topic, session: Session) -> list[Finding]:
 
 
 def check_large_images(session: Session, environment: Mapping[str, str], rmw: str) -> list[Finding]:
-    """Whether this shell's environment suits the images; that of the nodes is in their diagnostics."""
+    """Check whether this shell's environment suits the images; the nodes report theirs in their diagnostics."""
     if session.image is None:
         return []
     advice = transport_advice(session.image.bytes, environment, rmw)
@@ -90,7 +90,7 @@ def check_large_images(session: Session, environment: Mapping[str, str], rmw: st
 
 @dataclass(frozen=True)
 class MagnificationSeen:
-    """The last magnification as the nodes read it, or None and why not."""
+    """The last magnification as the nodes read it, or None and the reason."""
 
     value: float | None
     trouble: str = ""
@@ -110,7 +110,7 @@ def describe_magnifications(session: Session, config: MicroscopeConfig) -> Magni
 def check_magnification(
     topic: Topic, seen: MagnificationSeen | None, session: Session
 ) -> list[Finding]:
-    """Whether a magnification is known."""
+    """Check whether a magnification is known."""
     if not session.graph.publishers.get(topic.name):
         return []
     if seen is None:
@@ -128,7 +128,7 @@ def check_magnification(
 
 
 def check_stamps(topic: Topic, session: Session) -> list[Finding]:
-    """Whether stamps are there, go on, and are of this clock."""
+    """Check whether stamps are set, advance, and are of this clock."""
     arrivals = [a for a in session.arrivals.get(topic.name, ()) if a.stamp_ns is not None]
     stamps = [a.stamp_ns for a in arrivals if a.stamp_ns is not None]
     if not stamps:
@@ -187,7 +187,7 @@ def _age(age_s: float, replay: bool) -> Finding:
 
 
 def check_transport_time(topic: Topic, session: Session) -> list[Finding]:
-    """Whether the clock of the publisher's host and this one agree, by the time a message seems to take."""
+    """Check, by the apparent transport time, whether the clocks of the publisher's host and of this one agree."""
     times = [
         (a.received_ns - a.published_ns) * 1e-9
         for a in session.arrivals.get(topic.name, ())
@@ -217,7 +217,7 @@ def check_transport_time(topic: Topic, session: Session) -> list[Finding]:
 
 
 def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Finding]:
-    """Whether an output keeps up with the images."""
+    """Check whether an output keeps up with the images."""
     taken, made = session.arrivals.get(source.name, ()), session.arrivals.get(output.name, ())
     senders = session.graph.publishers.get(output.name, ())
     if not senders or len(taken) < 2:
@@ -232,7 +232,7 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
             )
         ]
     seen = f"{_rate(made)} for {_rate(taken)} of images"
-    # Either count may miss one at both ends of the time.
+    # Either count may miss one message at each end of the interval.
     if len(made) + 2 < 0.8 * len(taken):
         return [
             note(
@@ -245,7 +245,7 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
 
 
 def check_diagnostics(session: Session, namespace: str) -> list[Finding]:
-    """What the nodes of the suite say of themselves."""
+    """Report the diagnostics of the suite's nodes."""
     found = []
     for status in session.statuses:
         if status.level == 0:

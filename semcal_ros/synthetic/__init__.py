@@ -1,4 +1,4 @@
-"""The virtual SEM: recordings and live frames whose truth is known.
+"""The virtual SEM: recordings and live frames with known ground truth.
 
 It needs :mod:`semcal_ros.core` only: no ROS, no files, no clock. Time and random seeds are
 arguments.

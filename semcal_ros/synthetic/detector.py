@@ -78,7 +78,7 @@ class Detector:
         return round(4.0 * self.blur_px + 0.5) if self.blur_px > 0 else 0
 
     def expose(self, reflectivity: Image, rng: np.random.Generator) -> Grey:
-        """Grey image of a reflectivity that extends ``pad_px`` px beyond the frame on every side.
+        """Compute the grey image of a reflectivity that extends ``pad_px`` px beyond the frame on every side.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class Detector:
 
 
 def _draw_databar(rows: int, width: int, top: int) -> Image:
-    """Black bar with a scale line and tick marks, whose corners are none of the specimen's."""
+    """Draw a black bar with a scale line and tick marks; their corners must not be taken for the specimen's."""
     bar = np.zeros((rows, width), dtype=np.float32)
     middle = rows // 2
     bar[middle : middle + 1, width // 16 : width // 4] = top

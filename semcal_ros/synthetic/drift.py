@@ -32,7 +32,7 @@ class Drift:
 
     The displacement is zero at time 0. The wander is a sum of sines with random phases whose
     amplitudes fall as 1/frequency, the spectrum of a random walk, cut off at both ends: it is
-    smooth, deterministic by seed, and can be asked for any time.
+    smooth, determined by its seed, and can be evaluated at any time.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Drift:
     seed: int = 0
 
     def __call__(self, time_s: ArrayLike) -> Array:
-        """Displacement (n, 2) in m at times (n,) in s."""
+        """Return the displacement (n, 2) in m at times (n,) in s."""
         t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
         settled = -np.expm1(-np.maximum(t, 0.0) / self.settling_time_s)
         drift: Array = t[:, None] * np.array(self.velocity_m_s)
@@ -109,7 +109,7 @@ DRIFTS: Mapping[str, Drift] = MappingProxyType(
 
 
 def drift_preset(name: str) -> Drift:
-    """Drift of that name.
+    """Return the drift with this name.
 
     Raises
     ------

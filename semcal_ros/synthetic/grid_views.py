@@ -26,7 +26,7 @@ def grid_view(
     name: str = "",
     project: Callable[[Array], Array] | None = None,
 ) -> GridView:
-    """All lattice corners that fall into the image, with Gaussian noise on their pixels.
+    """Return all lattice corners inside the image, with Gaussian noise on their pixels.
 
     ``project`` takes the place of the camera's own projection of sem-frame points.
     """
@@ -63,7 +63,7 @@ def grid_views(
     takes the place of the cameras' projection: of sem-frame points at a magnification, as of a whole microscope.
     """
     rng = np.random.default_rng(seed)
-    # A generator of its own: the poses of a seed are the same with and without noise.
+    # A separate generator: the poses of a seed are the same with and without noise.
     noise_rng = np.random.default_rng(seed + 1_000_000)
     out = []
     for g in magnifications:
@@ -74,7 +74,7 @@ def grid_views(
             turn = rotations_from_vectors(np.array([[0.0, 0.0, rng.uniform(-0.6, 0.6)]]))[0]
             lean = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
             centre = rng.uniform(-0.5, 0.5, size=2) * square_px / camera.m
-            # Without a height of its own, the first view draws no number, so that seeds keep their poses.
+            # Without its own height sigma, the first view draws no number, so that seeds keep their poses.
             sigma = flat_height_sigma_m if k == 0 else height_sigma_m
             translation = np.array([*centre, rng.normal() * sigma if sigma > 0.0 else 0.0])
             out.append(

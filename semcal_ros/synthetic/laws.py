@@ -1,8 +1,8 @@
 """How a camera parameter changes with the magnification.
 
 None of these laws is a polynomial in g or in log g. A calibration that fits such polynomials
-therefore meets a curve that it can only approximate, as with a real microscope, and a test against
-it measures something.
+therefore meets a curve that it can only approximate, as with a real microscope, so that a test
+against it is meaningful.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ __all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
 
 # Changes of magnification that are remembered, for frames that have begun before them.
 _TURNS = 16
-# Commands of the stage that are remembered, for the same.
+# Commands of the stage that are remembered, for the same reason.
 _COMMANDS_KEPT = 32
 
 
@@ -56,7 +56,7 @@ class VirtualStage:
     def commanded(
         self, time_s: float, velocity_m_s: tuple[float, float], turn_rad_s: float = 0.0
     ) -> VirtualStage:
-        """The stage after a new command; it keeps where it has got to.
+        """Return the stage after a new command; it continues from its present position.
 
         Raises
         ------
@@ -87,7 +87,7 @@ class VirtualStage:
         return replace(self, before=before)
 
     def position_at(self, time_s: ArrayLike) -> Array:
-        """Positions (n, 2) in m at times (n,)."""
+        """Return positions (n, 2) in m at times (n,)."""
         times = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
         elapsed = np.maximum(times - self.time_s, 0.0)
         positions: Array = np.array(self.position_m) + elapsed[:, None] * np.array(
@@ -99,7 +99,7 @@ class VirtualStage:
         return positions
 
     def rotation_at(self, time_s: float) -> float:
-        """Rotation in rad at a time."""
+        """Return the rotation in rad at a time."""
         if time_s < self.time_s and self.before is not None:
             return self.before.rotation_at(time_s)
         return self.rotation_rad + max(time_s - self.time_s, 0.0) * self.turn_rad_s
@@ -118,7 +118,7 @@ class LiveFrame:
     magnification
         Magnification at the end of the frame.
     mixed
-        Whether it changed while the frame was being scanned.
+        Whether the magnification changed during the frame's scan.
     pose
         Specimen plane at the centre of the acquisition without drift, stage travel included.
     drift_m
@@ -215,7 +215,7 @@ class LiveScene:
         self.stage = self.stage.commanded(time_s, velocity_m_s, turn_rad_s)
 
     def pose_at(self, time_s: float) -> Pose:
-        """Specimen plane in the sem frame at a time, without drift."""
+        """Return the specimen plane in the sem frame at a time, without drift."""
         turn = rotation_about_beam(self.stage.rotation_at(time_s))
         travel = np.append(self.stage.position_at(time_s)[0], 0.0)
         return Pose(turn @ self.pose.R, self.pose.t_m + travel)
@@ -248,7 +248,7 @@ class LiveScene:
         return LiveFrame(image, start_time_s, g, len(parts) > 1, pose, drift_m, square_m)
 
     def _parts(self, start_time_s: float) -> list[tuple[float, Array]]:
-        """Magnifications during a frame, each with the part (h, w) of every pixel's passes that were
+        """Return the magnifications during a frame, each with the fraction (h, w) of every pixel's passes
         scanned at it.
         """
         timing = self.microscope.timing
@@ -261,7 +261,7 @@ class LiveScene:
         row, col = np.mgrid[:height, :width]
         pass_s = replace(timing, averages=1).pixel_offset_s(row, col, height, width)
         times_s = start_time_s + pass_s + timing.frame_time_s * _column(timing.averages)
-        # What each turn of the knob began, less what the next one took over.
+        # The fraction scanned since each change, minus the fraction scanned since the next one.
         begun = [np.mean(times_s >= at_s, axis=0) for at_s, _ in turns[1:]]
         shares = [np.ones((height, width)), *begun]
         left = [share - after for share, after in zip(shares, [*begun, 0.0], strict=True)]

@@ -60,7 +60,7 @@ class Residual:
         return self.spiral == 0.0 and self.sine == 0.0 and self.settling == 0.0
 
     def displacement_px(self, xy: Array, width: int, height: int) -> Array:
-        """Displacement (n, 2) in px at undistorted pixels (n, 2) of an image of that size."""
+        """Return the displacement (n, 2) in px at undistorted pixels (n, 2) of an image of this size."""
         n = 0.5 * width
         q = (xy - 0.5 * np.array([width - 1.0, height - 1.0])) / n
         r2 = np.sum(q * q, axis=1)
@@ -94,7 +94,7 @@ class VirtualMicroscope:
     px, py, ex, ey
         Laws of the principal point and of the distortion centre, in native pixels.
     residual
-        What the camera model does not contain.
+        Displacements that the camera model does not contain.
     residual_growth
         Law of a factor on the residual.
     timing
@@ -137,19 +137,19 @@ class VirtualMicroscope:
         return self.width, self.height
 
     def with_image_size(self, width: int, height: int) -> VirtualMicroscope:
-        """The same microscope taking images of another size over the same field width."""
+        """Return the same microscope with another image size over the same field width."""
         return replace(self, width=width, height=height)
 
     def with_timing(self, timing: ScanTiming) -> VirtualMicroscope:
-        """The same microscope with another raster timing."""
+        """Return the same microscope with another raster timing."""
         return replace(self, timing=timing)
 
     def nominal_pixel_size_m(self, magnification: float) -> float:
-        """Pixel size that the microscope itself would display, from the display width alone."""
+        """Return the pixel size that the microscope would display, from the display width alone."""
         return self.display_width_m / (_check_magnification(magnification) * self.width)
 
     def camera_at(self, magnification: float) -> ScanCamera:
-        """True camera at a magnification, without the residual.
+        """Return the true camera at a magnification, without the residual.
 
         Raises
         ------
@@ -183,17 +183,17 @@ class VirtualMicroscope:
         return growth * self.residual.displacement_px(xy_ideal, self.width, self.height)
 
     def distort(self, magnification: float, xy_ideal: ArrayLike) -> Array:
-        """Raw pixels (n, 2) of undistorted pixels (n, 2), with the residual."""
+        """Map undistorted pixels (n, 2) to raw pixels (n, 2), with the residual."""
         xy = as_points(xy_ideal, 2)
         raw = self.camera_at(magnification).distort(xy)
         return raw if self.residual.is_zero else raw + self._residual_px(magnification, xy)
 
     def project(self, magnification: float, xyz_m: ArrayLike) -> Array:
-        """Raw pixels (n, 2) of sem-frame points (n, 3) in m, with the residual."""
+        """Project sem-frame points (n, 3) in m to raw pixels (n, 2), with the residual."""
         return self.distort(magnification, self.camera_at(magnification).project_ideal(xyz_m))
 
     def undistort(self, magnification: float, xy_raw: ArrayLike) -> Array:
-        """Undistorted pixels (n, 2) of raw pixels (n, 2); NaN where there are none.
+        """Map raw pixels (n, 2) to undistorted pixels (n, 2); NaN where the inverse does not exist.
 
         The residual is small and smooth, so a fixed-point iteration around the camera's own inverse
         contracts.
@@ -201,7 +201,7 @@ class VirtualMicroscope:
         Raises
         ------
         InvalidValueError
-            If the residual is so strong that the iteration does not settle.
+            If the residual is so strong that the iteration does not converge.
         """
         raw = as_points(xy_raw, 2)
         camera = self.camera_at(magnification)

@@ -1,4 +1,4 @@
-"""Recordings to be made: which frames, when, at which magnification and pose."""
+"""Plans of recordings: which frames, when, at which magnification and pose."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in ran
 def specimen_for(
     kind: str, pixel_size_m: float, image_width: int, seed: int = 0
 ) -> tuple[Specimen, float | None]:
-    """Specimen of a kind, and the square size in m where it is the grid.
+    """Return the specimen of a kind, and the square size in m if it is the grid.
 
     Raises
     ------
@@ -108,7 +108,7 @@ class RecordingPlan:
         return len(self.frames)
 
     def render(self, index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Image of a frame; raises as :func:`~semcal_ros.synthetic.render.render_frame`."""
+        """Render a frame; raises as :func:`~semcal_ros.synthetic.render.render_frame`."""
         frame = self.frames[index]
         specimen: Specimen
         if frame.square_m is not None:
@@ -146,7 +146,7 @@ def calibration_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> RecordingPlan:
-    """The grid at several magnifications, ``views`` poses each, the first of them untilted."""
+    """Plan the grid at several magnifications, ``views`` poses each, the first one untilted."""
     _require_positive("views per magnification", views)
     frames: list[PlannedFrame] = []
     for number, g in enumerate(magnifications):
@@ -177,7 +177,7 @@ def drift_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> RecordingPlan:
-    """One magnification and pose under drift; without ``interval_s`` there is no pause."""
+    """Plan one magnification and pose under drift; without ``interval_s`` there is no pause."""
     return _fixed_pose(
         microscope, [magnification] * frames, kind, interval_s, drift, pose, detector, seed
     )
@@ -196,7 +196,7 @@ def zoom_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> RecordingPlan:
-    """A geometric sweep of the magnification over one region and pose (by default 8 deg tilted)."""
+    """Plan a geometric sweep of the magnification over one region and pose (by default tilted by 8 deg)."""
     _require_positive("frames", frames)
     sweep = np.geomspace(first_magnification, last_magnification, frames).round(1)
     tilted = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
@@ -214,7 +214,7 @@ def steps_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> RecordingPlan:
-    """``frames`` at each of several magnifications without a pause, each on the grid region that suits it."""
+    """Plan ``frames`` at each of several magnifications without a pause, each on the grid region that suits it."""
     _require_positive("frames", frames)
     plane = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
     period_s = microscope.timing.acquisition_time_s

@@ -44,7 +44,7 @@ class Pose:
 
     @staticmethod
     def flat(t_m: ArrayLike = (0.0, 0.0, 0.0), rotation_rad: float = 0.0) -> Pose:
-        """Untilted plane, turned about the beam."""
+        """Return an untilted plane, rotated about the beam."""
         return Pose(rotation_about_beam(rotation_rad), np.asarray(t_m, dtype=np.float64))
 
     @staticmethod
@@ -54,7 +54,7 @@ class Pose:
         rotation_rad: float,
         t_m: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Pose:
-        """Plane turned about the beam by ``rotation_rad``, then tilted.
+        """Return a plane rotated about the beam by ``rotation_rad``, then tilted.
 
         ``azimuth_rad`` is the direction of the tilt axis in the image plane, from x towards y.
         """
@@ -72,12 +72,12 @@ class Pose:
         return math.acos(min(1.0, max(-1.0, float(self.R[2, 2]))))
 
     def sem_from_specimen(self, xy_m: ArrayLike) -> Array:
-        """Sem-frame points (n, 3) of specimen-plane points (n, 2), m."""
+        """Map specimen-plane points (n, 2) to sem-frame points (n, 3), m."""
         return as_points(xy_m, 2) @ self.R[:, :2].T + self.t_m
 
 
 def rotation_about_beam(angle_rad: float) -> Array:
-    """(3, 3) rotation about z, from x towards y."""
+    """Return the (3, 3) rotation about z, from x towards y."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -94,7 +94,7 @@ def random_poses(
     offset_fraction: float = 0.02,
     first_flat: bool = True,
 ) -> tuple[Pose, ...]:
-    """Poses of the board for a calibration at one magnification, the same for the same seed.
+    """Draw poses of the board for a calibration at one magnification, the same for the same seed.
 
     Parameters
     ----------

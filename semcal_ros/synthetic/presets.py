@@ -80,7 +80,7 @@ PRESETS: Mapping[str, VirtualMicroscope] = MappingProxyType(_build())
 
 
 def preset(name: str) -> VirtualMicroscope:
-    """Microscope of that name.
+    """Return the microscope with this name.
 
     Raises
     ------

@@ -43,7 +43,7 @@ def render_frame(
     detector: Detector = _DEFAULT_DETECTOR,
     supersampling: int | None = None,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Image of a specimen, each pixel taken at its own time.
+    """Render an image of a specimen, each pixel taken at its own time.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def render_frame(
     detector
         Image formation.
     supersampling
-        Samples per pixel and direction; None takes what the specimen asks for.
+        Samples per pixel and direction; None takes the specimen's own.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def render_reflectivity(
 
 
 def _at_lines(drift: DriftFunction, time_s: Array) -> Array:
-    """Drift at every line of samples, asked for once per distinct time."""
+    """Return the drift at every line of samples, evaluated once per distinct time."""
     distinct, where = np.unique(time_s, return_inverse=True)
     return np.asarray(drift(distinct), dtype=np.float64)[where.ravel()]
 
@@ -145,7 +145,7 @@ def _pass_groups(
     """(seconds from the mean of all passes, weight) of the groups of passes drawn as one."""
     timing: ScanTiming = microscope.timing
     passes = np.arange(timing.averages)
-    # Several looks per pass: a vibration must not hide by being in step with the passes.
+    # Several samples per pass: a vibration in step with the passes must not go unnoticed.
     looks = np.linspace(0.0, timing.averages, _LOOKS_PER_PASS * timing.averages + 1)
     path_m = np.diff(np.asarray(drift(start_time_s + looks * timing.frame_time_s)), axis=0)
     m = microscope.camera_at(magnification).m

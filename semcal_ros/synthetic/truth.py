@@ -1,4 +1,4 @@
-"""What a virtual recording shows, as plain values for a file beside it.
+"""The ground truth of a virtual recording, as plain values for a file beside it.
 
 Keys carry their unit; everything is SI or px. The dictionary holds::
 
@@ -35,7 +35,7 @@ TRUTH_SCHEMA = "semcal_ros/truth/1"
 
 
 def parameters_of(microscope: VirtualMicroscope, magnification: float) -> dict[str, Any]:
-    """True camera parameters at a magnification, as listed above."""
+    """Return the true camera parameters at a magnification, as listed above."""
     camera = microscope.camera_at(magnification)
     residual, growth = microscope.residual, microscope.residual_growth(magnification)
     return {
@@ -55,7 +55,7 @@ def parameters_of(microscope: VirtualMicroscope, magnification: float) -> dict[s
 
 
 def truth_of(plan: RecordingPlan) -> dict[str, Any]:
-    """Truth of a recording as lists, numbers and strings, ready for JSON."""
+    """Return the truth of a recording as lists, numbers and strings, ready for JSON."""
     microscope = plan.microscope
     magnifications = sorted({frame.magnification for frame in plan.frames})
     return {

@@ -1,1 +1,1 @@
-"""What the virtual SEM looks at: grid, gold on carbon, target, cantilever, ball."""
+"""The specimens of the virtual SEM: grid, gold on carbon, target, cantilever, ball."""

@@ -56,11 +56,11 @@ class Turning:
     Parameters
     ----------
     duration_s
-        Of one round of the whole movement.
+        Duration of one period of the whole movement, s.
     roll_rad, yaw_rad
         Amplitudes of the turn about the tip's axis and about y.
     rolls, yaws
-        Periods of them in one round; of different number, so that directions fill an area.
+        Number of their periods in this time; they differ, so that the directions fill an area.
     travel_m
         Amplitude of the remaining shift, x, y and z.
     centre_m
@@ -89,7 +89,7 @@ class Turning:
 
 @dataclass(frozen=True)
 class BallFrame:
-    """One frame: when it begins, s, and its magnification."""
+    """One frame: its start time, s, and its magnification."""
 
     start_time_s: float
     magnification: float
@@ -104,7 +104,7 @@ class BallPlan:
     microscope, specimen, motion, drift, detector, seed
         What is recorded.
     frames
-        When, and how much magnified.
+        Start times and magnifications.
     """
 
     microscope: VirtualMicroscope
@@ -154,7 +154,7 @@ class BallPlan:
     def _box(
         self, rays: RayLattice, start_time_s: float
     ) -> tuple[tuple[int, int], tuple[int, int]] | None:
-        """Rows and columns (padded) outside of which there is background only."""
+        """Return the rows and columns (padded) outside which there is only background."""
         timing, body = self.microscope.timing, self.specimen
         times = start_time_s + np.linspace(0.0, timing.acquisition_time_s, 3)
         corners = []
@@ -166,7 +166,7 @@ class BallPlan:
         sem = np.einsum("tij,nj->tni", rotation, np.concatenate(corners)) + place[:, None]
         camera = rays.camera
         xy = camera.project_ideal(sem.reshape(-1, 3))
-        # Distortion moves the field by per cents; the middle of it hardly.
+        # Distortion moves the field by a few per cent, its middle hardly at all.
         low, high = xy.min(axis=0), xy.max(axis=0)
         size = np.array([camera.width, camera.height])
         margin = 4.0 + 0.03 * size[0]
@@ -248,7 +248,7 @@ def _compute_yield(
     cosine = np.maximum(-np.sum(unit * normal[hit], axis=1), _STEEPEST)
     at = origin[hit] + along[hit, None] * direction[hit]
     bright = body.reflectivity * body.texture(at) / cosine**body.slope_power
-    # What is bright at the limb levels off below the full yield.
+    # The bright limb levels off below the full yield.
     out[line[hit], column[hit]] = np.minimum(bright, 1.0)
     return out
 
@@ -256,7 +256,7 @@ def _compute_yield(
 def _find_near(
     body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
 ) -> Mask:
-    """Which rays can meet the body at all: by the distance from its outline in parallel projection."""
+    """Find the rays that can meet the body, by the distance from its outline in parallel projection."""
     w = (1.0 + rho * place[:, 2])[:, None]
     dx, dy = x - place[:, :1] / w, y - place[:, 1:2] / w
     axis = rotation[:, :2, 0]
@@ -294,7 +294,7 @@ def ball_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> BallPlan:
-    """The recording of section 4.4 of Malti et al. (2012): a 900 nm ball from 9000x to 10 000x.
+    """Plan the recording of section 4.4 of Malti et al. (2012): a 900 nm ball from 9000x to 10 000x.
 
     The magnification rises in equal parts of the recording; the movement fills its duration once. Without
     ``interval_s`` there is no pause between frames.

@@ -20,7 +20,7 @@ _TILE = 128
 
 @dataclass(frozen=True)
 class BallOnTip:
-    """A ball at the origin of the body frame that sticks on a conical tip along +x.
+    """A ball at the origin of the body frame on a conical tip along +x.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class BallOnTip:
     tip_radius_m, tip_slope
         Radius of the tip at the ball's centre and its growth per length.
     tip_length_m
-        Where the tip ends.
+        Distance of the tip's end from the ball's centre.
     grain_m
         Size of the texture's cells.
     contrast
@@ -54,7 +54,7 @@ class BallOnTip:
     seed: int = 0
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """Where rays meet the surface first.
+        """Find where rays first meet the surface.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class BallOnTip:
 
 @lru_cache(maxsize=2)
 def _make_noise(seed: int) -> Image:
-    """Periodic noise of unit spread: grains of two sizes."""
+    """Make periodic noise with unit standard deviation from grains of two sizes."""
     rng = np.random.default_rng(seed)
     white = rng.standard_normal((2, _TILE, _TILE, _TILE), dtype=np.float32)
     fine, coarse = (

@@ -127,14 +127,14 @@ class CantileverScene:
         if self.shape == "parabola":
             return np.asarray(inside**2 + 2.0 * beyond)
         a = self.load
-        # The slope does not change any more beyond the load.
+        # Beyond the load the slope is constant.
         whole = 3.0 * a - 1.0 + (1.0 - a) ** 3
         bent = 3.0 * a * inside**2 - inside**3 + np.maximum(inside - a, 0.0) ** 3
         return np.asarray((bent + 3.0 * a**2 * beyond) / whole)
 
     @property
     def end_x_m(self) -> float:
-        """Where the end is along the axis at rest: the arc length is conserved."""
+        """Position of the end along the axis at rest: the arc length is conserved."""
         u = np.linspace(0.0, 1.0, 401)
         slope = np.gradient(self.bending(u), u)
         share = 0.5 * float(np.mean(slope[:-1] ** 2 + slope[1:] ** 2)) / 2.0
@@ -150,7 +150,7 @@ class CantileverScene:
         parts = [_soften_edge(across, y_width), _soften_edge(x_m - self.end_x_m, x_width)]
         inside = np.minimum(-across, self.end_x_m - x_m)
         self._lay(seen, self.beam, parts, inside)
-        # The beam goes on inside of the holder, so that no seam is seen.
+        # The beam continues inside the holder, so that no seam is visible.
         self._lay(seen, self.holder, [_soften_edge(x_m, x_width)], -x_m)
         if self.gap_m is not None:
             self._lay_pusher(seen, x_m, y_m, x_width, y_width)
@@ -169,7 +169,7 @@ class CantileverScene:
         self._lay(seen, self.pusher, parts, np.minimum(front - y, np.minimum(x - first, last - x)))
 
     def _lay(self, seen: Array, level: float, parts: Sequence[Array], inside: Array) -> None:
-        """Lay something bright over the picture; ``inside`` is the distance from its edges."""
+        """Draw a bright shape over the image; ``inside`` is the distance from its edges."""
         cover = parts[0]
         for part in parts[1:]:
             cover = cover * part
@@ -290,7 +290,7 @@ def cantilever_plan(
     detector: Detector | None = None,
     seed: int = 0,
 ) -> CantileverPlan:
-    """The experiment of the paper: in each pose, frames at all magnifications one after the other.
+    """Plan the experiment of the paper: in each pose, frames at all magnifications one after the other.
 
     Parameters
     ----------
@@ -300,14 +300,14 @@ def cantilever_plan(
         The beam; its deflection and the gap of the pusher are set in each pose.
     magnifications, pushes, largest_deflection_m, frames_per_pose
         The poses: fractions of the largest deflection, and frames of each at each magnification.
-        Where a fraction is 0 the pusher does not touch.
+        At a fraction of 0 the pusher does not touch the beam.
     view
         What lies in the middle of the field: the middle of the beam, its last two thirds of a field
         with the end, or the first with the base.
     rotation_rad
         Of the beam in the image.
     interval_s
-        From frame to frame; at least an acquisition is taken.
+        Time from frame to frame; at least the acquisition time.
     drift, detector, seed
         As for other recordings.
 

@@ -75,7 +75,7 @@ class GoldOnCarbon:
     def _octave(
         self, octave: int, texel_m: float, pixel_m: float, x_m: Array, y_m: Array
     ) -> tuple[Image | np.float32, Image | np.float32]:
-        """What the particles of one octave cover, and their light (already times the cover)."""
+        """Return the cover of the particles of one octave, and their light (already times the cover)."""
         pyramid, mean = _make_pyramid(self.seed)
         level = max(0, math.floor(math.log2(max(0.5 * pixel_m / texel_m, 1.0))))
         if level >= len(pyramid):
@@ -95,7 +95,7 @@ class GoldOnCarbon:
 
 
 def _wrap(u: Array, shift: float, size: float) -> Image:
-    """Coordinates reduced to one tile while they still have all their digits."""
+    """Reduce coordinates to one tile before they are rounded to single precision."""
     # Texel centres are at integers, so the border of the tile, where all levels agree, is at -0.5.
     u += shift * size - 0.5
     u -= size * np.floor(u / size)
@@ -104,7 +104,7 @@ def _wrap(u: Array, shift: float, size: float) -> Image:
 
 @lru_cache(maxsize=4)
 def _make_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
-    """Levels (n, n, 2) of cover and light, each half the size of the last, and their means (2,)."""
+    """Make levels (n, n, 2) of cover and light, each half the size of the last, and their means (2,)."""
     tile = _draw_tile(np.random.default_rng([seed, 1]))
     levels = [tile]
     while len(levels[-1]) > 8:
@@ -125,7 +125,7 @@ def _blur_periodic(tile: Image, sigma: float) -> Image:
 
 
 def _draw_tile(rng: np.random.Generator) -> Image:
-    """One periodic tile (n, n, 2): cover in 0..1, and light = cover times brightness."""
+    """Draw one periodic tile (n, n, 2): cover in 0..1, and light = cover times brightness."""
     span = np.arange(-_MARGIN, _MARGIN + 1)
     tile = np.zeros((_TILE, _TILE, 2), dtype=np.float32)
     covered = 0.0
@@ -146,7 +146,7 @@ def _draw_tile(rng: np.random.Generator) -> Image:
 
 
 def _draw_particle(distance: Array, radius: float, brightness: float) -> tuple[Image, Image]:
-    """A ball as secondary electrons show it: brighter at its rim, its edge two texels wide."""
+    """Draw a ball as secondary electrons show it: brighter at its rim, its edge two texels wide."""
     cover = np.clip((radius - distance) / 2.0 + 0.5, 0.0, 1.0)
     rim = np.minimum(distance / radius, 1.0) ** 4
     light = cover * brightness * (0.72 + 0.28 * rim)

@@ -1,4 +1,4 @@
-"""What the renderer needs of a specimen, and the two simplest: the chess grid and an even one."""
+"""The interface of a specimen, and the two simplest: the chess grid and a uniform one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LARGEST_SQUARE = 0.155  # of the image width: at least six squares are in view
 
 
 class Specimen(Protocol):
-    """What the renderer needs of a specimen."""
+    """The interface that the renderer needs of a specimen."""
 
     @property
     def supersampling(self) -> int:
@@ -44,7 +44,7 @@ class Specimen(Protocol):
 
 @dataclass(frozen=True)
 class FlatSpecimen:
-    """The same reflectivity everywhere."""
+    """A specimen with the same reflectivity everywhere."""
 
     value: float = 0.5
 
@@ -89,7 +89,7 @@ class ChessGrid:
 
 
 def _filter_wave(u: Array, width: float) -> Array:
-    """Square wave of period 2, +1 on (0, 1) and -1 on (1, 2), averaged over a box of that width."""
+    """Return a square wave of period 2, +1 on (0, 1) and -1 on (1, 2), averaged over a box of this width."""
     if width >= 1.0:
         return (_integrate_wave(u + 0.5 * width) - _integrate_wave(u - 0.5 * width)) / width
     phase = u - 0.5
@@ -108,7 +108,7 @@ def _integrate_wave(u: Array) -> Array:
 
 
 def square_for(pixel_size_m: float, image_width: int = 512) -> float:
-    """Square size in m that an operator would choose: the largest with six squares in view."""
+    """Return the square size in m that an operator would choose: the largest with six squares in view."""
     limit = _LARGEST_SQUARE * image_width * pixel_size_m
     fitting = [square for square in SQUARES_M if square <= limit]
     return max(fitting, default=min(SQUARES_M))

@@ -1,6 +1,6 @@
-"""Which point of the specimen every sample of a frame looks at.
+"""The point of the specimen that every sample of a frame shows.
 
-Undistortion is smooth, so it is computed at the nodes of a coarse lattice and brought to every line
+Undistortion is smooth, so it is computed at the nodes of a coarse lattice and interpolated to every line
 of samples by a quintic spline. The specimen plane and the drift are met exactly at every line, at
 the nodes along it; a second spline gives the samples in between, at the cost of one matrix product
 per coordinate. The splines are wrong by less than 1e-8 px where the camera model is the whole
@@ -132,7 +132,7 @@ class PlaneLattice:
         )
 
     def displaced(self, left_m: Array, right_m: Array) -> tuple[Array, Array]:
-        """Specimen coordinates at the nodes when the specimen is displaced while it is scanned.
+        """Return the specimen coordinates at the nodes of a specimen displaced during its scan.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class PlaneLattice:
 def trace_ray_lattice(
     microscope: VirtualMicroscope, magnification: float, supersampling: int, pad: int
 ) -> RayLattice:
-    """Rays of a frame; kept for the last few magnifications.
+    """Trace the rays of a frame; cached for the last few magnifications.
 
     Raises
     ------
@@ -204,14 +204,14 @@ def trace_ray_lattice(
 
 
 def _place_nodes(pixels: int, pad: int) -> Array:
-    """Nodes over an image side, pad included."""
+    """Place nodes over an image side, pad included."""
     first, last = -0.5 - pad, pixels - 0.5 + pad
     spacing = max(_NODE_SPACING_PX, pixels / _MOST_INTERVALS)
     return np.linspace(first, last, max(2 * _DEGREE, round((last - first) / spacing) + 1))
 
 
 def _make_spline_basis(nodes: Array, samples: Array) -> Array:
-    """(nodes, samples) matrix from values at the nodes to a spline's values at the samples."""
+    """Return the (nodes, samples) matrix from values at the nodes to a spline's values at the samples."""
     spline = make_interp_spline(nodes, np.eye(len(nodes)), k=_DEGREE)
     return np.ascontiguousarray(spline(samples).T)
 
