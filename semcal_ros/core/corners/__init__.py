@@ -1,4 +1,4 @@
-"""Automatic corners of an endless chess board."""
+"""Automatic detection of the corners of an endless chess board."""
 
 from __future__ import annotations
 

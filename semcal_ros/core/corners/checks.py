@@ -1,4 +1,4 @@
-"""Fitted corners, and the checks that each of them has to pass."""
+"""Fitted corners, and the checks that each of them must pass."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ __all__ = [
 ]
 
 
-# Parts of another board are off by up to 0.3 squares, how far lattices reach for a corner; local
+# Parts of another board are off by up to 0.3 squares, the search radius of a growing lattice; local
 # maps predict the next corners across a gap to a few hundredths of a square.
 CONTINUED = 0.05
 # Predictions with a larger variance than this reach too far across the gap.
 LEVERAGE_MAX = 25.0
-# Fewer corners were predicted from those across the gap already; that they agree is known.
+# Smaller parts were predicted from the corners across the gap already, and agree with them.
 PART_MIN = 4
 
 
 def select_connected(fitted: FittedCorners, keep: Mask) -> Mask:
-    """The largest part of the lattice, and the others that continue it; (n,) true for these.
+    """Select the largest part of the lattice and the parts that continue it; (n,) true for these.
 
-    Where two boards meet, growing a lattice goes on from one to the other, but no corner in between
-    agrees with its neighbours. Debris parts a board as well, but then the maps of one part predict
-    the other.
+    Where two boards meet, a lattice grows from one into the other, but no corner in between agrees
+    with its neighbours. Debris also divides a board, but then the maps of one part predict the
+    other.
     """
     cells = fitted.cells
     low = cells[keep].min(axis=0)
@@ -63,7 +63,7 @@ def select_connected(fitted: FittedCorners, keep: Mask) -> Mask:
 
 
 def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
-    """Whether the corners around a part are where the joined ones predict them."""
+    """Return whether the corners of a part lie where the joined ones predict them."""
     cells, xy = fitted.cells, fitted.fit.xy
     maps = fit_local_maps(cells[other], cells[joined], xy[joined])
     near = maps.usable & (maps.leverage < LEVERAGE_MAX)
@@ -103,9 +103,10 @@ MISFIT_MAX = 0.12
 IMBALANCE_MAX = 15.0
 # The median of that chi-square, 2 ln 2.
 IMBALANCE_MEDIAN = 1.39
-# Stains of the board and the model's own shortcomings, relative to half the contrast.
+# Stains of the board and shortcomings of the model, relative to half the contrast.
 UNLIKE_MAX = 0.05
-# Beyond the border of a board all squares are alike: the fourth at its corners differs by one.
+# Beyond the border of a board all squares have one grey value, so that opposite squares differ by
+# the whole contrast.
 BORDER = 0.5
 # Noise alone exceeds four sigmas once in 15000 corners, but the spread is that of all corners and
 # its tails are longer than a normal distribution's.
@@ -117,7 +118,7 @@ CORNERS_MIN = 6
 
 @dataclass(frozen=True)
 class FittedCorners:
-    """Cells with their local maps, pixels, fits, and which of them are credible."""
+    """Cells with their local maps, pixels and fits, and which of them are credible."""
 
     cells: Indices
     maps: LocalMaps
@@ -126,7 +127,7 @@ class FittedCorners:
     good: Mask
 
     def select(self, keep: Mask) -> FittedCorners:
-        """Those where ``keep`` is true."""
+        """Return the corners where ``keep`` is true."""
         return FittedCorners(
             self.cells[keep],
             self.maps.select(keep),
@@ -137,7 +138,7 @@ class FittedCorners:
 
     @staticmethod
     def join(first: FittedCorners, second: FittedCorners) -> FittedCorners:
-        """Both sets."""
+        """Return the corners of both sets."""
         return FittedCorners(
             np.concatenate([first.cells, second.cells]),
             LocalMaps.join([first.maps, second.maps]),
@@ -148,7 +149,7 @@ class FittedCorners:
 
 
 def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) -> Mask:
-    """Fits that settled near the prediction, with the right sign of contrast."""
+    """Select fits that settled near the prediction with the right sign of contrast; (n,)."""
     norm = np.linalg.norm(maps.axes, axis=2)
     spacing = np.abs(maps.cell_px2) / norm.max(axis=1)
     expected = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
@@ -175,18 +176,18 @@ def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array3
 
 
 def contrast_signs(cells: Indices) -> Array:
-    """(n,) 1 for cells of even i + j, -1 for the others: the sign of the contrast alternates."""
+    """Return (n,) 1 for cells of even i + j and -1 for the others, as the contrast alternates."""
     return np.where(cells.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def find_undisturbed(fitted: FittedCorners) -> Mask:
-    """Corners whose pixels the model explains: no debris, no border of the board.
+    """Select corners whose pixels the model explains: no debris, no border of the board; (n,).
 
-    In a picture with little noise the model's own shortcomings are significant everywhere, so that
-    the excess must also be a visible part of the contrast.
+    In an image with little noise the shortcomings of the model are significant everywhere, so the
+    excess must also be a visible part of the contrast.
     """
     fit = fitted.fit
-    # Those on the border of a small board may be half of all, and would pass for the usual.
+    # Half of the corners of a small board may lie on its border, and would set the median.
     good = fitted.good & (fit.unlike < BORDER)
     if not np.any(good):
         return good
@@ -198,10 +199,10 @@ def find_undisturbed(fitted: FittedCorners) -> Mask:
 
 
 def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
-    """Corners with opposite squares of the same grey value and edges as sharp as elsewhere.
+    """Select corners with opposite squares of the same grey value and edges as sharp as elsewhere.
 
-    A grain in one square hardly shows in the sum of the squared residuals of a noisy picture, but
-    shifts the corner by many sigmas.
+    A grain in one square hardly shows in the sum of the squared residuals of a noisy image, but
+    shifts the corner by many standard deviations.
     """
     usual = max(pooled, float(np.median(fit.imbalance[good])) / IMBALANCE_MEDIAN)
     uneven = (fit.imbalance > IMBALANCE_MAX * usual) & (fit.unlike > UNLIKE_MAX)
@@ -212,7 +213,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
 
 
 def inflate_variance(fit: CornerFit, keep: Mask) -> Array:
-    """Factor on the covariances: the pooled misfit, or a corner's own if that is far larger."""
+    """Return (n,) factors on the covariances: the pooled misfit, or a far larger one of a corner."""
     pooled = float(np.median(fit.chi2[keep]))
     significant = pooled * (1.0 + 3.0 * np.sqrt(2.0 / fit.freedom))
     return np.where(fit.chi2 > significant, fit.chi2, pooled)

@@ -36,11 +36,12 @@ BAND_BLURS = 3.0
 # weights within a factor of four of those at the mean of the dark pixels. A safeguard, not a
 # measurement.
 LEAST_OF_FLOOR = 0.25
-# Large enough to hide what a call costs, small enough to keep the arrays in a cache.
+# Large enough to hide the cost of a call, small enough to keep the arrays in the cache.
 BLOCK_PIXELS = 24000
-# Where pixels say next to nothing, rounding must not decide what is a large pull.
+# Part of the prior's variance: where pixels carry almost no information, rounding must not decide
+# whether a pull is large.
 PULL_LEAST = 0.02
-# For the first pass, which knows no noise yet.
+# Variance of a pixel in the first pass, before the noise is known.
 ASSUMED_VARIANCE = 0.02
 
 
@@ -57,7 +58,7 @@ class NoiseModel:
     dark: float
 
     def variance(self, value: Array32) -> Array32:
-        """Variance at the grey values ``value``, same shape."""
+        """Return the variance at the grey values ``value``, in the same shape."""
         variance = np.float32(self.slope) * (value - np.float32(self.dark))
         variance += np.float32(self.floor)
         least = np.float32(LEAST_OF_FLOOR * self.floor)
@@ -79,7 +80,7 @@ class CornerFit:
         (n, 7) and (n, 8) parameters of :mod:`semcal_ros.core.corners.edge_model`, positions
         relative to the window.
     normal
-        (n, 15, 15) normal matrices, the prior's share included.
+        (n, 15, 15) normal matrices, including the prior.
     chi2
         (n,) weighted squared residuals per degree of freedom.
     freedom
@@ -87,16 +88,16 @@ class CornerFit:
     shift_px
         (n,) size of the last step; large where the fit has not settled.
     coverage
-        (n,) part of the window in the image.
+        (n,) part of the window that lies in the image.
     level, variance
-        (n, 2) mean grey value and squared residual of the pixels darker and of those brighter than
-        the middle.
+        (n, 2) mean grey value and mean squared residual of the pixels darker and of the pixels
+        brighter than the middle.
     imbalance, unlike
-        (n,) score test of opposite squares that differ in grey value, chi-square with two degrees
-        of freedom in units of ``chi2``, and by how much of the contrast they do; zeros where
-        that was not asked for.
+        (n,) score test of a difference in grey value between opposite squares, a chi-square with
+        two degrees of freedom in units of ``chi2``, and the difference as a part of the contrast;
+        zeros where the squares were not compared.
     blur_pull
-        (n,) how far the blur is from its prior, in standard deviations.
+        (n,) distance of the blur from its prior, in standard deviations.
     """
 
     xy: Array
@@ -115,7 +116,7 @@ class CornerFit:
     blur_pull: Array
 
     def select(self, keep: Mask) -> CornerFit:
-        """The fits of the corners where ``keep`` is true."""
+        """Return the fits of the corners where ``keep`` is true."""
         return CornerFit(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @property
@@ -125,7 +126,7 @@ class CornerFit:
 
     @staticmethod
     def join(parts: Sequence[CornerFit]) -> CornerFit:
-        """All fits of several sets."""
+        """Concatenate the fits of several sets."""
         return CornerFit(
             *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CornerFit))
         )
@@ -147,7 +148,7 @@ class CornerFit:
 
 
 def rough_start(windows: PixelWindows, prior: Prior, sign: Array) -> Array:
-    """(n, 15) parameters to begin with: the prior's, and the mean and scatter of the pixels.
+    """Return (n, 15) starting values: those of the prior, and the mean and scatter of the pixels.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def rough_start(windows: PixelWindows, prior: Prior, sign: Array) -> Array:
 
 
 def band_px(blur_px: float) -> float:
-    """Half-width of the band of pixels along an edge that tell where it is."""
+    """Return the half-width of the band of pixels that determine the position of an edge."""
     return max(BAND_MIN_PX, BAND_BLURS * blur_px + 1.0)
 
 
@@ -178,24 +179,24 @@ def fit_corners(
     iterations: int,
     judged: bool = False,
 ) -> CornerFit:
-    """Gauss-Newton on position, edge directions, blur, grey levels and their gradients.
+    """Fit position, edge directions, blur, grey levels and gradients of corners by Gauss-Newton.
 
     Parameters
     ----------
     windows
         Pixels of the corners.
     geometry
-        What the lattice says about them.
+        Spacing and curvature of their edges from the lattice.
     start
-        (n, 15) first parameters, or None for the prior's.
+        (n, 15) starting values, or None for those of the prior.
     prior
         Prior of the parameters.
     noise
-        Noise for the weights; None for equal weights.
+        Noise model for the weights; None for equal weights.
     iterations
         Number of steps.
     judged
-        Whether opposite squares are to be compared.
+        Whether to compare opposite squares.
     """
     block = max(1, BLOCK_PIXELS // windows.x.shape[1])
     parts = []
@@ -233,7 +234,7 @@ def _fit_block(
     axes[:, [0, 1, LOG_BLUR], [0, 1, 2]] = 1.0
     for left in range(iterations - 1, -1, -1):
         # Levels and variances are those before the last step, which is tiny where the fit has
-        # settled.
+        # converged.
         jacobian, model = evaluate(windows, geometry, nonlinear, linear)
         weight = windows.valid if noise is None else windows.valid / noise.variance(model)
         residual = windows.value - model
@@ -254,7 +255,7 @@ def _fit_block(
     fitted = np.sum(1.0 - known / np.einsum("nii->ni", normal), axis=1)
     freedom = np.maximum(windows.valid.sum(axis=1, dtype=np.float64) - fitted, 1.0)
     chi2 = np.einsum("np,np,np->n", weight, residual, residual).astype(np.float64)
-    # The last step changes it as the normal equations, without the prior's share, promise.
+    # The last step changes chi2 as the normal equations predict without the prior.
     change = np.einsum("na,na->n", step, right - 2.0 * pull + known * step)
     chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
     level, variance = _statistics(windows, residual, model, freedom)
@@ -282,23 +283,23 @@ def _fit_block(
 
 
 def _pull(log_blur: Array, variance: Array, prior: Prior) -> Array:
-    """(n,) how far the blur is from its prior, in standard deviations of what a fit makes of it."""
+    """Return (n,) distances of the blur from its prior, in standard deviations of fitted values."""
     deviation = prior.deviation[:, LOG_BLUR]
-    # A fit under a prior scatters by the prior's variance less its own.
+    # Values fitted under a prior scatter by the variance of the prior less that of the fit.
     spread = np.maximum(deviation**2 - variance, PULL_LEAST * deviation**2)
     return (log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread)
 
 
 def fit_noise(fit: CornerFit) -> NoiseModel:
-    """Noise as a function of the grey value, from the residuals of unweighted fits.
+    """Fit the noise as a function of the grey value to the residuals of unweighted fits.
 
-    It is a line through the noise of the dark and that of the bright pixels; medians over the
-    corners keep some corners under debris from mattering.
+    The model is a line through the noise of the dark pixels and that of the bright ones. Medians
+    over the corners make it robust against a few corners under debris.
     """
     dark, bright = (float(v) for v in np.median(fit.level, axis=0))
     low, high = (float(v) for v in np.median(fit.variance, axis=0))
     spread = max(bright - dark, 1e-6)
-    # Rounding to grey levels is never without noise.
+    # The variance stays positive even in an image without noise.
     tiny = 1e-6 * spread**2
     low, high = max(low, tiny), max(high, tiny)
     if high < low:
@@ -309,7 +310,7 @@ def fit_noise(fit: CornerFit) -> NoiseModel:
 def _statistics(
     windows: PixelWindows, residual: Array32, model: Array32, freedom: Array
 ) -> tuple[Array, Array]:
-    """Levels and variances of the pixels darker and brighter than the middle, both (n, 2)."""
+    """Return levels and variances of the pixels darker and brighter than the middle, (n, 2) each."""
     valid = windows.valid
     total = np.maximum(valid.sum(axis=1, keepdims=True), 1.0)
     middle = (model * valid).sum(axis=1, keepdims=True) / total

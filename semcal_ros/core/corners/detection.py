@@ -24,12 +24,13 @@ SCALES_PX = (2.5, 1.5, 4.2, 7.0)
 # A view with fewer corners is refused; it is also the least that the search for the distortion
 # centre uses.
 MINIMUM_CORNERS = 12
-# A lattice that fills this part of the image is not going to be beaten at another scale.
+# A lattice that covers this part of the image will not be surpassed at another scale.
 FILLED = 0.6
-# Debris and missing squares may spoil so many corners without another scale being better.
+# Debris and missing squares may spoil the other corners without another scale being better.
 CONVINCING = 0.6
 
-# A larger part of the corners off the lattice is a second board rather than what debris cut off.
+# If a larger part of the corners does not continue the lattice, that is a second board rather than a
+# part cut off by debris.
 FOREIGN_MAX = 0.15
 
 
@@ -64,7 +65,7 @@ class LatticeDetection:
     blur_px
         Median standard deviation of the blur of the edges, px.
     rejected_xy
-        (k, 2) where lattice points in the image that were not good enough were expected, px.
+        (k, 2) expected positions of lattice points in the image that were rejected, px.
     """
 
     ij: Indices
@@ -78,14 +79,14 @@ class LatticeDetection:
 
     @property
     def rejected(self) -> int:
-        """Number of lattice points in the image that were not good enough."""
+        """Number of lattice points in the image that were rejected."""
         return len(self.rejected_xy)
 
 
 def find_lattice(
     image: ArrayLike, *, databar_rows: int = 0
 ) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Find the corners of a chess board seen in part or as a whole, at any rotation and tilt.
+    """Find the corners of a chess board, of which all or a part is in view, at any rotation and tilt.
 
     Candidates are maxima of minus the determinant of the Hessian at several scales; a lattice is
     grown from them with local prediction and the alternating sign of the contrast; every corner in
@@ -97,12 +98,11 @@ def find_lattice(
     image
         (h, w) grey values, 8 or 16 bit integers or floats.
     databar_rows
-        Rows at the bottom that do not belong to the picture.
+        Rows at the bottom that do not belong to the image.
 
     Returns
     -------
-    The corners, or a rejection if the image is blank, saturated, shows no lattice, or one that goes
-    over into another.
+    The corners, or a rejection if the image is blank or saturated, or shows no lattice or two.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def find_lattice(
 
 
 def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, float] | None:
-    """The best corners of all scales, and the part of the image that their lattice covers."""
+    """Find the best corners over all scales, and the part of the image that their lattice covers."""
     candidates: list[tuple[float, Lattice]] = []
     best: tuple[RefinedCorners, float] | None = None
     for scale in SCALES_PX:
@@ -169,7 +169,7 @@ def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, 
 def _better(
     best: tuple[RefinedCorners, float] | None, other: RefinedCorners | None, filled: float
 ) -> tuple[RefinedCorners, float] | None:
-    """The one with more corners that are worth more."""
+    """Return the candidate with the larger product of number of corners and quality."""
     if other is None:
         return best
     if best is None or len(other.ij) * other.quality > len(best[0].ij) * best[0].quality:
@@ -178,7 +178,7 @@ def _better(
 
 
 def _covered_share(lattice: Lattice, size: tuple[int, int]) -> float:
-    """Part of the image that the cells of a lattice cover."""
+    """Return the part of the image that the cells of a lattice cover."""
     area = float(np.abs(np.linalg.det(lattice.axes)).sum())
     return area / (size[0] * size[1])
 

@@ -4,12 +4,13 @@
     S(d) = sum_k (-1)^k erf((d - k h) / (sqrt(2) w)),  k = -1, 0, 1
     B(d) = sum_k n(d - k h)
 
-with ``d1`` and ``d2`` the distances from the edges along i and j, ``h`` the distance of the next
+with ``d1`` and ``d2`` the distances from the edges along i and j, ``h`` the distance to the next
 parallel edge, ``w`` the blur and ``n`` the derivative of the blurred step. The edges bend as the
-local lattice map says, but for a small correction that large squares can determine; a plane and a
-gradient of the contrast take shading. ``g / a0`` is how far the edges lie outside of the bright
-squares: a slope of the specimen, or the bright rim that an electron microscope shows at every step.
-It moves the two halves of an edge to opposite sides and matters where only one half is in view.
+local lattice map does, except for a small correction that large squares can determine; a plane and
+a gradient of the contrast describe shading. ``g / a0`` is the distance by which the edges lie
+outside of the bright squares, because of a slope of the specimen or the bright rim that an electron
+microscope shows at every step. It moves the two halves of an edge to opposite sides and matters
+where only one half is in view.
 """
 
 from __future__ import annotations
@@ -57,16 +58,16 @@ GROWTH = slice(13, 15)
 
 @dataclass(frozen=True)
 class EdgeGeometry:
-    """What the lattice says about each corner and the fit does not change.
+    """Geometry of each corner from the lattice, which the fit does not change.
 
     Attributes
     ----------
     spacing_1, spacing_2
-        (n,) distance to the next edge parallel to the edge along i, along j.
+        (n,) distance to the next edge parallel to the edge along i and to that along j, px.
     curvature_1, curvature_2
         (n,) signed curvature of the edges, 1/px.
     length
-        (n,) typical arm length, px, which makes the derivatives alike in size.
+        (n,) typical arm length, px, which scales the derivatives to similar magnitudes.
     """
 
     spacing_1: Array
@@ -76,12 +77,12 @@ class EdgeGeometry:
     length: Array
 
     def select(self, rows: slice) -> EdgeGeometry:
-        """A slice of the corners."""
+        """Return a slice of the corners."""
         return EdgeGeometry(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
     def from_map(cls, axes: Array, bend: Array) -> EdgeGeometry:
-        """From first and second derivatives of the local lattice map, both (n, 2, 2)."""
+        """Make it from first and second derivatives of the local lattice map, both (n, 2, 2)."""
         norm = np.linalg.norm(axes, axis=2)
         cell = np.linalg.det(axes)
         tangent = axes / norm[:, :, None]
@@ -97,18 +98,18 @@ class EdgeGeometry:
 
 
 # erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
-# 7.1.26, error below 1.5e-7, single precision's own. It shares the exponential with the derivative.
+# 7.1.26, error below 1.5e-7, that of single precision. It shares the exponential with the derivative.
 ERF_P = np.float32(0.3275911)
 # c1 to c5.
 ERF_C = tuple(
     np.float32(c) for c in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
 )
-# Closer parallel edges than this, in blur widths, reach into the window half a square away.
+# Parallel edges closer than this, in blur widths, affect the window, which ends half a square away.
 NEIGHBOUR_BLURS = 8.0
 
 
 def _erf_and_bell(z: Array32) -> tuple[Array32, Array32]:
-    """erf(z / sqrt 2) and exp(-z^2 / 2)."""
+    """Return erf(z / sqrt 2) and exp(-z^2 / 2)."""
     bell = np.exp(np.float32(-0.5) * z * z)
     t = np.float32(1.0) / (np.float32(1.0) + (ERF_P * np.float32(np.sqrt(0.5))) * np.abs(z))
     tail = t * ERF_C[4]
@@ -122,7 +123,7 @@ def _erf_and_bell(z: Array32) -> tuple[Array32, Array32]:
 def _profile(
     distance: Array32, spacing: Array32, blur: Array32
 ) -> tuple[Array32, Array32, Array32, Array32]:
-    """S, dS/dd, dS/dlog(w) and B."""
+    """Return S, dS/dd, dS/dlog(w) and B."""
     scale = np.float32(np.sqrt(2.0 / np.pi)) / blur
     value, slope = _erf_and_bell(distance / blur)
     slope *= scale
@@ -145,7 +146,7 @@ def _profile(
 def evaluate(
     windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, linear: Array | None
 ) -> tuple[Array32, Array32]:
-    """Derivatives of the model at the pixels, and the model.
+    """Evaluate the model at the pixels, with its derivatives.
 
     Returns
     -------

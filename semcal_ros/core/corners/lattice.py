@@ -1,4 +1,4 @@
-"""From saddle points to a lattice: seeds by symmetry, then growing with local prediction."""
+"""Grow a lattice through saddle points: seeds by symmetry, then steps by local prediction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Lattice", "grow_best_lattice"]
 # shells of a square lattice (4 + 4 + 4 + 8). A tilt and spurious saddle points move the four
 # neighbours beyond the first shell.
 NEIGHBOURS = 20
-# Saddle directions of skewed cells are off by some degrees, and noise adds to it.
+# In skewed cells the directions of a saddle are off by a few degrees, and noise adds to that.
 COSINE_MIN = float(np.cos(np.deg2rad(28.0)))
 # Sum of two opposite arms over their length. Where a neighbour is missing, arms of one and of three
 # squares give 0.5.
@@ -55,7 +55,7 @@ class Lattice:
     axes: Array
 
     def select(self, keep: Mask) -> Lattice:
-        """The points where ``keep`` is true."""
+        """Return the points where ``keep`` is true."""
         return Lattice(self.ij[keep], self.xy[keep], self.axes[keep])
 
 
@@ -66,7 +66,7 @@ class _Seeds:
 
 
 def grow_best_lattice(saddles: SaddlePoints, image_size: tuple[int, int]) -> Lattice | None:
-    """The largest lattice that grows from one of several seeds, or None if there is no seed.
+    """Return the largest lattice grown from one of several seeds, or None without a seed.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def grow_best_lattice(saddles: SaddlePoints, image_size: tuple[int, int]) -> Lat
 
 
 def _asymptotic_directions(hessian: Array) -> Array:
-    """(n, 2, 2) unit vectors of zero second derivative: the edges of a chess corner."""
+    """Return (n, 2, 2) unit vectors of zero second derivative: the edges of a chess corner."""
     values, vectors = np.linalg.eigh(hessian)
     low, high = np.maximum(-values[:, 0], 0.0), np.maximum(values[:, 1], 0.0)
     total = np.maximum(low + high, np.finfo(float).tiny)
@@ -106,7 +106,7 @@ def _asymptotic_directions(hessian: Array) -> Array:
 
 
 def _find_seeds(saddles: SaddlePoints, tree: cKDTree) -> _Seeds:
-    """Points with four symmetric neighbours along the edges, of opposite contrast."""
+    """Find points with four symmetric neighbours of opposite contrast along the edges."""
     n = min(len(saddles.xy), SEED_POINTS)
     xy, hessian = saddles.xy[:n], saddles.hessian[:n]
     queried = tree.query(xy, k=min(NEIGHBOURS + 1, len(saddles.xy)))
@@ -136,7 +136,7 @@ def _find_seeds(saddles: SaddlePoints, tree: cKDTree) -> _Seeds:
 
 
 class _Growth:
-    """Wavefront growing: each round predicts and looks up all free neighbours of the last one."""
+    """Wavefront growing: each round predicts and looks up the free neighbours of the last front."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class _Growth:
         cells: Indices = np.stack([keys // side, keys % side], axis=1)
         inside = np.all((cells >= 1) & (cells < side - 1), axis=1)
         cells = cells[inside]
-        # A second look, with more neighbours known, finds what the first prediction missed.
+        # A second attempt, with more neighbours known, finds what the first prediction missed.
         free = (self._member[cells[:, 0], cells[:, 1]] < 0) & (
             self._tried[cells[:, 0], cells[:, 1]] < 3
         )
@@ -214,7 +214,7 @@ class _Growth:
         return total / count[:, None], axes / count[:, None, None]
 
     def _look_up(self, cells: Indices, predicted: Array, axes: Array) -> Indices:
-        """Index of the saddle of the right sign at each prediction; -1 where there is none."""
+        """Return the index of the saddle of the right sign at each prediction, or -1 without one."""
         radius = SEARCH_RADIUS * np.linalg.norm(axes, axis=2).min(axis=1)
         k = min(2, len(self._saddles.xy))
         queried = self._tree.query(predicted, k=k)
@@ -229,7 +229,7 @@ class _Growth:
         choice = np.argmin(np.where(usable, distance, np.inf), axis=1)
         row = np.arange(len(cells))
         members = np.where(usable[row, choice], index[row, choice], -1)
-        # Two cells that claim the same saddle: the nearer prediction gets it.
+        # Where two cells claim the same saddle, the nearer prediction gets it.
         order = np.argsort(distance[row, choice], kind="stable")
         _, first = np.unique(members[order], return_index=True)
         keep = np.zeros(len(cells), dtype=bool)
@@ -237,7 +237,7 @@ class _Growth:
         return np.where(keep, members, -1)
 
     def _update_axes(self, cells: Indices) -> None:
-        """Local axes of new cells: differences to neighbours, blended with inherited ones."""
+        """Set the axes of new cells: differences to neighbours, averaged with the inherited axes."""
         here = self._saddles.xy[self._member[cells[:, 0], cells[:, 1]]]
         axes = self._axes[cells[:, 0], cells[:, 1]]
         for axis in range(2):

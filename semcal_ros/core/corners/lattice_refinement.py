@@ -1,4 +1,4 @@
-"""From a grown lattice to every corner in view at sub-pixel accuracy: fill in, fit, reject."""
+"""Refine a grown lattice to every corner in view at sub-pixel accuracy: fill in, fit, reject."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ SAMPLE = 40
 HOPELESS = 0.25
 # Corners from which the spreads are learnt again, when noise and blur are known.
 SECOND_SAMPLE = 160
-# Corners nearer to the frame than this part of a square, besides the margin, may fail.
+# Corners nearer to the frame than the margin and this part of a square may fail.
 RIM_PART = 0.1
 
 
@@ -69,11 +69,11 @@ class RefinedCorners:
     blur_px
         Median blur.
     quality
-        Part of the corners expected inside the lattice's extent that passed.
+        Part of the corners expected well inside of the image that passed.
     rejected_xy
-        (k, 2) where lattice points in the image that did not pass were expected, px.
+        (k, 2) expected positions of lattice points in the image that did not pass, px.
     foreign
-        Number of corners that are good, but do not continue this lattice.
+        Number of good corners that do not continue this lattice.
     """
 
     ij: Indices
@@ -87,7 +87,7 @@ class RefinedCorners:
 
 @dataclass(frozen=True)
 class _Knowledge:
-    """What the first fits taught about the image."""
+    """What the first fits reveal about the image."""
 
     noise: NoiseModel
     learnt: Learnt
@@ -99,11 +99,11 @@ class _Knowledge:
 
 
 def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
-    """Fit all corners of a lattice, drop bad ones, look for missed ones; None if under six remain.
+    """Fit all corners of a lattice, drop bad ones, add missed ones; None if fewer than six remain.
 
-    A sample of the corners teaches noise, blur and what varies how much over the image; with this
-    all corners are fitted, then missed ones beside them, then all again with the shading and the
-    bends that the neighbours show.
+    Noise, blur and the spread of the nuisance parameters over the image are learnt from a sample
+    of the corners. With these all corners are fitted, then the missed ones beside them, then all
+    again with the shading and the bends that the neighbours show.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
 
 
 def _quality(fitted: FittedCorners, image: Array32) -> float:
-    """Part of the corners that passed, of those expected well inside of the image."""
+    """Return the part that passed of the corners expected well inside of the image."""
     size = np.array([image.shape[1], image.shape[0]])
     slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
     expected = np.all((fitted.maps.xy >= slack) & (fitted.maps.xy <= size - 1 - slack), axis=1)
@@ -160,7 +160,7 @@ def _quality(fitted: FittedCorners, image: Array32) -> float:
 
 
 def _better_maps(grown: Lattice, first: FittedCorners) -> LocalMaps:
-    """Local maps with what was fitted in place of the saddle points."""
+    """Fit local maps through the fitted positions in place of the saddle points."""
     count = len(first.cells)
     xy = np.concatenate([first.fit.xy, grown.xy[count:]])
     known = np.concatenate([first.good, np.ones(len(xy) - count, dtype=bool)])
@@ -168,13 +168,13 @@ def _better_maps(grown: Lattice, first: FittedCorners) -> LocalMaps:
 
 
 def _shuffle(lattice: Lattice) -> Lattice:
-    """The lattice in random but fixed order, so that its first corners are a fair sample."""
+    """Return the lattice in random but fixed order, so that its first corners are a fair sample."""
     order = np.random.default_rng(0).permutation(len(lattice.ij))
     return Lattice(lattice.ij[order], lattice.xy[order], lattice.axes[order])
 
 
 def _find_failed(cells: Indices, xy: Array, passed: Indices, image: Array32) -> Array:
-    """(k, 2) positions in the image of the cells, each once, that are not among those passed."""
+    """Return (k, 2) positions in the image of the cells, each once, that did not pass."""
     keys, first = np.unique(_keys(cells), return_index=True)
     size = np.array([image.shape[1], image.shape[0]])
     inside = np.all((xy[first] >= 0) & (xy[first] <= size - 1), axis=1)
@@ -198,7 +198,7 @@ def _result(
 
 
 def _plausible(lattice: Lattice) -> Lattice:
-    """The lattice without points that do not fit their neighbours."""
+    """Return the lattice without points that do not fit their neighbours."""
     maps = fit_local_maps(lattice.ij, lattice.ij, lattice.xy)
     miss = np.linalg.norm(maps.xy - lattice.xy, axis=1)
     spacing = np.linalg.norm(lattice.axes, axis=2).min(axis=1)
@@ -230,7 +230,7 @@ def _learn(first: FittedCorners) -> _Knowledge:
 
 
 def _relearn(known: FittedCorners, knowledge: _Knowledge) -> _Knowledge:
-    """What the second fits teach beyond the first, which knew neither blur nor noise."""
+    """Learn again from the second fits; the first ones knew neither blur nor noise."""
     few = known.select(np.arange(len(known.cells)) < SECOND_SAMPLE)
     geometry = EdgeGeometry.from_map(few.maps.axes, few.maps.bend)
     prior = knowledge.learnt.prior(few.maps, geometry)
@@ -300,5 +300,5 @@ def _fill(image: Array32, known: FittedCorners, knowledge: _Knowledge) -> Fitted
 
 
 def _keys(cells: Indices) -> Indices:
-    """One number per cell; indices stay far below 2^20."""
+    """Return one number per cell; indices stay far below 2^20."""
     return np.asarray(cells[:, 0] * (1 << 21) + cells[:, 1], dtype=np.int64)

@@ -57,13 +57,13 @@ class LocalMaps:
 
     @property
     def usable(self) -> Mask:
-        """Where enough neighbours, not all in a row, determine a regular map."""
+        """(n,) whether enough neighbours, not all in a row, determine a regular map."""
         norm = np.linalg.norm(self.axes, axis=2)
         skew = self.cell_px2 / np.maximum(norm[:, 0] * norm[:, 1], 1e-9)
         return (self.support >= SUPPORT_MIN) & (norm.min(axis=1) > 1.0) & (skew > 0.2)
 
     def select(self, keep: Mask) -> LocalMaps:
-        """The maps of the cells where ``keep`` is true."""
+        """Return the maps of the cells where ``keep`` is true."""
         return LocalMaps(
             self.xy[keep],
             self.axes[keep],
@@ -74,7 +74,7 @@ class LocalMaps:
 
     @staticmethod
     def join(parts: Sequence[LocalMaps]) -> LocalMaps:
-        """All maps of several sets."""
+        """Concatenate the maps of several sets."""
         return LocalMaps(
             *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(LocalMaps))
         )
@@ -83,7 +83,7 @@ class LocalMaps:
 def fit_local_maps(
     cells: Indices, ij: Indices, xy: Array, *, leave_out_self: bool = True
 ) -> LocalMaps:
-    """Weighted least-squares polynomials around ``cells`` through the known corners near them.
+    """Fit weighted least-squares polynomials through the known corners near ``cells``.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def fit_local_maps(
     ij, xy
         (k, 2) indices and (k, 2) positions of the known corners.
     leave_out_self
-        Do not use a known corner for its own prediction.
+        Whether to predict a known corner without its own position.
     """
     cubic = len(ij) < CUBIC_BELOW
     reach = 3 if cubic else 2
@@ -130,9 +130,10 @@ def fit_local_maps(
 
 
 def _solve(solver: Array, which: Indices, xy: Array, member: Indices) -> Array:
-    """(n, terms, 2) coefficients: ``solver[which]`` times the positions of the neighbours.
+    """Return (n, terms, 2) coefficients: ``solver[which]`` times the positions of the neighbours.
 
-    Inside of a lattice all cells share one solver, which makes one large product of many small.
+    Inside of a lattice all cells share one solver, so that one large product replaces many small
+    ones.
     """
     common = int(np.argmax(np.bincount(which)))
     solution = np.stack([coordinate[member] @ solver[common].T for coordinate in xy.T], axis=2)
@@ -142,13 +143,13 @@ def _solve(solver: Array, which: Indices, xy: Array, member: Indices) -> Array:
 
 
 def _solvers(patterns: Array, basis: Array, ridge: Array) -> Array:
-    """(k, terms, m) maps from values to coefficients for each row of weights in (k, m)."""
+    """Return (k, terms, m) maps from values to coefficients, one for each row of (k, m) weights."""
     terms = basis.shape[1]
     pairs = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     normal = (patterns @ pairs).reshape(-1, terms, terms)
     normal += np.diag(ridge + 1e-9)
     solver = np.linalg.inv(normal) @ (basis.T * patterns[:, None, :])
-    # Positions relative to the neighbours' mean keep the ridge off the zeroth order.
+    # Taking positions relative to the mean of the neighbours keeps the ridge off the zeroth order.
     mean = patterns / np.maximum(patterns.sum(axis=1, keepdims=True), 1e-12)
     solver -= solver.sum(axis=2, keepdims=True) * mean[:, None]
     solver[:, 0] += mean

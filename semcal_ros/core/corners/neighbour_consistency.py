@@ -1,4 +1,4 @@
-"""Which corners agree with what their neighbours predict, given the covariances of all of them."""
+"""Test of corners against the predictions of their neighbours, given the covariances of all."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ __all__ = ["find_consistent"]
 
 # Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
 MISS_SIGMAS = (5.0, 4.3, 3.7)
-# What local maps through squares of LARGE_SQUARE_PX miss of the strongest distortion, per standard
-# deviation of a single corner's prediction; it grows as the third power of the square.
+# Error of local maps through squares of LARGE_SQUARE_PX under the strongest distortion, per standard
+# deviation of the prediction of a single corner; it grows as the third power of the square.
 MAP_ERROR_PX = 2.0
-# It is concentrated in parts of the image, where it is so many times its median.
+# That error is concentrated in parts of the image, where it is this many times its median.
 MAP_ERROR_RATIO = 4.0
-# Smooth distortions and perspectives are followed to a few hundredths of a pixel; twice as many
-# corners as terms keep single corners from bending it.
+# A trend of this degree follows smooth distortions and perspectives to a few hundredths of a pixel.
+# Twice as many corners as terms keep single corners from bending it.
 TREND_DEGREE = 5
-# Medians of the square of a length in the plane, in variances per axis.
+# Median of the squared length of a normal vector in the plane, 2 ln 2, in variances per axis.
 MEDIAN_SQUARE = 1.386
 
 
 def find_consistent(fitted: FittedCorners) -> Mask:
-    """Corners that agree with what their neighbours predict.
+    """Select corners that agree with the predictions of their neighbours; (n,).
 
-    Later looks are without the worst, which spoil the predictions of their neighbours.
+    Later passes leave out the worst corners, which spoil the predictions of their neighbours.
     """
     good = fitted.good
     for sigmas in MISS_SIGMAS:
@@ -40,10 +40,10 @@ def find_consistent(fitted: FittedCorners) -> Mask:
 
 
 def _agree_with_neighbours(fitted: FittedCorners, good: Mask, sigmas: float) -> Mask:
-    """Corners within so many standard deviations of what the good ones around them predict."""
+    """Select corners within ``sigmas`` of the predictions of the good corners around them; (n,)."""
     cells, xy = fitted.cells, fitted.fit.xy
-    # Local maps extrapolate at the rim and are coarse in large squares, where only what is left
-    # beside a smooth trend is small enough for them.
+    # Local maps extrapolate at the rim and are coarse in large squares. There only the residuals of
+    # a smooth trend are small enough for them.
     rest = xy - _trend(cells, good, xy)
     maps = fit_local_maps(cells, cells[good], rest[good])
     # The neighbours are as uncertain as the corner itself.
@@ -56,16 +56,16 @@ def _agree_with_neighbours(fitted: FittedCorners, good: Mask, sigmas: float) -> 
 
 
 def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:
-    """(n,) squared lengths of (n, 2) vectors in standard deviations."""
+    """Return (n,) squared lengths of (n, 2) vectors in standard deviations."""
     x, y = miss.T
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
 def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Array) -> Array:
-    """(n,) what the maps miss besides noise, px, from what the image as a whole shows of it.
+    """Estimate the (n,) errors of the maps besides noise, px, from the image as a whole.
 
-    An uneven board is uneven everywhere; a distortion too strong for the maps is so in a part of
+    An uneven board is uneven everywhere; a distortion is too strong for the maps only in a part of
     the image.
     """
     excess = max(float(np.median(squared[good])) / MEDIAN_SQUARE - 1.0, 0.0)
@@ -77,7 +77,7 @@ def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Ar
 
 
 def _trend(cells: Indices, good: Mask, xy: Array) -> Array:
-    """(n, 2) positions of all cells on a polynomial through the good corners."""
+    """Return (n, 2) positions of all cells on a polynomial through the good corners."""
     known = int(good.sum())
     degree = max(d for d in range(1, TREND_DEGREE + 1) if d == 1 or (d + 1) * (d + 2) <= known)
     low, high = cells.min(axis=0), cells.max(axis=0)

@@ -1,8 +1,8 @@
-"""What an image as a whole tells about the nuisance parameters of each of its corners.
+"""Priors of the nuisance parameters of each corner, learnt from the image as a whole.
 
-A single small or blurred corner hardly tells a gradient of the contrast or a bend of an edge from a
-shift of its own. How much such parameters vary over the image, though, is well determined by all
-corners together, so that their spread is learnt and used as a prior.
+A single small or blurred corner hardly separates a gradient of the contrast or a bend of an edge
+from a shift of its own. The variation of such parameters over the image, however, is well
+determined by all corners together, so their spread is learnt and used as a prior.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ PARAMETERS = NONLINEAR + LINEAR
 ANGLE_PRIOR = 0.03
 # Logarithm of the blur: a factor of 1.6 about the first guess.
 LOG_BLUR_PRIOR = 0.5
-# What a quadratic or cubic map through few, one-sided neighbours misses of a strong distortion
-# grows as the third power.
+# Error of a quadratic or cubic map through few, one-sided neighbours under a strong distortion; it
+# grows as the third power of the square.
 SAGITTA_PRIOR_PX = 0.5
 # Side of the squares for which that holds: about a quarter of a 512 px image.
 LARGE_SQUARE_PX = 130.0
@@ -72,7 +72,7 @@ class Prior:
     deviation: Array
 
     def near(self, parameters: Array) -> Prior:
-        """The same with directions within half a turn of those of (n, 15) ``parameters``."""
+        """Return the same prior with directions within half a turn of (n, 15) ``parameters``."""
         mean = self.mean.copy()
         turns = (parameters[:, ANGLES] - mean[:, ANGLES]) / (2.0 * np.pi)
         mean[:, ANGLES] += 2.0 * np.pi * np.round(turns)
@@ -95,7 +95,7 @@ class Learnt:
     spread: Array
 
     def prior(self, maps: LocalMaps, geometry: EdgeGeometry) -> Prior:
-        """Prior of corners whose local maps are given."""
+        """Return the prior of corners whose local maps are given."""
         loose = loose_prior(maps, geometry, 1.0)
         mean = loose.mean + self.common
         mean[:, LOG_BLUR] = self.common[LOG_BLUR]
@@ -103,7 +103,7 @@ class Learnt:
 
 
 def loose_prior(maps: LocalMaps, geometry: EdgeGeometry, blur_px: float) -> Prior:
-    """Prior before anything has been fitted: what is plausible for any image of a board."""
+    """Return the prior before any fit: what is plausible for any image of a board."""
     deviation = np.full((len(maps.xy), PARAMETERS), np.inf)
     deviation[:, ANGLES] = ANGLE_PRIOR
     deviation[:, LOG_BLUR] = LOG_BLUR_PRIOR
@@ -119,18 +119,18 @@ def loose_prior(maps: LocalMaps, geometry: EdgeGeometry, blur_px: float) -> Prio
 
 
 def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: float) -> Learnt:
-    """Common values and spreads from the fits of some corners.
+    """Learn common values and spreads from the fits of some corners.
 
     Parameters
     ----------
     parameters
-        (n, 15) fitted.
+        (n, 15) fitted values.
     normal
-        (n, 15, 15) normal matrices, the prior's share included.
+        (n, 15, 15) normal matrices, including the prior.
     used
         Prior of those fits.
     unit
-        Variance that the prior was weighted with against the pixels.
+        Variance of a pixel by which the prior was weighted.
     noise
         Variance of the residuals in the same measure.
     """
@@ -138,7 +138,7 @@ def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: flo
     common, spread = np.zeros(PARAMETERS), np.ones(PARAMETERS)
     for group in GROUPS:
         deviation = used.deviation[:, group]
-        # What the pixels alone say: the prior is taken off again.
+        # The information of the pixels alone, without the prior.
         share = np.maximum(information[:, group] - unit / deviation**2, 1e-9)
         own = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
             information[:, group] / share
@@ -154,7 +154,7 @@ def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: flo
 
 
 def _weighted_median(values: Array, weights: Array) -> Array:
-    """(m,) weighted medians of the columns of (n, m)."""
+    """Return the (m,) weighted medians of the columns of (n, m)."""
     order = np.argsort(values, axis=0)
     total = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
     middle = (total < 0.5 * total[-1]).sum(axis=0)
@@ -163,7 +163,7 @@ def _weighted_median(values: Array, weights: Array) -> Array:
 
 
 def _largest_spread(score: Array, variance: Array) -> float:
-    """The largest spread that scores with those variances of their own do not contradict."""
+    """Return the largest spread that scores with these variances do not contradict."""
     total = SPREADS[:, None] ** 2 + variance
     # Corners under debris count no more than others at three standard deviations.
     cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER)).sum(axis=1)
@@ -171,12 +171,12 @@ def _largest_spread(score: Array, variance: Array) -> float:
 
 
 def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) -> Prior:
-    """The prior with gradients of brightness and contrast taken from the neighbours' levels.
+    """Return the prior with gradients of brightness and contrast from the neighbours' levels.
 
     Parameters
     ----------
     prior
-        Prior so far.
+        Prior to start from.
     cells
         (n, 2) lattice indices.
     linear

@@ -15,9 +15,8 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 __all__ = ["LatticeStatus", "SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
 
 
-# Below this part of the response of the strong saddles a maximum is taken for noise. The response
-# is quadratic in the contrast, so corners with a third of the contrast of the strong ones still
-# count.
+# A maximum below this part of the response of the strong saddles counts as noise. The response is
+# quadratic in the contrast, so corners with a third of the contrast of the strong ones still count.
 RELATIVE_THRESHOLD = 0.1
 # Rank of the response that stands for the strong saddles: as many corners as a usable image has at
 # least, so that a few specks brighter than the board do not set the threshold.
@@ -45,7 +44,7 @@ class SaddlePoints:
     Attributes
     ----------
     xy
-        (n, 2) positions, px, good to a few tenths.
+        (n, 2) positions, px, accurate to a few tenths.
     hessian
         (n, 2, 2) Hessian of the smoothed image at the points.
     response
@@ -58,7 +57,7 @@ class SaddlePoints:
 
 
 def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
-    """Local maxima of ``-det(Hessian)`` of the image smoothed by a Gaussian.
+    """Find local maxima of ``-det(Hessian)`` of the image smoothed by a Gaussian.
 
     Parameters
     ----------
@@ -108,7 +107,7 @@ def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64],
     radius = max(1, round(1.2 * scale_px))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     peaks = (response >= cv2.dilate(response, kernel)) & (response > 0)
-    # The frame's own rim has no second derivative.
+    # There is no second derivative on the rim of the frame.
     peaks[[0, -1], :] = False
     peaks[:, [0, -1]] = False
     rows, columns = np.nonzero(peaks)
@@ -128,7 +127,7 @@ SMALLEST_SIDE = 32
 
 
 def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
-    """The image as (h, w) float32 without its databar.
+    """Return the image as (h, w) float32 without its databar.
 
     Raises
     ------
@@ -147,7 +146,7 @@ def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
 
 
 def screen_image(image: Image) -> Image | Rejection[LatticeStatus]:
-    """The image scaled to a contrast of about 1, unless it is blank or saturated."""
+    """Scale the image to a contrast of about 1, or reject it as blank or saturated."""
     sample = image[::2, ::2]
     if not np.all(np.isfinite(image)):
         return Rejection(LatticeStatus.NOT_FINITE, "the image has values that are not finite")
@@ -173,7 +172,7 @@ def screen_image(image: Image) -> Image | Rejection[LatticeStatus]:
 
 
 def _two_levels(sample: NDArray[np.float32]) -> bool:
-    """Whether both limits are common: a clean two-level board is not saturated."""
+    """Return whether both limits are common: a clean two-level board is not saturated."""
     top = float(np.mean(sample >= sample.max()))
     bottom = float(np.mean(sample <= sample.min()))
     return min(top, bottom) > 0.2

@@ -1,4 +1,4 @@
-"""Whether opposite squares of a corner have the same grey value, as those of a chess board do."""
+"""Test that opposite squares of a corner have the same grey value, as on a chess board."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def compare_opposite_squares(
     normal: Array,
     step: Array,
 ) -> tuple[Array, Array]:
-    """Score test of the two edge steps that the model has not: both squares beyond an edge brighter.
+    """Apply a score test of two steps that the model lacks: both squares beyond an edge brighter.
 
-    Nothing is fitted again: the residuals are projected on the new terms, less what the parameters
-    of the model take of them.
+    Nothing is fitted again: the residuals are projected on the two new terms, from which the
+    parameters of the model are eliminated.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def compare_opposite_squares(
     Returns
     -------
     statistic
-        (n,) chi-square with two degrees of freedom where squares are alike.
+        (n,) chi-square with two degrees of freedom where opposite squares are alike.
     difference
         (n,) the larger of the two steps, half the difference of grey value.
     """
@@ -53,7 +53,7 @@ def compare_opposite_squares(
     score = (sides @ residual[:, :, None])[:, :, 0] - np.einsum("nka,na->nk", shared, step)
     total = weight.sum(axis=1, dtype=np.float64)
     information = np.empty((len(x), 2, 2))
-    # The ridge is for a window of which only one side of an edge is in view.
+    # The ridge is for windows that show only one side of an edge.
     information[:, 0, 0] = information[:, 1, 1] = total * (1.0 + 1e-6)
     both = np.einsum("np,np->n", side_1, np.copysign(np.float32(1.0), side_2))
     information[:, 0, 1] = information[:, 1, 0] = both

@@ -1,4 +1,4 @@
-"""The pixels that tell about each corner: half a square around it, near its two edges."""
+"""The pixels that determine each corner: half a square around it, near its two edges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["PixelWindows", "gather_windows"]
 # Windows of neighbouring corners just touch, so that no pixel is used twice and the errors are
 # independent.
 HALF_WIDTH = 0.5
-# Boxes around corners are searched for their pixels so many at a time, to stay in the cache.
+# Number of pixels in the boxes that are searched at a time, to stay in the cache.
 BLOCK_PIXELS = 60000.0
 
 
@@ -33,7 +33,7 @@ class PixelWindows:
     valid
         (n, p) 1 for pixels in the window and in the image, 0 for padding.
     origin
-        (n, 2) the positions that the windows are centred on.
+        (n, 2) positions on which the windows are centred.
     coverage
         (n,) part of the window that lies in the image.
     """
@@ -46,12 +46,12 @@ class PixelWindows:
     coverage: Array
 
     def select(self, keep: Mask | slice) -> PixelWindows:
-        """The windows where ``keep`` is true, or a slice of them without a copy."""
+        """Return the windows where ``keep`` is true, or a slice of them without a copy."""
         return PixelWindows(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @staticmethod
     def join(parts: Sequence[PixelWindows]) -> PixelWindows:
-        """All windows of several sets, padded alike."""
+        """Concatenate the windows of several sets, padded to the same number of pixels."""
         pixels = max(part.x.shape[1] for part in parts)
 
         def padded(name: str) -> Array32:
@@ -76,7 +76,7 @@ class PixelWindows:
 def gather_windows(
     image: Array32, origin: Array, axes: Array, bend: Array, band_px: float
 ) -> PixelWindows:
-    """Pixels within half a square of each origin and within ``band_px`` of one of the two edges.
+    """Gather the pixels within half a square of each origin and ``band_px`` of one of its edges.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def gather_windows(
     axes, bend
         (n, 2, 2) first and second derivatives of the local lattice map.
     band_px
-        Half-width of the bands along the edges. Pixels farther from both edges do not tell where
-        the corner is.
+        Half-width of the bands along the edges. Pixels farther from both edges carry no
+        information on the position of the corner.
     """
     reach = int(np.ceil(HALF_WIDTH * np.abs(axes).sum(axis=1).max(initial=0.0))) + 1
     block = max(1, int(BLOCK_PIXELS / (2 * reach + 1) ** 2))
@@ -134,7 +134,7 @@ def _pack(
     origin: Array,
     coverage: Array,
 ) -> PixelWindows:
-    """The pixels marked in boxes (n, s, s) around ``start``, side by side."""
+    """Return the pixels marked in boxes (n, s, s) around ``start``, side by side."""
     side = inside.shape[1]
     count = np.count_nonzero(inside, axis=(1, 2))
     pixels = max(1, int(count.max(initial=1)))
