@@ -1,1 +1,1 @@
-"""Views of a grid to a magnification-continuous calibration with its covariance."""
+"""From views of a grid to a magnification-continuous calibration with its covariance."""

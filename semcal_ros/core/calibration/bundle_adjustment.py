@@ -33,7 +33,7 @@ _MAX_ITERATIONS = 60
 # Levenberg-Marquardt damping relative to the diagonal: nearly Gauss-Newton at the start, and from
 # rounding to steps of no length.
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
-# Decrease over its prediction, below which the quadratic model of a view has failed.
+# Ratio of actual to predicted decrease below which the quadratic model of a view has failed.
 _POOR_GAIN = 0.25
 # Steps by which the pose of such a view follows a new camera. It has to be near only: the next
 # iteration continues from there.
@@ -55,7 +55,7 @@ class BundleStatus(Enum):
 
 @dataclass(frozen=True)
 class BundleResult:
-    """Outcome of :func:`refine`.
+    """Result of :func:`refine`.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class BundleResult:
     information
         (M, 10, 10) information on each magnification's camera with the poses eliminated.
     gradient
-        (M, 10) the matching right-hand side (zero sum over a free camera at the optimum).
+        (M, 10) the matching right-hand side (its sum over a free camera is zero at the optimum).
     covariance
         (K, K) of theta for unit variance of the whitened residuals.
     height_variance_m2
@@ -102,7 +102,15 @@ class BundleResult:
 
 @dataclass(frozen=True)
 class _Step:
-    """A damped Gauss-Newton step, and the decrease of the cost that its quadratic model predicts for each view."""
+    """A damped Gauss-Newton step, and the decrease of cost that its quadratic model predicts.
+
+    Attributes
+    ----------
+    state
+        State after the step.
+    predicted, predicted_prior
+        (V,) predicted decrease for each view, and that of the prior of theta.
+    """
 
     state: State
     predicted: Array
@@ -133,8 +141,9 @@ def refine(
 ) -> BundleResult:
     """Minimise the robust reprojection error from ``state``.
 
-    With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost that ends the
-    iteration. Never raises for lack of convergence: the result says how it ended.
+    With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost that
+    ends the iteration. The function never raises for lack of convergence: the result says how it
+    ended.
     """
     costs = view_costs(problem, state)
     cost = float(costs.sum()) + prior_cost(problem, state)
@@ -172,11 +181,11 @@ def refine(
 def _refine_following_poses(
     problem: Problem, state: State, costs: Array, step: _Step
 ) -> tuple[State, Array]:
-    """The state after a step, and its costs per view.
+    """Return the state after a step, and its costs per view.
 
-    The tilt of a nearly flat view acts by its square, so that its quadratic model holds for very small steps only.
-    Where the model failed, the pose is adjusted to the new camera by itself; else a few such views would hold back
-    the rest.
+    The tilt of a nearly flat view acts through its square, so the quadratic model holds only for
+    very small steps. Where the model failed, the pose is adjusted to the new camera on its own;
+    otherwise a few such views would hold back the rest.
     """
     trial = step.state
     trial_costs = view_costs(problem, trial)
@@ -196,7 +205,7 @@ def _refine_following_poses(
 def _refine_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
 ) -> tuple[State, Array, int, BundleStatus]:
-    """Levenberg-Marquardt on each view by itself, for all views at once.
+    """Adjust the pose of each view on its own by Levenberg-Marquardt, for all views at once.
 
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
@@ -257,7 +266,7 @@ def _make_result(
 
 
 def _make_empty_result(problem: Problem, state: State) -> BundleResult:
-    """The result where some point has no projection at the start: nothing is known."""
+    """Return the result where some point has no projection at the start: nothing is known."""
     groups, size = len(problem.designs), len(state.theta)
     return BundleResult(
         state=state,

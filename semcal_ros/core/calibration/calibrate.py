@@ -51,7 +51,8 @@ METHODS = ("joint", "pda", "discrete")
 _MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 _MIN_VIEWS = 3
-# Residuals over the corners' sigmas beyond which the misfit is the model's and not a matter of these.
+# Ratio of residuals to the sigmas of the corners beyond which the misfit is due to the model and not
+# to these sigmas.
 _MISFIT = 3.0
 
 
@@ -76,7 +77,7 @@ class MethodOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """What a user chooses of a calibration.
+    """The choices that a user has for a calibration.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class CalibrationOptions:
         Options of the paper's methods.
     breakpoints
         Magnifications at which the microscope switches its scan range, so that scale, aspect and
-        skew jump (only ``"joint"``). A jump that the views ask for elsewhere is reported as a
+        skew jump (only ``"joint"``). A jump that the views indicate elsewhere is reported as a
         warning.
     residual
         Whether a residual field describes what the distortion parameters cannot (only
@@ -97,7 +98,7 @@ class CalibrationOptions:
     Raises
     ------
     InvalidValueError
-        For an unknown method or mode, or an option that the method does not have.
+        For an unknown method or mode, or an option that the method does not support.
     """
 
     method: str = "joint"
@@ -126,7 +127,7 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A calibration with what it was computed from.
+    """A calibration with the views from which it was computed.
 
     Attributes
     ----------
@@ -155,7 +156,7 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class _MethodFit:
-    """What the methods have in common: functions, covariance, and the same without one magnification."""
+    """The common result of all methods; ``without`` gives it without one magnification."""
 
     functions: Functions
     covariance: Array
@@ -168,7 +169,7 @@ class _MethodFit:
 
 
 def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
-    """The views in the order of their magnifications."""
+    """Return the views in the order of their magnifications, or raise if they are too few."""
     if not views:
         raise CalibrationError(
             "no usable view",
@@ -216,8 +217,8 @@ def calibrate_views(
         Weak prior knowledge; the defaults suit any SEM, and follow the views where their perspective is that of a
         photograph.
     on_stage
-        Called with the name of what begins and the fraction of the work that is done, 0 to 1 (only ``"joint"``, which
-        begins anew after leaving out views).
+        Called with the name of the stage that begins and the fraction of the work that is done, 0 to
+        1 (only ``"joint"``, which starts again after leaving out views).
 
     Raises
     ------
@@ -285,7 +286,7 @@ def _make_model(
 def _fit_without_outliers(
     setup: Setup, residual: str, on_stage: Callable[[str, float], None]
 ) -> tuple[JointFit, Setup, tuple[RejectedView, ...]]:
-    """The adjustment without the views that disagree with the others, and these."""
+    """Fit without the views that disagree with the others; also returns those views."""
     outliers: list[RejectedView] = []
     while True:
         fit = fit_joint(setup, residual, on_stage)
@@ -296,7 +297,7 @@ def _fit_without_outliers(
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
         ]
-        # At least two views of every magnification stay, so that this ends.
+        # At least two views of every magnification stay, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
 
@@ -404,7 +405,10 @@ def _describe_separate(g: float, centre: Any, result: BundleResult) -> dict[str,
 
 
 def _predict_held_out(setup: Setup, fit: _MethodFit, method: str) -> dict[float, float]:
-    """Error at each magnification under a calibration from all others; empty for a single magnification."""
+    """Return the error at each magnification under a calibration from all others.
+
+    The result is empty for a single magnification.
+    """
     out: dict[float, float] = {}
     count = len(setup.magnifications)
     if count < 2:
@@ -418,7 +422,7 @@ def _predict_held_out(setup: Setup, fit: _MethodFit, method: str) -> dict[float,
             height = fit.height_sigma_m[mine]
             poses = fit_poses(own, camera_at, height_sigma_m=height, starts=starts)
         except (CalibrationError, InvalidValueError):
-            # The method has no answer there: that is an infinite error, not a missing one.
+            # The method has no answer there: the error is infinite, not missing.
             out[float(g)] = float("inf")
             continue
         out.update(rms_by_magnification(poses))

@@ -78,13 +78,13 @@ def _with(state: State, values: Mapping[str, float]) -> State:
 
 
 def _fit_one(setup: Setup, tau_px: float | None) -> tuple[DistortionCentre, Problem, BundleResult]:
-    """Algorithm 2, steps 2 to 9, for a setup with a single magnification."""
+    """Run steps 2 to 9 of Algorithm 2 for a setup with a single magnification."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     functions = constant_functions(setup, {"scale": start.scale_factor})
     problem = build_problem(setup, functions, setup.views, setup.priors.height_sigma_m)
     state = State(stack_coefficients(functions), start.rotations, start.translations_m)
-    # Aspect and skew are freed only with the distortion, which they would otherwise imitate.
+    # Aspect and skew are freed only with the distortion, which they would imitate without it.
     held = _hold(problem, {"xi_r": 0.0, "xi_t": 0.0, "aspect": 1.0, "skew": 0.0})
     pinhole = adjust(held, resolve_mirrored_tilts(held, state)[0])
 
@@ -133,7 +133,7 @@ def fit_discrete(setup: Setup, *, tau_px: float | None = None) -> DiscreteFit:
 def table_functions(
     magnifications: Array, parameters: Array, covariances: Array
 ) -> tuple[dict[str, ContinuousFunction], Array]:
-    """Linear interpolation in log g between separate calibrations, with the covariance of all nodes.
+    """Interpolate linearly in log g between separate calibrations; covariance of all nodes.
 
     This is what the discrete calibrations of the literature offer between their magnifications.
     """
@@ -146,7 +146,7 @@ def table_functions(
 
 
 def _block_covariance(covariances: Sequence[Array] | Array) -> Array:
-    """(10 M, 10 M) covariance, parameter-major, of M independent nodes."""
+    """Return the (10 M, 10 M) covariance, parameter-major, of M independent nodes."""
     stacked = np.asarray(covariances)
     count, size = stacked.shape[0], stacked.shape[1]
     full = np.zeros((size, count, size, count))

@@ -31,7 +31,7 @@ _SIGNIFICANCE = 1e-3
 
 @dataclass(frozen=True)
 class DistortionCentre:
-    """Outcome of Algorithm 1.
+    """Result of Algorithm 1.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class DistortionCentre:
     homography_rms_px
         RMS residual of the homographies.
     noise_rms_px
-        RMS of what a smooth residual (cubic in the image) leaves: the noise of the corners.
+        RMS residual beside a smooth part (cubic in the image): the noise of the corners.
     p_value
         Probability of residuals as smooth as these without distortion.
     """
@@ -55,7 +55,7 @@ class DistortionCentre:
 
 
 def _radial_fundamental(board: Array, image: Array, from_image: Array) -> Array:
-    """(3, 3) matrix F with image' F board = 0 in normalised coordinates of both, unit norm, rank 2.
+    """Return the (3, 3) F with image' F board = 0 in normalised coordinates; unit norm, rank 2.
 
     Normalised 8-point algorithm. ``from_image`` normalises the image of all views alike, so that their matrices share
     the left epipole.
@@ -76,7 +76,7 @@ def _cubic_basis(image: Array) -> Array:
 
 
 def _smooth_part(view: GridView) -> tuple[Array, Array, int]:
-    """Homography residual, the same without its cubic part, and the number of cubic coefficients."""
+    """Return homography residuals, these without their cubic part, and the number of its terms."""
     h = fit_homography(view.board_xy_m, view.image_xy)
     residual = view.image_xy - transform_points(h, view.board_xy_m)
     basis = _cubic_basis(view.image_xy)
@@ -87,12 +87,12 @@ def _smooth_part(view: GridView) -> tuple[Array, Array, int]:
 def find_distortion_centre(
     views: Sequence[GridView], *, tau_px: float | None = None
 ) -> DistortionCentre:
-    """Algorithm 1 for the views of one magnification.
+    """Run Algorithm 1 on the views of one magnification.
 
     Parameters
     ----------
     views
-        Views of at least 12 corners each (the cubic needs 10); those with fewer are passed over.
+        Views of at least 12 corners each (the cubic needs 10); those with fewer are ignored.
     tau_px
         With a value, the paper's threshold on the RMS homography error decides instead of the F-test.
     """
@@ -107,7 +107,7 @@ def find_distortion_centre(
         residual_sum += float(np.sum(residual**2))
         noise_sum += float(np.sum(noise**2))
         corners += len(residual)
-        # 8 of the coefficients are spent on what the homography has already fitted.
+        # 8 of the coefficients describe what the homography has already fitted.
         smooth_freedom += coefficients - 8
     noise_freedom = max(2 * corners - 8 * len(usable) - smooth_freedom, 1)
     ratio = ((residual_sum - noise_sum) / smooth_freedom) / max(noise_sum / noise_freedom, 1e-300)

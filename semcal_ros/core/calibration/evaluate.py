@@ -1,7 +1,7 @@
-"""How well known cameras explain views of a grid: poses are fitted, cameras are not.
+"""Errors of views of a grid under known cameras: poses are fitted, cameras are not.
 
-This is the only figure by which calibrations are compared (design section 6.6): single parameters trade off against
-each other and against the poses.
+This is the only figure by which calibrations are compared (design section 6.6): single parameters
+trade off against each other and against the poses.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class ViewPose:
     rotations, translations_m
         (V, 3, 3) and (V, 3): sem frame from grid.
     residuals_px
-        One (n, 2) array per view: observed minus projected pixels, the residual field taken off both.
+        One (n, 2) array per view: observed minus projected pixels, both without the residual field.
     magnifications
         (V,) magnification of each view.
     converged
-        Whether the fit of the poses settled.
+        Whether the fit of the poses converged.
     """
 
     rotations: Array
@@ -60,7 +60,7 @@ def fit_poses(
     """Fit the pose of every view with the camera of its magnification held fixed.
 
     ``height_sigma_m`` is the prior 1-sigma of the heights, one number or (V,). ``starts`` are rotations (V, 3, 3) and
-    translations (V, 3) near the solution; without them both signs of the tilt are tried.
+    translations (V, 3) near the solution; without starts both signs of the tilt are tried.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def _select_best(fits: Sequence[BundleResult], starts: Indices, magnifications: 
 
 
 def rms_by_magnification(fit: ViewPose) -> dict[float, float]:
-    """RMS distance of the corners in px for each magnification, ascending."""
+    """Return the RMS distance of the corners in px for each magnification, ascending."""
     out: dict[float, float] = {}
     for g in np.unique(fit.magnifications):
         square = np.concatenate(

@@ -1,6 +1,6 @@
 """Starting values of a calibration: scales and poses from the affine part of every view.
 
-Only the nominal scale (magnification, image width, display width) is presumed, and zero distortion.
+They presume only the nominal scale (magnification, image width, display width) and zero distortion.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from semcal_ros.core.errors import CalibrationError
 __all__ = ["InitialValues", "initial_values", "pose_from_camera"]
 
 
-# Width of the field over the distance of the pivot. Noise and distortion imitate some hundredths; an SEM at 100x has
-# 0.06 to 0.15, a photographic lens about 1.
+# Ratio of the field width to the distance of the pivot. Noise and distortion imitate a few
+# hundredths; an SEM at 100x has 0.06 to 0.15, a photographic lens about 1.
 _WIDE = 0.3
 
 
 @dataclass(frozen=True)
 class InitialValues:
-    """Start of the adjustment.
+    """Starting values of the adjustment.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class InitialValues:
 
 
 def _estimate_rho(affines: Sequence[AffineView], rotations: Array, fallback: float) -> float:
-    """Least squares of |depth gradient| = rho * sin(tilt); the views with the largest fields dominate by weight."""
+    """Fit |depth gradient| = rho * sin(tilt) by least squares, weighted by the field of view."""
     gradient = np.array([np.linalg.norm(a.gradient) for a in affines])
     tilt = np.linalg.norm(rotations[:, 2, :2], axis=1)
     # Noise of the gradient grows with the scale, since it acts over a smaller field.
@@ -68,7 +68,7 @@ def _estimate_rho(affines: Sequence[AffineView], rotations: Array, fallback: flo
 def initial_values(
     views: Sequence[GridView], nominal_px_per_m: Array, centre_px: Array, rho_prior: float
 ) -> InitialValues:
-    """Starting values from views (V) and their nominal scales (V,) in px per m."""
+    """Estimate starting values from V views and their nominal scales (V,) in px per m."""
     affines = [view_affine(v.board_xy_m, v.image_xy, centre_px) for v in views]
     ratios = np.array([a.scale for a in affines]) / nominal_px_per_m
     factor = float(np.median(ratios))
@@ -76,7 +76,8 @@ def initial_values(
     rho = _estimate_rho(affines, rotations, rho_prior)
     board = np.stack([a.board_xy_m for a in affines])
     translations = -np.einsum("vij,vj->vi", rotations[:, :, :2], board)
-    # The grid point seen at the image centre lies on the axis: at the reference plane, unless its scale tells more.
+    # The grid point at the image centre lies on the axis: at the reference plane, unless its scale
+    # determines its height.
     wide = _is_wide(rho, (2.0 * centre_px[0] + 1.0) / min(a.scale for a in affines))
     if wide:
         translations[:, 2] += (factor / ratios - 1.0) / rho
@@ -88,7 +89,7 @@ def _is_wide(rho: float, field_m: float) -> bool:
 
 
 def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
-    """Two candidate poses of a view under a known camera.
+    """Estimate two candidate poses of a view under a known camera.
 
     Returns
     -------
@@ -117,7 +118,8 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     rotation = rotation_from_affine(metric, affine.gradient)
     both = np.stack([rotation, mirrored_tilt(rotation[None])[0]])
     offset = np.linalg.solve(camera.ideal_from_sem_jacobian, centre - principal)
-    # The grid plane passes through the reference plane on the axis of the image centre, unless its scale tells more.
+    # The grid plane passes through the reference plane on the axis of the image centre, unless its
+    # scale determines its height.
     depth = 1.0
     if _is_wide(camera.rho, camera.width / camera.m):
         depth = 1.0 / float(np.linalg.norm(metric, 2))

@@ -1,7 +1,7 @@
 """The default calibration: one adjustment over all images at all magnifications.
 
 Its unknowns are the coefficients of the continuous functions themselves, so a magnification with few views borrows
-from its neighbours and nothing has to be interpolated afterwards (design section 6.4).
+from its neighbours, and nothing needs to be interpolated afterwards (design section 6.4).
 """
 
 from __future__ import annotations
@@ -66,24 +66,26 @@ _RESERVE, _LEAST_SIZE = 2, 5
 # Updates of the spread of the heights before anything is selected. It has to be near only, since
 # every later adjustment updates it again.
 _HEIGHT_UPDATES = 4
-# Spread of heights over its prior: a micrometre is below what any view shows, and nobody has millimetres of depth of
-# field.
+# Limits of the spread of heights, relative to its prior: a micrometre is less than any view can
+# show, and no instrument has a depth of field of more than millimetres.
 _LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
 # Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
 # mount, less than tilts that are set on purpose.
 _FLAT_RAD = np.radians(5.0)
-# Fewer views than this say nothing about a spread of their own.
+# Fewer views than this do not determine a spread of their own.
 _ENOUGH_HEIGHTS = 4
-# For what only has to be near: signs of tilts, poses, moderately flexible functions.
+# Corners per view for what only needs to be near: signs of tilts, poses, start functions.
 _ENOUGH_CORNERS = 60
-# Tolerance of the adjustments on the way; only the last one has to be exact.
+# Tolerance of the intermediate adjustments; only the last one needs to be exact.
 _COARSE = 1e-6
 # Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
 # change; with both fixed the turns converge.
 _MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
-# Change of the corrections of all corners, RMS in px, that is none: a fiftieth of good corners' noise.
+# RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
+# the noise of good corners.
 _FIELD_SETTLED_PX = 1e-3
-# The depth gradient of weakly tilted views says little; a start beyond 5 mm would be noise.
+# Largest start of rho, 1/m. The depth gradient of weakly tilted views is noisy, and a pivot nearer
+# than 5 mm would be noise.
 _MAX_START_RHO = 200.0
 
 
@@ -96,7 +98,7 @@ class FittedField:
     field
         The field itself.
     choice
-        Its strength, and what cross-validation says.
+        Its strength, and the result of cross-validation.
     system
         The reduced system at the solution, from which magnifications can be left out.
     settled
@@ -120,9 +122,9 @@ class Adjustment:
     problem, result
         The adjustment that gave their coefficients.
     rounds
-        How often the number of coefficients was chosen.
+        Number of times that the numbers of coefficients were chosen.
     settled
-        Whether the last choice was that of the round before.
+        Whether the last choice was the same as that of the round before.
     """
 
     functions: Functions
@@ -134,7 +136,7 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class JointFit:
-    """Outcome of :func:`fit_joint`.
+    """Result of :func:`fit_joint`.
 
     Attributes
     ----------
@@ -157,11 +159,11 @@ class JointFit:
 
 
 def _update_height_sigma(setup: Setup, result: BundleResult) -> Array:
-    """(V,) expectation-maximisation update of the spread of the heights.
+    """Update the (V,) spread of the heights by expectation maximisation.
 
     Views without tilt have a spread of their own: the axis of the stage hardly ever passes through
-    the point that is looked at, so that tilting changes the height, while views from above may all
-    share one.
+    the point in view, so that tilting changes the height, while views from above may all share one
+    height.
     """
     square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
     flat = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
@@ -177,7 +179,7 @@ def _update_height_sigma(setup: Setup, result: BundleResult) -> Array:
 def refit_functions(
     functions: Functions, sizes: Mapping[str, tuple[str, int]]
 ) -> dict[str, ContinuousFunction]:
-    """Functions of other kinds and sizes through the values of the given ones, by least squares."""
+    """Fit functions of other kinds and sizes to the values of the given ones, by least squares."""
     out: dict[str, ContinuousFunction] = {}
     for name, function in functions.items():
         kind, size = sizes.get(name, (function.kind, function.smooth_size))
@@ -191,7 +193,7 @@ def refit_functions(
 
 
 def _thin_view(view: GridView) -> GridView:
-    """The view with a spread of at most so many corners as its pose and a rough camera need."""
+    """Return the view with a random part of its corners, enough for a pose and a rough camera."""
     if len(view.board_xy_m) <= _ENOUGH_CORNERS:
         return view
     keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
@@ -199,7 +201,7 @@ def _thin_view(view: GridView) -> GridView:
 
 
 def adapt_priors(setup: Setup) -> Setup:
-    """The setup with priors for a photographic lens where the views show that strong a perspective."""
+    """Return the setup with priors of a photographic lens where the perspective is that strong."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     if not start.wide:
@@ -208,7 +210,7 @@ def adapt_priors(setup: Setup) -> Setup:
 
 
 def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
-    """Moderately flexible functions, poses, and the spread of the heights, from nominal values alone."""
+    """Fit moderately flexible functions, poses and the spread of heights from nominal values."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     rho = start.rho if start.wide else min(max(start.rho, 0.0), _MAX_START_RHO)
@@ -231,7 +233,7 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
 
 
 def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
-    """The functions with some more coefficients than were chosen, all zero."""
+    """Return the functions with a few more coefficients than were chosen, all zero."""
     out = dict(functions)
     low, high = functions["scale"].g_range
     for name in _SMOOTH if low < high else ():
@@ -246,11 +248,11 @@ def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
 def _pad_covariance(
     setup: Setup, padded: Functions, adjustment: Adjustment, field: FittedField | None
 ) -> Array:
-    """Covariance of the padded functions' coefficients and of the field's.
+    """Return the covariance of the coefficients of the padded functions and of the field.
 
-    A coefficient that was left out is not known to be zero: what the data do not tell about it is as uncertain as its
-    prior says. Nor is zero what the data say: by how much all coefficients would move if those were let free, the
-    estimate may be wrong on top of that.
+    A coefficient that was left out is not known to be zero: where the data do not determine it, its
+    prior gives its uncertainty. Nor do the data say that it is zero: the estimate may also be wrong
+    by as much as all coefficients would move if the omitted ones were free.
     """
     views = setup.views if field is None else undo_field(setup, field.field).views
     problem = build_problem(setup, padded, views, adjustment.problem.height_sigma_m)
@@ -300,7 +302,7 @@ def _select_and_adjust(
 
 
 def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
-    """The exact adjustment with the chosen functions, all tilts having been tried both ways."""
+    """Adjust exactly with the chosen functions, after trying both signs of every tilt."""
     thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
     height = _update_height_sigma(setup, adjustment.result)
     turned, _ = resolve_mirrored_tilts(
@@ -315,10 +317,11 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
 def _add_field(
     setup: Setup, adjustment: Adjustment, always: bool
 ) -> tuple[Adjustment, FittedField | None]:
-    """Camera and residual field, or the adjustment as it is where the field is not worthwhile.
+    """Add a residual field, or return the adjustment unchanged where it is not worthwhile.
 
-    Each turn solves for both together, and then adjusts poses and camera to observations that the field has corrected.
-    In the first turns the strength of the field and the number of coefficients of the functions are chosen anew.
+    Each turn solves for camera and field together, and then adjusts poses and camera to
+    observations that the field has corrected. In the first turns the strength of the field and the
+    numbers of coefficients of the functions are chosen again.
     """
     field = blank = blank_field(setup)
     start, before = adjustment, setup
@@ -345,7 +348,7 @@ def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
 
 
 def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:
-    """The adjustment with other views and coefficients; ``choosing`` the number of coefficients again."""
+    """Adjust to other views from other coefficients; ``choosing`` selects their number again."""
     functions, height = (
         with_coefficients(adjustment.functions, theta),
         _update_height_sigma(setup, adjustment.result),
@@ -402,9 +405,10 @@ def fit_joint(
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
-    """The joint solution without one magnification, by one Gauss-Newton step on the reduced equations.
+    """Return the solution without one magnification, by one Gauss-Newton step on reduced equations.
 
-    At the optimum the poses of the other views follow linearly, so that one step is as good as a new adjustment.
+    At the optimum the poses of the other views follow linearly, so one step is as good as a new
+    adjustment.
     """
     if fit.field is not None:
         fitted = fit.field

@@ -1,8 +1,8 @@
-"""How many coefficients each continuous function gets.
+"""Selection of the number of coefficients of each continuous function.
 
-An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), which is all that a candidate
-set of functions has to be fitted to. A candidate is judged by leave-one-magnification-out cross-validation on these
-summaries: fitted to all magnifications but one, how much worse does it explain that one's images? The two outermost
+An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), and a candidate set of
+functions is fitted to these alone. A candidate is judged by leave-one-magnification-out cross-validation on these
+summaries: fitted to all magnifications but one, how much worse does it explain the images of that one? The two outermost
 magnifications are never left out, since the calibration does not claim to hold beyond them; there the fit itself
 counts.
 """
@@ -30,7 +30,7 @@ __all__ = ["Summary", "select_functions"]
 _MAX_SIZE = 8
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0
-# Half chi-squares by which a choice must be better to replace the one before.
+# Gain in half chi-squares by which a choice must be better to replace the previous one.
 _CLEARLY = 2.0
 
 
@@ -50,7 +50,7 @@ class Summary:
 
     @classmethod
     def of(cls, problem: Problem, result: BundleResult) -> Summary:
-        """The summary of an adjustment, scaled to the variance that its residuals show."""
+        """Summarise an adjustment, scaled to the variance that its residuals show."""
         cameras = problem.designs @ result.state.theta
         right = np.einsum("mpq,mq->mp", result.information, cameras) + result.gradient
         variance = variance_factor(problem, result)
@@ -88,7 +88,7 @@ class _Candidates:
         return self.priors[key]
 
     def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
-        """Cost of predicting each inner magnification from the others, and of fitting the outermost ones."""
+        """Return the cost of predicting inner magnifications and of fitting the outermost ones."""
         key = tuple(sizes[name] for name in FUNCTION_NAMES)
         if key not in self.scores:
             self.scores[key] = self._score(sizes)
@@ -127,10 +127,10 @@ def select_functions(
     free: Sequence[str],
     current: Mapping[str, tuple[str, int]] | None = None,
 ) -> dict[str, tuple[str, int]]:
-    """Greedy choice of (kind, size) for the functions named in ``free``.
+    """Choose (kind, size) of the functions named in ``free`` greedily.
 
     Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the cross-validation gains
-    more than :data:`_GAIN_PER_COEFFICIENT` for each, and taken away again where that costs less. The ``current``
+    more than :data:`_GAIN_PER_COEFFICIENT` for each, and removed where that costs less. The ``current``
     choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions)

@@ -105,8 +105,8 @@ IMBALANCE_MAX = 15.0
 IMBALANCE_MEDIAN = 1.39
 # Stains of the board and shortcomings of the model, relative to half the contrast.
 UNLIKE_MAX = 0.05
-# Beyond the border of a board all squares have one grey value, so that opposite squares differ by
-# the whole contrast.
+# Beyond the border of a board all squares are alike; at a corner of the board the fourth square
+# differs from them by one, in units of ``CornerFit.unlike``.
 BORDER = 0.5
 # Noise alone exceeds four sigmas once in 15000 corners, but the spread is that of all corners and
 # its tails are longer than a normal distribution's.
@@ -213,7 +213,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
 
 
 def inflate_variance(fit: CornerFit, keep: Mask) -> Array:
-    """Return (n,) factors on the covariances: the pooled misfit, or a far larger one of a corner."""
+    """Return (n,) factors on the covariances: the pooled misfit, or a corner's far larger one."""
     pooled = float(np.median(fit.chi2[keep]))
     significant = pooled * (1.0 + 3.0 * np.sqrt(2.0 / fit.freedom))
     return np.where(fit.chi2 > significant, fit.chi2, pooled)

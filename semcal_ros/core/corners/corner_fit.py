@@ -310,7 +310,7 @@ def fit_noise(fit: CornerFit) -> NoiseModel:
 def _statistics(
     windows: PixelWindows, residual: Array32, model: Array32, freedom: Array
 ) -> tuple[Array, Array]:
-    """Return levels and variances of the pixels darker and brighter than the middle, (n, 2) each."""
+    """Return (n, 2) levels and variances of the pixels darker and brighter than the middle."""
     valid = windows.valid
     total = np.maximum(valid.sum(axis=1, keepdims=True), 1.0)
     middle = (model * valid).sum(axis=1, keepdims=True) / total

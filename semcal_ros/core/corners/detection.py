@@ -29,8 +29,8 @@ FILLED = 0.6
 # Debris and missing squares may spoil the other corners without another scale being better.
 CONVINCING = 0.6
 
-# If a larger part of the corners does not continue the lattice, that is a second board rather than a
-# part cut off by debris.
+# If a larger part of the corners does not continue the lattice, that part is a second board rather
+# than cut off by debris.
 FOREIGN_MAX = 0.15
 
 
@@ -147,7 +147,7 @@ def find_lattice(
 
 
 def _best_corners(image: Image, size: tuple[int, int]) -> tuple[RefinedCorners, float] | None:
-    """Find the best corners over all scales, and the part of the image that their lattice covers."""
+    """Find the best corners over all scales, and the part of the image that they cover."""
     candidates: list[tuple[float, Lattice]] = []
     best: tuple[RefinedCorners, float] | None = None
     for scale in SCALES_PX:

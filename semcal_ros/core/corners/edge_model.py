@@ -98,7 +98,7 @@ class EdgeGeometry:
 
 
 # erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
-# 7.1.26, error below 1.5e-7, that of single precision. It shares the exponential with the derivative.
+# 7.1.26, error below 1.5e-7, as of single precision. It shares the exponential with the derivative.
 ERF_P = np.float32(0.3275911)
 # c1 to c5.
 ERF_C = tuple(

@@ -214,7 +214,7 @@ class _Growth:
         return total / count[:, None], axes / count[:, None, None]
 
     def _look_up(self, cells: Indices, predicted: Array, axes: Array) -> Indices:
-        """Return the index of the saddle of the right sign at each prediction, or -1 without one."""
+        """Return the index of the saddle of the right sign at each prediction, or -1."""
         radius = SEARCH_RADIUS * np.linalg.norm(axes, axis=2).min(axis=1)
         k = min(2, len(self._saddles.xy))
         queried = self._tree.query(predicted, k=k)
@@ -237,7 +237,7 @@ class _Growth:
         return np.where(keep, members, -1)
 
     def _update_axes(self, cells: Indices) -> None:
-        """Set the axes of new cells: differences to neighbours, averaged with the inherited axes."""
+        """Set axes of new cells: differences to neighbours, averaged with the inherited axes."""
         here = self._saddles.xy[self._member[cells[:, 0], cells[:, 1]]]
         axes = self._axes[cells[:, 0], cells[:, 1]]
         for axis in range(2):

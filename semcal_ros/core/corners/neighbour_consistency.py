@@ -14,8 +14,8 @@ __all__ = ["find_consistent"]
 
 # Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
 MISS_SIGMAS = (5.0, 4.3, 3.7)
-# Error of local maps through squares of LARGE_SQUARE_PX under the strongest distortion, per standard
-# deviation of the prediction of a single corner; it grows as the third power of the square.
+# Error of local maps through squares of LARGE_SQUARE_PX under the strongest distortion, per
+# standard deviation of the prediction of a corner; it grows as the third power of the square.
 MAP_ERROR_PX = 2.0
 # That error is concentrated in parts of the image, where it is this many times its median.
 MAP_ERROR_RATIO = 4.0

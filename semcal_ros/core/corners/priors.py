@@ -130,7 +130,7 @@ def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: flo
     used
         Prior of those fits.
     unit
-        Variance of a pixel by which the prior was weighted.
+        Variance of a pixel that the weight of the prior assumed.
     noise
         Variance of the residuals in the same measure.
     """
