@@ -51,8 +51,8 @@ METHODS = ("joint", "pda", "discrete")
 _MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 _MIN_VIEWS = 3
-# Ratio of residuals to the sigmas of the corners beyond which the misfit is due to the model and not
-# to these sigmas.
+# Ratio of residuals to the sigmas of the corners beyond which the misfit is due to the model and
+# not to these sigmas.
 _MISFIT = 3.0
 
 
@@ -217,8 +217,8 @@ def calibrate_views(
         Weak prior knowledge; the defaults suit any SEM, and follow the views where their perspective is that of a
         photograph.
     on_stage
-        Called with the name of the stage that begins and the fraction of the work that is done, 0 to
-        1 (only ``"joint"``, which starts again after leaving out views).
+        Called with the name of the stage that begins and the fraction of the work that is done, 0
+        to 1 (only ``"joint"``, which starts again after leaving out views).
 
     Raises
     ------

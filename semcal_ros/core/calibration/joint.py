@@ -67,7 +67,7 @@ _RESERVE, _LEAST_SIZE = 2, 5
 # every later adjustment updates it again.
 _HEIGHT_UPDATES = 4
 # Limits of the spread of heights, relative to its prior: a micrometre is less than any view can
-# show, and no instrument has a depth of field of more than millimetres.
+# show, and a depth of field of millimetres does not occur.
 _LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
 # Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
 # mount, less than tilts that are set on purpose.

@@ -1,9 +1,10 @@
 """Selection of the number of coefficients of each continuous function.
 
-An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), and a candidate set of
-functions is fitted to these alone. A candidate is judged by leave-one-magnification-out cross-validation on these
-summaries: fitted to all magnifications but one, how much worse does it explain the images of that one? The two outermost
-magnifications are never left out, since the calibration does not claim to hold beyond them; there the fit itself
+An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), and a
+candidate set of functions is fitted to these alone. A candidate is judged by
+leave-one-magnification-out cross-validation on these summaries: fitted to all magnifications but
+one, how much worse does it explain the images of that one? The two outermost magnifications are
+never left out, since the calibration does not claim to hold beyond them; there the fit itself
 counts.
 """
 

@@ -2,8 +2,8 @@
 
 The unknowns are one vector ``theta`` of coefficients, from which the camera of each magnification follows linearly
 (``camera = design @ theta``), and six pose unknowns per view. The poses are eliminated view by view (Schur complement),
-so that the reduced system has the size of ``theta`` whatever the number of views; what is left of a view is a 10 x 10
-information matrix on the camera of its magnification.
+so the reduced system has the size of ``theta`` for any number of views; a view leaves a 10 x 10 information matrix on
+the camera of its magnification.
 
 Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 6.
 """
@@ -66,7 +66,7 @@ class Problem:
     norm_px
         Normalisation of the distortion.
     prior_mean, prior_sigma
-        (K,) prior of theta; an infinite sigma is no prior.
+        (K,) prior of theta; an infinite sigma stands for no prior.
     height_sigma_m
         (V,) prior 1-sigma of each view's height t_z about the reference plane.
     """
@@ -109,7 +109,7 @@ def make_problem(
     prior_sigma: Array,
     height_sigma_m: Array | float,
 ) -> Problem:
-    """Arrange views for the adjustment; ``magnifications`` (M,) are the distinct ones, in order.
+    """Arrange views for an adjustment; ``magnifications`` (M,) are the distinct ones, in order.
 
     ``height_sigma_m`` is one number, or one for each view.
     """
@@ -139,26 +139,29 @@ def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, A
 
 
 def residuals(problem: Problem, state: State) -> Array:
-    """(N, 2) observed minus projected pixels; NaN where a point has no projection."""
+    """Return (N, 2) observed minus projected pixels; NaN where a point has no projection."""
     _, points, cameras = _points_and_cameras(problem, state)
     return problem.observed_px - project_points(cameras, points, problem.norm_px)
 
 
 def whitened_norm(problem: Problem, miss: Array) -> Array:
-    """(N,) lengths of residuals (N, 2) in standard deviations."""
+    """Return the (N,) lengths of residuals (N, 2) in standard deviations."""
     xx, yx, yy = problem.whitening.T
     return np.hypot(xx * miss[:, 0], yx * miss[:, 0] + yy * miss[:, 1])
 
 
 def _huber(norm: Array) -> tuple[Array, Array]:
-    """Huber's loss (half squared norm inside) and weight of the whitened residual norms."""
+    """Return Huber's loss (half the squared norm inside) and weight of whitened residual norms."""
     outside = norm > _HUBER
     loss = np.where(outside, _HUBER * (norm - 0.5 * _HUBER), 0.5 * norm * norm)
     return loss, np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
 
 
 def view_costs(problem: Problem, state: State) -> Array:
-    """(V,) half the robust sum of squares of each view with the prior of its height; infinite without projection."""
+    """Return (V,) half robust sums of squares, with the priors of the heights.
+
+    The cost of a view is infinite where one of its points has no projection.
+    """
     miss = residuals(problem, state)
     norm = whitened_norm(problem, miss)
     loss = np.where(np.isfinite(norm), _huber(norm)[0], np.inf)
@@ -167,14 +170,14 @@ def view_costs(problem: Problem, state: State) -> Array:
 
 
 def prior_cost(problem: Problem, state: State) -> float:
-    """Half the sum of squares of theta about its prior."""
+    """Return half the sum of squares of theta about its prior."""
     prior = (state.theta - problem.prior_mean) / problem.prior_sigma
     return float(0.5 * prior @ prior)
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations: per view (V, 16, 16) and (V, 16), with camera first and pose last."""
+    """Normal equations of each view, (V, 16, 16) and (V, 16), with camera first and pose last."""
 
     matrix: Array
     right: Array
@@ -202,7 +205,7 @@ class WhitenedRows:
 
 
 def whitened_rows(problem: Problem, state: State) -> WhitenedRows:
-    """Residuals and derivatives of all observations."""
+    """Compute the whitened residuals and derivatives of all observations."""
     rotated, points, cameras = _points_and_cameras(problem, state)
     jacobians = project_points_with_jacobians(cameras, points, problem.norm_px)
     miss = problem.observed_px - jacobians.xy
@@ -221,7 +224,7 @@ def whitened_rows(problem: Problem, state: State) -> WhitenedRows:
 
 
 def whiten(whitening: Array, rows: Array, huber: Array) -> None:
-    """Turn rows (2, k, N) into ones of unit variance, in place."""
+    """Scale rows (2, k, N) to unit variance, in place."""
     xx, yx, yy = whitening.T * np.sqrt(huber)
     rows[1] *= yy
     if np.any(yx):
@@ -240,7 +243,7 @@ def with_height_prior(problem: Problem, state: State, matrix: Array, column: int
 
 
 def normal_equations(problem: Problem, state: State) -> NormalEquations:
-    """Huber-weighted normal equations of every view, with the prior of its height."""
+    """Compute the Huber-weighted normal equations of every view, with the prior of its height."""
     whitened = whitened_rows(problem, state)
     n_views = len(problem.group)
     matrix = np.empty((n_views, 17, 17))
@@ -273,7 +276,10 @@ def schur_complement(
 def reduced_normal_equations(
     problem: Problem, theta: Array, information: Array, gradient: Array
 ) -> tuple[Array, Array]:
-    """Reduced normal equations (K, K) and (K,) of theta, with its prior, from the blocks per magnification."""
+    """Assemble the reduced normal equations (K, K) and (K,) of theta, with its prior.
+
+    ``information`` (M, 10, 10) and ``gradient`` (M, 10) are the blocks of each magnification.
+    """
     designs = problem.designs
     matrix = np.einsum("mpk,mpq,mql->kl", designs, information, designs, optimize=True)
     right = np.einsum("mpk,mp->k", designs, gradient)
@@ -283,7 +289,7 @@ def reduced_normal_equations(
 
 
 def retract(problem: Problem, state: State, change: Array, pose: Array) -> State:
-    """The state after changes of theta (K,) and of the poses (V, 6)."""
+    """Return the state after changes of theta (K,) and of the poses (V, 6)."""
     return State(
         state.theta + change,
         rotations_from_vectors(pose[:, :3]) @ state.rotations,
@@ -292,7 +298,7 @@ def retract(problem: Problem, state: State, change: Array, pose: Array) -> State
 
 
 def select_views(problem: Problem, chosen: Mask) -> Problem:
-    """The problem with only some of its views."""
+    """Return the problem with only some of its views."""
     points = chosen[problem.view_of_point]
     counts = np.diff(problem.starts)[chosen]
     return replace(

@@ -1,8 +1,8 @@
-"""Views that an adjustment cannot believe, such as one whose magnification was recorded wrongly.
+"""Views that disagree with the others, such as one whose magnification was recorded wrongly.
 
-A wrong magnification is a wrong scale, which the height of a view imitates where the projection is perspective, and
-which nothing imitates where it is parallel. So a view is compared with the others in both: its height with those of its
-own magnification, and how well it fits with all.
+A wrong magnification is a wrong scale. Under a perspective projection the height of a view imitates
+it; under a parallel one nothing does. So a view is compared with the others in two ways: its height
+with those at its own magnification, and its misfit with all.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from semcal_ros.core.errors import Rejection
 __all__ = ["ChangePoint", "find_change_point", "find_outliers"]
 
 
-# Half chi-squares, that is 2.7 standard deviations: a recording without jump has one in twenty chances to be suspected.
+# Gain in half chi-squares, 2.7 standard deviations: a recording without a jump is suspected in one of
+# twenty cases.
 _LEAST_GAIN = 3.65
 
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """A jump of the scale that the views ask for.
+    """A jump of the scale that the views indicate.
 
     Attributes
     ----------
     below, above
-        Neighbouring magnifications between which it lies.
+        Neighbouring magnifications between which the jump lies.
     relative, sigma
         Size relative to the scale, and its 1-sigma.
     """
@@ -50,9 +51,10 @@ class ChangePoint:
 
 
 def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> ChangePoint | None:
-    """The jump that would improve an adjustment most, or None if none is worth mentioning.
+    """Find the jump that would improve an adjustment most, or None if none is significant.
 
-    ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it has already are left out.
+    ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has are
+    left out.
     """
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
@@ -79,24 +81,25 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     return best
 
 
-# Robust standard deviations: heights are a mixture of still and moved stages, with long tails.
+# Largest deviation of a height in robust standard deviations: heights are a mixture of views with
+# still and with moved stages, with long tails.
 _HEIGHT_SIGMAS = 8.0
-# Spread below which differences of height are nothing, m.
+# Least spread of the heights, m; smaller differences of height are not significant.
 _LEAST_HEIGHT_M = 5e-6
 # RMS residual of a view over that of the median view. Good views differ by less, and a wrong
 # magnification that the height cannot imitate exceeds it. Chosen by trial.
 _MISFIT_RATIO = 6.0
-# Fewer views at a magnification are compared with those of all others instead.
+# Where a magnification has fewer views, they are compared with those at all magnifications.
 _ENOUGH_VIEWS = 3
-# Single views are wrong, not many.
+# Largest part of the views that may disagree: single views are wrong, not many.
 _FEW = 0.1
 
 
 def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the views that disagree with the others; index and reason of each.
 
-    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification disagree, or many in all,
-    it is not single views that are wrong, and none is named.
+    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification disagree, or many in
+    all, the fault is not in single views, and none is returned.
     """
     height = result.state.translations_m[:, 2]
     square = np.add.reduceat(
@@ -108,7 +111,8 @@ def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Reject
     for own in members:
         if len(own) >= _ENOUGH_VIEWS:
             offset[own] = height[own] - np.median(height[own])
-    # 90 % of normal deviates are below 1.645; the median would only see the stages that stood still.
+    # 90 % of normal deviates are below 1.645; the median would only reflect the views with a still
+    # stage.
     spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
     odd = (np.abs(offset) > _HEIGHT_SIGMAS * spread) | (misfit > _MISFIT_RATIO)
     outliers: dict[int, Rejection[ViewStatus]] = {}

@@ -3,7 +3,7 @@
 Each parameter x(g) is taken to obey a linear differential equation with constant coefficients,
 ``D^k x + w_(k-1) D^(k-1) x + ... + w_0 x = 0`` (16)-(18). Derivatives come from finite differences, the weights w from
 weighted least squares (19)-(21), and the equation is solved through fitted boundary values. Equation (21) is printed as
-``(A'A)^-1 A b``; used is ``-(A'A)^-1 A' b``. The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials
+``(A'A)^-1 A b``; this module uses ``-(A'A)^-1 A' b``. The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials
 of degree 3 and 5 prone to oscillate; all of these can be selected here so that the comparison can be repeated.
 """
 
@@ -21,7 +21,7 @@ __all__ = ["ode_weights", "pda_functions"]
 
 
 def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Array:
-    """(order,) coefficients w_0 ... w_(order-1) of the differential equation that the samples obey best.
+    """Estimate the coefficients w_0 ... w_(order-1) of the equation that the samples obey best.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def pda_functions(
     blocks = []
     for i, name in enumerate(FUNCTION_NAMES):
         values = discrete.parameters[:, i]
-        # Parameters held by their prior have no scatter of their own; all nodes then count alike.
+        # Parameters held by their prior have no scatter of their own; all nodes then count equally.
         sigma = np.maximum(np.sqrt(discrete.covariances[:, i, i]), 1e-8 * (1.0 + np.abs(values)))
         if legendre_degree is None:
             weights = ode_weights(position, values, 1.0 / sigma, order)

@@ -1,4 +1,4 @@
-"""What is known before a calibration: weak priors, and the setup that all problems share."""
+"""Knowledge before a calibration: weak priors, and the setup that all problems share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _JUMPING = ("scale", "aspect", "skew")
 
 @dataclass(frozen=True)
 class Priors:
-    """Weak prior knowledge that holds what the data leave open; kept in the calibration file.
+    """Weak prior knowledge that holds what the data leave open; stored in the calibration file.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Priors:
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
         1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times k squared. A few
         times what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a
-        magnification. What the data cannot tell of a change is uncertain by this much, and not taken for none.
+        magnification. A change that the data do not determine is uncertain by this much, and not assumed to be zero.
     """
 
     centre_fraction: float = 0.08
@@ -59,16 +59,16 @@ class Priors:
     height_sigma_m: float = 1e-4
 
     def of_wide_views(self, rho: float) -> Priors:
-        """The same for a lens whose pivot is at a distance of ``1 / rho``, and not some centimetres away.
+        """Return the priors of a lens with the pivot at ``1 / rho`` and not a few centimetres away.
 
-        Nothing is presumed of distance and heights but their order of magnitude.
+        Only the order of magnitude of the distance and of the heights is presumed.
         """
         return replace(self, rho_mean=rho, rho_sigma=rho, height_sigma_m=0.3 / rho)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What is common to all problems over one set of views, which are in the order of their magnifications."""
+    """Everything common to all problems over one set of views, in order of their magnifications."""
 
     views: tuple[GridView, ...]
     magnifications: Array
@@ -88,11 +88,11 @@ class Setup:
         return 0.5 * (np.array(self.image_size, dtype=np.float64) - 1.0)
 
     def nominal_px_per_m(self, g: Array) -> Array:
-        """Scales that the display width alone predicts."""
+        """Return the scales in px per m that the display width alone predicts."""
         return g * self.image_size[0] / self.display_width_m
 
     def change_prior_of(self, name: str) -> float:
-        """1-sigma of the change of a camera parameter over the calibrated range."""
+        """Return the 1-sigma of the change of a camera parameter over the calibrated range."""
         p = self.priors
         centre = p.centre_change_fraction * self.image_size[0]
         return {
@@ -106,14 +106,15 @@ class Setup:
         }.get(name, self.prior_of(name)[1])
 
     def breaks_of(self, name: str) -> Array:
-        """Breakpoints of a camera parameter: the amplifiers of the scan change scale, aspect and skew."""
+        """Return the breakpoints of a camera parameter: only scale, aspect and skew have any."""
         return np.array(self.breakpoints if name in _JUMPING else (), dtype=np.float64)
 
     def coefficient_priors(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
-        """Means and sigmas of the coefficients of a camera parameter's function, ``size`` without its jumps.
+        """Return means and sigmas of the coefficients of a function, ``size`` without its jumps.
 
-        The constant of a polynomial has the parameter's own prior, the others say how it changes, and the last ones
-        how it jumps; all values of a table have the parameter's own.
+        The constant of a polynomial has the prior of the parameter, the next coefficients have the
+        prior of its change, and the last ones that of its jumps; all values of a table have the
+        prior of the parameter.
         """
         mean, sigma = self.prior_of(name)
         if kind == "linear_log":
@@ -126,7 +127,7 @@ class Setup:
         return np.concatenate([[mean], np.zeros(size - 1 + jumps)]), np.concatenate(sigmas)
 
     def prior_of(self, name: str) -> tuple[float, float]:
-        """(mean, sigma) of a camera parameter."""
+        """Return (mean, sigma) of a camera parameter."""
         p, width = self.priors, self.image_size[0]
         cx, cy = self.centre_px
         return {

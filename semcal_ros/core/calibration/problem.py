@@ -1,4 +1,4 @@
-"""How coefficient functions and their priors become an adjustment, and back."""
+"""Conversion of coefficient functions and their priors to an adjustment, and back."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _POSE_ITERATIONS = 12
 def build_problem(
     setup: Setup, functions: Functions, views: Sequence[GridView], height_sigma_m: Array | float
 ) -> Problem:
-    """The adjustment of ``views`` with coefficient functions of the given kinds and sizes."""
+    """Set up the adjustment of ``views`` with functions of the given kinds and sizes."""
     nominal = setup.nominal_px_per_m(setup.magnifications)
     designs = np.stack(
         [
@@ -62,7 +62,7 @@ def build_problem(
 
 
 def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
-    """(K,) means and sigmas of all coefficients, as in :meth:`Setup.coefficient_priors`."""
+    """Return (K,) means and sigmas of all coefficients, as in :meth:`Setup.coefficient_priors`."""
     parts = [
         setup.coefficient_priors(name, functions[name].kind, functions[name].smooth_size)
         for name in FUNCTION_NAMES
@@ -71,7 +71,7 @@ def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
 
 
 def with_coefficients(functions: Functions, theta: Array) -> dict[str, ContinuousFunction]:
-    """The functions with the coefficients of a vector in the order of ``FUNCTION_NAMES``."""
+    """Return the functions with coefficients from a vector in the order of ``FUNCTION_NAMES``."""
     out: dict[str, ContinuousFunction] = {}
     start = 0
     for name in FUNCTION_NAMES:
@@ -82,7 +82,7 @@ def with_coefficients(functions: Functions, theta: Array) -> dict[str, Continuou
 
 
 def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, ContinuousFunction]:
-    """Functions that do not depend on the magnification, but for the jumps."""
+    """Make functions that do not depend on the magnification, except for their jumps."""
     g_range = (float(setup.magnifications[0]), float(setup.magnifications[-1]))
     return {
         name: ContinuousFunction(
@@ -98,12 +98,12 @@ def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, C
 
 
 def stack_coefficients(functions: Functions) -> Array:
-    """(K,) all coefficients in the order of ``FUNCTION_NAMES``."""
+    """Return (K,) all coefficients in the order of ``FUNCTION_NAMES``."""
     return np.concatenate([functions[name].coefficients for name in FUNCTION_NAMES])
 
 
 def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> BundleResult:
-    """Refine, and turn views over to their mirrored tilt as long as that fits better."""
+    """Refine, and turn views to their mirrored tilt as long as that fits better."""
     result = refine(problem, state, tolerance=tolerance)
     for _ in range(_MAX_TURNS):
         turned, changed = resolve_mirrored_tilts(problem, result.state)
@@ -114,11 +114,11 @@ def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> Bundle
 
 
 def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
-    """Fit the poses from both signs of the tilt; the better ones, and how many of them are turned over."""
+    """Fit the poses from both signs of the tilt; return the better ones and the number of changes."""
     pairs = zip(problem.starts[:-1], problem.starts[1:], strict=True)
     middle = np.stack([problem.board_m[a:b].mean(axis=0) for a, b in pairs])
     rotations = mirrored_tilt(state.rotations)
-    # Turning about the point that is seen in the middle keeps the view in place.
+    # Turning about the middle of the visible points keeps the view in place.
     moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)
     mirrored = State(state.theta, rotations, state.translations_m + moved)
     own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
@@ -142,7 +142,7 @@ def _view_costs(problem: Problem, result: BundleResult) -> Array:
 
 
 def variance_factor(problem: Problem, result: BundleResult) -> float:
-    """Mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
+    """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
     norm2 = whitened_norm(problem, result.residuals_px) ** 2 * result.huber_weight
     freedom = 2.0 * result.huber_weight.sum() - 6 * len(problem.group) - len(result.state.theta)
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))

@@ -1,9 +1,9 @@
 """Estimation of the residual field together with the coefficients of the camera.
 
-The field is linear in its coefficients, so that one reduced system over all magnifications holds both: the poses are
-eliminated view by view, and what is left of a view is an information matrix on its camera and its slice of the field.
-How strong the field may be, and whether there is one, is decided by cross-validation: magnifications are left out, or
-views where there are few magnifications.
+The field is linear in its coefficients, so one reduced system over all magnifications holds both:
+the poses are eliminated view by view, and each view leaves an information matrix on its camera and
+its slice of the field. Cross-validation decides on the strength of the field and whether there is
+one: it leaves out magnifications, or views where there are few magnifications.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ __all__ = [
 _STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
 # A prior this narrow holds the field at zero; the same equations then serve without a field.
 _NO_STRENGTH_PX = 1e-7
-# Second differences of the coefficients are so much smaller than the coefficients: fields are smooth.
+# Ratio of the coefficients to their second differences: fields are smooth.
 _SMOOTHNESS = 4.0
-# Differences between neighbouring coefficients in log g, likewise.
+# Ratio of the coefficients to their differences between neighbours in log g.
 _STEADINESS = 3.0
-# Standard deviation of what the field has in common with the rest of the model, px.
+# Prior standard deviation of the part of the field that the rest of the model describes, px.
 _OVERLAP_PX = 1e-4
 # The field is taken to change slowly with the magnification: as a parabola in log g at most.
 _MAX_COEFFICIENTS_IN_G = 3
-# Fewer magnifications say nothing about one that is left out.
+# Fewer magnifications do not predict one that is left out.
 _ENOUGH_MAGNIFICATIONS = 4
 # Bounds the time: every fold is solved once for each strength.
 _MAX_FOLDS = 6
-# A field must gain so many held-out half chi-squares, and standard errors over what is left out.
+# Least gain of a worthwhile field, in held-out half chi-squares and in standard errors.
 _LEAST_GAIN, _CLEARLY = 6.0, 2.5
 
 
@@ -60,7 +60,8 @@ _LEAST_GAIN, _CLEARLY = 6.0, 2.5
 class FieldSystem:
     """Quadratic approximation of the reprojection error with the poses eliminated.
 
-    Its members are what cross-validation leaves out: magnifications, or views where there are few magnifications.
+    Cross-validation leaves out its members: magnifications, or views where there are few
+    magnifications.
 
     Attributes
     ----------
@@ -86,7 +87,7 @@ class FieldSystem:
     theta_precision: Array
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
-        """Normal equations of theta and all coefficients of the field, whose prior precision is ``prior``."""
+        """Assemble the normal equations of theta and the field, whose prior precision is ``prior``."""
         count, width = len(self.designs), self.right.shape[1]
         blocks, rights = np.zeros((count, width, width)), np.zeros((count, width))
         for v in np.flatnonzero(keep):
@@ -110,14 +111,14 @@ class FieldSystem:
         return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
 
     def solve(self, keep: Mask, prior: Array) -> Array:
-        """Theta followed by the coefficients of the field, from the members that are kept."""
+        """Solve for theta followed by the coefficients of the field, from the members in ``keep``."""
         matrix, right = self.assembled(keep, prior)
         scaled, scale = equilibrate(matrix)
         factor = cho_factor(scaled, check_finite=False)
         return scale * cho_solve(factor, scale * right)
 
     def covariance(self, prior: Array) -> Array:
-        """Covariance of what :meth:`solve` gives from all members."""
+        """Return the covariance of the result of :meth:`solve` from all members."""
         matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
         scaled, scale = equilibrate(matrix)
         factor = cho_factor(scaled, check_finite=False)
@@ -125,7 +126,7 @@ class FieldSystem:
         return 0.5 * (inverse + inverse.T) * np.outer(scale, scale)
 
     def costs(self, solution: Array) -> Array:
-        """(N,) cost of each member, but for a constant."""
+        """Return the (N,) cost of each member, up to a constant."""
         size = self.designs.shape[2]
         slices = self.weights @ solution[size:].reshape(self.weights.shape[1], -1)
         z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
@@ -135,7 +136,7 @@ class FieldSystem:
 
 @dataclass(frozen=True)
 class FieldChoice:
-    """Outcome of the cross-validation.
+    """Result of the cross-validation.
 
     Attributes
     ----------
@@ -144,7 +145,7 @@ class FieldChoice:
     gain, gain_sigma
         Held-out half chi-squares that the field gains, and their standard error.
     worthwhile
-        Whether that is clearly a gain.
+        Whether the gain is significant.
     prior
         Prior precision of the coefficients.
     """
@@ -157,14 +158,14 @@ class FieldChoice:
 
 
 def blank_field(setup: Setup) -> ResidualField:
-    """A field without displacement for the magnifications of these views."""
+    """Make a field without displacement for the magnifications of these views."""
     g = setup.magnifications
     count = min(_MAX_COEFFICIENTS_IN_G, len(g))
     return zero_field(setup.image_size, (float(g[0]), float(g[-1])), count)
 
 
 def undo_field(setup: Setup, field: ResidualField) -> Setup:
-    """The views as the parametric distortion alone would have made them."""
+    """Return the views as they would be under the parametric distortion alone."""
     slices = {float(g): field.at(float(g)) for g in setup.magnifications}
     views = []
     for view in setup.views:
@@ -177,7 +178,7 @@ def undo_field(setup: Setup, field: ResidualField) -> Setup:
 def field_system(
     setup: Setup, problem: Problem, result: BundleResult, field: ResidualField
 ) -> FieldSystem:
-    """The reduced system about an adjustment.
+    """Compute the reduced system about an adjustment.
 
     ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the ones that ``field`` has
     corrected. Weights are scaled to the variance that the residuals show.
@@ -222,7 +223,10 @@ def field_system(
 
 
 def _without_poses(augmented: Array) -> tuple[Array, Array]:
-    """Schur complement of the pose in augmented normal equations (V, k, k): camera, pose, field, right-hand side."""
+    """Eliminate the pose from augmented normal equations (V, k, k) by the Schur complement.
+
+    The order is camera, pose, field, right-hand side.
+    """
     keep = np.r_[0:10, 16 : augmented.shape[1]]
     pose = augmented[:, 10:16, 10:16]
     cross = augmented[:, 10:16][:, :, keep]
@@ -237,7 +241,7 @@ def _second_differences(count: int) -> Array:
 
 
 def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
-    """Prior precision of all coefficients."""
+    """Return the prior precision of all coefficients."""
     ng, ny, nx, _ = field.coefficients.shape
     bent = np.kron(np.eye(ny), _second_differences(nx)) + np.kron(
         _second_differences(ny), np.eye(nx)
@@ -253,7 +257,7 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
 
 
 def _folds(system: FieldSystem) -> list[Mask]:
-    """Members that are left out together."""
+    """Return masks of the members that are left out together."""
     candidates = np.ones(len(system.group), dtype=bool)
     if len(system.designs) >= _ENOUGH_MAGNIFICATIONS:
         # The calibration does not claim to hold beyond the outermost magnifications: they are not left out.
@@ -268,7 +272,7 @@ def choose_field(
     system: FieldSystem,
     blank: ResidualField,
 ) -> FieldChoice:
-    """The strength of a field that predicts best what it has not seen, and whether the field is worthwhile at all."""
+    """Choose the strength that predicts left-out members best, and whether a field is worthwhile."""
     folds = _folds(system)
 
     def held_out(strength_px: float) -> Array:
@@ -294,7 +298,7 @@ def choose_field(
 def solve_field(
     system: FieldSystem, prior: Array, blank: ResidualField, keep: Mask | None = None
 ) -> tuple[Array, ResidualField]:
-    """Theta and field from all members, or from those that are kept."""
+    """Solve for theta and the field from all members, or from those in ``keep``."""
     every = np.ones(len(system.group), dtype=bool)
     solution = system.solve(every if keep is None else keep, prior)
     theta, coefficients = np.split(solution, [system.designs.shape[2]])

@@ -18,7 +18,7 @@ __all__ = ["collect_statistics", "describe_field", "list_undetermined"]
 
 
 def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
-    """How the residual field was chosen, or None without one."""
+    """Describe how the residual field was chosen, or return None without one."""
     if fitted is None:
         return None
     choice = fitted.choice
@@ -32,7 +32,7 @@ def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
 
 
 def list_undetermined(setup: Setup, model: CalibrationModel) -> list[str]:
-    """Warnings about what the views do not determine beyond the priors."""
+    """List warnings about parameters that the views do not determine beyond their priors."""
     warnings: list[str] = []
     covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
     assert covariance is not None

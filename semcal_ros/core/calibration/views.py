@@ -1,4 +1,4 @@
-"""Views of a planar grid: what a calibration is computed from."""
+"""Views of a planar grid, from which a calibration is computed."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ __all__ = [
     "views_from_detections",
 ]
 
-# Relative error of the size of a square that tilt, height, noise and the microscope's own scale do not explain.
+# Relative error of the size of a square that tilt, height, noise and the scale error of the
+# microscope do not explain.
 _MISFIT = 0.12
-# As a wrong magnification makes it, whatever its error.
+# Deviation at which a size counts as wrong, as from a wrong magnification, however far off it is.
 _FAR = 0.3
 
 
@@ -50,7 +51,7 @@ class GridView:
     name
         For messages and reports, such as the frame number.
     covariance_px2
-        (n, 2, 2) covariance of the observations where more than ``sigma_px`` is known, else None.
+        (n, 2, 2) covariance of the observations, or None where only ``sigma_px`` is known.
     """
 
     magnification: float
@@ -91,14 +92,14 @@ class GridView:
         return np.stack([first, -last * xy / xx, last], axis=1)
 
     def add_excess_noise(self, sigma_px: float) -> GridView:
-        """The view with corners that are more uncertain by ``sigma_px`` per axis."""
+        """Return the view with corners that are more uncertain by ``sigma_px`` per axis."""
         spread = self.covariance_px2
         if spread is not None:
             spread = spread + sigma_px**2 * np.eye(2)
         return replace(self, sigma_px=np.hypot(self.sigma_px, sigma_px), covariance_px2=spread)
 
     def chosen(self, keep: NDArray[Any]) -> GridView:
-        """The view with some of its corners, by index or mask."""
+        """Return the view with some of its corners, by index or mask."""
         spread = None if self.covariance_px2 is None else self.covariance_px2[keep]
         return replace(
             self,
@@ -185,7 +186,7 @@ class SquareAssignment:
     scale_factor
         Median ratio of the observed px per m to the nominal one of the display width.
     apparent_m
-        (v,) side that each view's magnification says, with the common ratio taken out.
+        (v,) side according to the magnification of each view, without the common ratio.
     """
 
     square_m: Array
@@ -199,7 +200,7 @@ class SquareAssignment:
 
     @property
     def misfits(self) -> Mask:
-        """(v,) views whose squares have none of the known sizes at their magnification."""
+        """(v,) whether the squares of a view have none of the known sizes at its magnification."""
         return np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT
 
 
@@ -230,7 +231,7 @@ def assign_squares(
             nearest = np.argmin(np.abs(observed[:, None] - offset - sizes[None, :]), axis=1)
             offset = float(np.median(observed - sizes[nearest]))
         deviation = np.abs(observed - offset - sizes[nearest])
-        # The mean: a size of which there are few views must not be given up for the others.
+        # The mean, so that a size with few views is not given up for the others.
         spread = float(np.mean(np.minimum(deviation, _FAR)))
         # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale decides.
         score = max(spread, 0.05) + 0.02 * abs(offset)
@@ -246,9 +247,10 @@ def assign_squares(
 
 
 def _centre_lattice(detection: LatticeDetection) -> Array:
-    """(n, 2) lattice indices with the origin at the corner nearest to the middle of the image.
+    """Return (n, 2) lattice indices with the origin at the corner nearest to the image centre.
 
-    The height of a view is that of its origin, and what its prior speaks of is the height of what is looked at.
+    The height of a view is that of its origin, and its prior refers to the height of the part of
+    the specimen in view.
     """
     middle = 0.5 * (np.array(detection.image_size, dtype=np.float64) - 1.0)
     nearest = np.argmin(np.sum((detection.xy - middle) ** 2, axis=1))
@@ -263,7 +265,7 @@ def views_from_detections(
     squares_m: Sequence[float],
     names: Sequence[str] | None = None,
 ) -> tuple[tuple[GridView, ...], SquareAssignment]:
-    """Views in metres from accepted lattice detections.
+    """Make views in metres from accepted lattice detections.
 
     Parameters
     ----------
@@ -310,14 +312,16 @@ def views_from_detections(
 
 # Median of the squared length of a normal vector in the plane, in variances per axis.
 _MEDIAN_SQUARE = 2.0 * float(np.log(2.0))
-# Ratio of variances up to which the stated uncertainties are good enough.
+# Ratio of observed to stated variances up to which the stated uncertainties are kept.
 _GOOD_ENOUGH = 1.5
 
 
 def estimate_excess_sigma_px(
     views: Sequence[GridView], residuals_px: Array, unknowns: int
 ) -> float:
-    """1-sigma per axis, px, that all corners scatter beyond their own; 0 where that is not worth a correction.
+    """Estimate the scatter of all corners beyond their own sigmas, 1-sigma per axis in px.
+
+    The result is 0 where the excess is too small for a correction.
 
     Parameters
     ----------
@@ -342,5 +346,5 @@ def estimate_excess_sigma_px(
 
 
 def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridView, ...]:
-    """The views, their corners more uncertain by ``sigma_px`` per axis."""
+    """Return the views with corners that are more uncertain by ``sigma_px`` per axis."""
     return tuple(view.add_excess_noise(sigma_px) for view in views)

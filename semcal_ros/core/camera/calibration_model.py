@@ -35,7 +35,10 @@ def checked_magnification(magnification: float) -> float:
 def design_matrix(
     functions: Mapping[str, ContinuousFunction], g: float, nominal_px_per_m: float
 ) -> Array:
-    """(10, K) matrix from all coefficients, in the order of ``FUNCTION_NAMES``, to camera parameters at ``g``."""
+    """Return the (10, K) matrix from all coefficients to the camera parameters at ``g``.
+
+    The coefficients are in the order of ``FUNCTION_NAMES``.
+    """
     blocks = [functions[name].basis(g) for name in FUNCTION_NAMES]
     blocks[0] = blocks[0] * nominal_px_per_m
     matrix = np.zeros((len(blocks), sum(len(b) for b in blocks)))
@@ -65,10 +68,10 @@ class CalibrationModel:
     method
         "joint", "discrete" or "pda".
     statistics
-        What a reader wants to know of the calibration: views, corners, residuals, held-out errors, priors and gauge,
+        Description of the calibration for its reader: views, corners, residuals, held-out errors, priors and gauge,
         convergence, warnings. Plain numbers, strings, lists and dicts.
     residual
-        What the distortion parameters do not describe, or None.
+        Distortion that the parameters do not describe, or None.
     """
 
     functions: Mapping[str, ContinuousFunction]
@@ -120,7 +123,7 @@ class CalibrationModel:
     def at(self, magnification: float) -> ScanCamera:
         """The camera at a magnification.
 
-        Outside of :attr:`magnification_range` the functions go on along their tangents in log g, ``in_range`` is
+        Outside of :attr:`magnification_range` the functions continue along their tangents in log g, ``in_range`` is
         False, and the covariance grows with the distance from the range.
 
         Raises
@@ -161,7 +164,7 @@ class CalibrationModel:
             ) from error
 
     def _extrapolation_covariance(self, g: float) -> Array:
-        """Diagonal (10, 10) allowance for not knowing how the functions go on.
+        """Return a diagonal (10, 10) allowance for the unknown course of the functions.
 
         Each parameter may leave its tangent by as much as it varied over the calibrated range, per unit of
         log g relative to the range, squared with the distance so that it starts smoothly at the edge.

@@ -1,8 +1,8 @@
 """Continuous functions of the magnification.
 
 Every kind is linear in its coefficients, ``f(g) = basis(g) @ coefficients``, so that one covariance matrix of all
-coefficients propagates exactly to any magnification. Outside of the range in which a function was determined it goes on
-along its tangent in log g; the caller flags that and widens the uncertainty.
+coefficients propagates exactly to any magnification. Outside of the range in which it was determined a function
+continues along its tangent in log g; the caller flags that and widens the uncertainty.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def _hat_row(value: float, knots: Array) -> Array:
 
 
 def _ode_row(value: float, weights: Array) -> Array:
-    """First row of the transition matrix of D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x over ``value``."""
+    """Return the first row of the transition matrix of D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x over ``value``."""
     order = len(weights)
-    # Here, so that programs that ask another kind of calibration start without scipy.
+    # Imported here so that programs that use another kind of function start without scipy.
     from scipy.linalg import expm
 
     companion = np.diag(np.ones(order - 1), 1)
@@ -48,7 +48,7 @@ def _ode_row(value: float, weights: Array) -> Array:
 
 
 def _chebyshev_row(value: float, size: int) -> Array:
-    """First Chebyshev polynomials by their recurrence: at one place faster than numpy's for many."""
+    """Return Chebyshev polynomials by their recurrence; at one value numpy is slower."""
     row = [1.0, value]
     while len(row) < size:
         row.append(2.0 * value * row[-1] - row[-2])
@@ -56,7 +56,7 @@ def _chebyshev_row(value: float, size: int) -> Array:
 
 
 def basis_row(kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array) -> Array:
-    """(size,) values of the basis functions at a magnification inside of ``g_range``."""
+    """Return (size,) values of the basis functions at a magnification inside of ``g_range``."""
     low, high = g_range
     if kind == "chebyshev_log":
         u = _unit_interval(np.log(g), np.log(low), np.log(high))
@@ -148,7 +148,7 @@ class ContinuousFunction:
         return len(self.coefficients) - len(self.breaks)
 
     def basis(self, g: float) -> Array:
-        """(size,) row such that ``value = basis(g) @ coefficients``; tangential in log g out of range."""
+        """Return the (size,) row with ``value = basis(g) @ coefficients``; tangential out of range."""
         low, high = self.g_range
         edge = min(max(g, low), high)
         row = basis_row(self.kind, self.smooth_size, edge, self.g_range, self.shape)
@@ -160,5 +160,5 @@ class ContinuousFunction:
         return np.concatenate([row, (g >= self.breaks).astype(np.float64)])
 
     def __call__(self, g: float) -> float:
-        """Value at the magnification ``g``."""
+        """Return the value at the magnification ``g``."""
         return float(self.basis(g) @ self.coefficients)

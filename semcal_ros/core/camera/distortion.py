@@ -6,7 +6,7 @@ The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortio
     f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q),      r2 = |q|^2
 
 The radial term is the closed form of the division model (Fitzgibbon 2001, doi:10.1109/CVPR.2001.990465), the tangential
-one is the reading of equation (2) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, that makes sense: the printed
+one is the consistent reading of equation (2) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed
 bracket adds a squared displacement vector to a scalar.
 """
 
@@ -30,14 +30,14 @@ _TOLERANCE = 1e-14
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Outcome of inverting the distortion.
+    """Result of inverting the distortion.
 
     Attributes
     ----------
     q
         (n, 2) normalised ideal coordinates; NaN where ``converged`` is false.
     converged
-        (n,) bool. False outside of the model's domain, or where Newton's method did not settle.
+        (n,) bool. False outside of the model's domain, or where Newton's method did not converge.
     iterations
         Number of Newton steps that were taken.
     residual
@@ -51,7 +51,7 @@ class Undistortion:
 
 
 def _radial(r2: Array, xi_r: Array) -> tuple[Array, Array]:
-    """Root ``s`` and factor ``lambda = 2 / (1 + s)``; NaN where ``4 xi_r r2 >= 1``."""
+    """Return the root ``s`` and the factor ``lambda = 2 / (1 + s)``; NaN where ``4 xi_r r2 >= 1``."""
     inside = 1.0 - 4.0 * xi_r * r2
     root = np.sqrt(np.where(inside > 0.0, inside, np.nan))
     return root, 2.0 / (1.0 + root)
@@ -72,7 +72,7 @@ def distort_normalised(q: Array, xi_r: Array | float, xi_t: Array | float) -> Ar
 def distort_jacobians(
     q: Array, xi_r: Array | float, xi_t: Array | float
 ) -> tuple[Array, Array, Array]:
-    """Distorted points with their derivatives.
+    """Distort points, with derivatives.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def distort_jacobians(
     x, y = q.T
     along = 2.0 * growth * xi_radial
     tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
-    # The points last in memory, as they are worked on; first in shape, as elsewhere.
+    # In memory the points come last, which is faster; in shape they come first, as elsewhere.
     df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((2, 2, len(q)))
     df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
     df_dq[0, 1] = along * x * y + tangential_y
@@ -136,7 +136,7 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
         settled = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
         done[active[settled]] = True
         active = active[good & ~settled & np.isfinite(size)]
-    # Rounding may keep the last step just above the tolerance: what maps back exactly is an answer.
+    # Rounding may keep the last step just above the tolerance; a point that maps back is converged.
     done |= error <= 1e-12
     q[~done] = np.nan
     return Undistortion(q, done, iterations, error)

@@ -27,19 +27,19 @@ __all__ = [
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """(n, 3, 3) matrices ``[v]`` such that ``[v] @ u`` is the cross product ``v x u``."""
+    """Return (n, 3, 3) matrices ``[v]`` such that ``[v] @ u`` is the cross product ``v x u``."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def rotations_from_vectors(vectors: Array) -> Array:
-    """(n, 3, 3) rotations of (n, 3) rotation vectors, rad."""
+    """Return the (n, 3, 3) rotations of (n, 3) rotation vectors, rad."""
     return Rotation.from_rotvec(vectors).as_matrix()
 
 
 def normalising_similarity(points: Array) -> Array:
-    """Similarity that moves the centroid to 0 and the mean distance to sqrt(2) (Hartley 1997)."""
+    """Return the similarity that makes the centroid 0 and the mean distance sqrt(2) (Hartley 1997)."""
     centre = points.mean(axis=0)
     spread = np.mean(np.hypot(*(points - centre).T))
     s = np.sqrt(2.0) / spread if spread > 0 else 1.0
@@ -47,13 +47,13 @@ def normalising_similarity(points: Array) -> Array:
 
 
 def transform_points(matrix: Array, points: Array) -> Array:
-    """(n, 2) points mapped by a (3, 3) homography."""
+    """Map (n, 2) points by a (3, 3) homography."""
     homogeneous = np.column_stack([points, np.ones(len(points))]) @ matrix.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def fit_homography(source: Array, target: Array) -> Array:
-    """(3, 3) homography with ``target ~ H source`` for (n, 2) points, n >= 4, by the normalised DLT.
+    """Fit the (3, 3) homography ``target ~ H source`` to (n, 2) points, n >= 4, by normalised DLT.
 
     Hartley and Zisserman, Multiple View Geometry, algorithm 4.2.
     """
@@ -65,8 +65,8 @@ def fit_homography(source: Array, target: Array) -> Array:
     bottom = np.hstack([zeros, ones, -b[:, 1:] * ones])
     rows = np.vstack([top, bottom])
     # The normal matrix is 9 x 9 whatever the number of points; normalised, its condition allows it.
-    # cv2.findHomography takes 0.88 ms for 250 points and this 0.40 ms, and it goes on to minimise
-    # the distances, which moves coefficients by 4e-4; the adjustment does that later.
+    # cv2.findHomography takes 0.88 ms for 250 points and this 0.40 ms. It also minimises the
+    # distances, which moves coefficients by 4e-4; the adjustment does that later.
     _, vectors = np.linalg.eigh(rows.T @ rows)
     h = np.linalg.solve(from_target, vectors[:, 0].reshape(3, 3)) @ from_source
     return h / h[2, 2]
@@ -97,7 +97,7 @@ class AffineView:
 
 
 def view_affine(board_xy_m: Array, image_xy: Array, at_px: Array) -> AffineView:
-    """Affine part and depth gradient of a view at the image point ``at_px`` (2,)."""
+    """Return the affine part and depth gradient of a view at the image point ``at_px`` (2,)."""
     h = fit_homography(board_xy_m, image_xy)
     board = np.linalg.solve(h, np.append(at_px, 1.0))
     board = board[:2] / board[2]
@@ -107,7 +107,7 @@ def view_affine(board_xy_m: Array, image_xy: Array, at_px: Array) -> AffineView:
 
 
 def rotation_from_affine(matrix: Array, gradient: Array) -> Array:
-    """(3, 3) proper rotation whose upper left block is ``matrix`` scaled to largest singular value 1.
+    """Return the rotation whose upper left block is ``matrix`` scaled to largest singular value 1.
 
     The sign of the tilt makes the third row agree with ``gradient`` (depth grows away from the gun); the mirrored
     solution is :func:`mirrored_tilt`.
@@ -124,6 +124,6 @@ def rotation_from_affine(matrix: Array, gradient: Array) -> Array:
 
 
 def mirrored_tilt(rotations: Array) -> Array:
-    """Rotations (n, 3, 3) with the same view under parallel projection and the opposite tilt."""
+    """Return rotations (n, 3, 3) of opposite tilt with the same view under parallel projection."""
     sign = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
     return rotations * sign

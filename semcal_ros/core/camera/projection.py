@@ -62,7 +62,10 @@ class ProjectionJacobians:
 
 
 def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
-    """Undistorted pixels (n, 2); ``parameters`` has shape (10,) or (n, 10). NaN at or behind the pivot."""
+    """Project points to undistorted pixels (n, 2); NaN at or behind the pivot.
+
+    ``parameters`` has shape (10,) or (n, 10).
+    """
     m, a, skew, px, py, rho = np.moveaxis(parameters[..., :6], -1, 0)
     w = 1.0 + rho * xyz_m[:, 2]
     scale = m / np.where(w > 0.0, w, np.nan)
@@ -72,7 +75,7 @@ def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
 
 
 def project_points(parameters: Array, xyz_m: Array, norm_px: float) -> Array:
-    """Raw (distorted) pixels (n, 2); NaN where the model has no answer."""
+    """Project points to raw (distorted) pixels (n, 2); NaN where the model has no answer."""
     centre = parameters[..., 8:10]
     q = (project_ideal_points(parameters, xyz_m) - centre) / norm_px
     return centre + norm_px * distort_normalised(q, parameters[..., 6], parameters[..., 7])
@@ -81,9 +84,9 @@ def project_points(parameters: Array, xyz_m: Array, norm_px: float) -> Array:
 def project_points_with_jacobians(
     parameters: Array, xyz_m: Array, norm_px: float
 ) -> ProjectionJacobians:
-    """Raw pixels with analytic derivatives; shapes as in :class:`ProjectionJacobians`.
+    """Project points to raw pixels, with analytic derivatives.
 
-    In memory the points come last, so that every derivative of all points lies together.
+    In memory the points come last, so that each derivative of all points is contiguous.
     """
     n = len(xyz_m)
     table = np.broadcast_to(parameters, (n, 10))

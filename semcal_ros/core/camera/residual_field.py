@@ -1,4 +1,4 @@
-"""Residual field: what two distortion parameters cannot describe of a scan.
+"""Residual field: the distortion of a scan that two parameters cannot describe.
 
 Spiral distortion, non-linear scan coils and the settling of the beam at the start of a line are smooth displacements
 of the image that no small set of parameters covers. They are held by a tensor-product B-spline over the raw pixel and
@@ -9,9 +9,9 @@ log g (design section 4): a raw pixel x would lie at
 if there were only the parametric distortion, with ``c`` the middle of the image and ``n`` half its width. Being defined
 on the raw pixel, the field corrects observations by a fixed linear map of its coefficients.
 
-The knots are denser at the start of the lines, where the beam settles. The field leaves alone what the rest of the
-model describes: shifts, linear maps, and the patterns of the radial and of the tangential distortion. Two ways to say
-the same would leave the pixel size undefined.
+The knots are denser at the start of the lines, where the beam settles. The field excludes what the rest of the
+model describes: shifts, linear maps, and the patterns of the radial and of the tangential distortion. Otherwise two
+descriptions of the same displacement would leave the pixel size undefined.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def _clamped(breaks: Array, degree: int) -> Array:
 
 
 def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
-    """(n, size) values of the basis functions; outside of the knots those of their ends."""
-    # Here, so that programs that ask a calibration without a residual field start without scipy.
+    """Return (n, size) values of the basis functions, constant beyond the outermost knots."""
+    # Imported here so that programs without a residual field start without scipy.
     from scipy.interpolate import BSpline
 
     inside = np.clip(values, knots[0], knots[-1])
@@ -53,7 +53,7 @@ def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
 
 
 def _spline_slopes(values: Array, knots: Array) -> Array:
-    """(n, size) derivatives of the basis functions; outside of the knots there are none."""
+    """Return (n, size) derivatives of the basis functions, zero beyond the outermost knots."""
     from scipy.interpolate import BSpline
 
     size = len(knots) - _DEGREE - 1
@@ -85,13 +85,13 @@ class FieldSlice:
     cross_covariance: Array | None = None
 
     def basis(self, q: Array) -> Array:
-        """(n, ny nx) products of the basis functions at normalised raw positions (n, 2)."""
+        """Return (n, ny nx) products of the basis functions at normalised raw positions (n, 2)."""
         x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
         y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
         return (y[:, :, None] * x[:, None, :]).reshape(len(q), -1)
 
     def displacement(self, q: Array) -> Array:
-        """(n, 2) displacement at normalised raw positions (n, 2); NaN where the position is."""
+        """Return the (n, 2) displacement at normalised raw positions (n, 2); NaN at NaN positions."""
         out = np.full_like(q, np.nan)
         known = np.all(np.isfinite(q), axis=1)
         ny, nx, _ = self.coefficients.shape
@@ -102,7 +102,7 @@ class FieldSlice:
         return out
 
     def gradient(self, q: Array) -> Array:
-        """(n, 2, 2) derivative of the displacement by the position; finite positions only."""
+        """Return the (n, 2, 2) derivative of the displacement by position; finite positions only."""
         ny, nx, _ = self.coefficients.shape
         (x, dx), (y, dy) = (
             (_spline_rows(v, knots, _DEGREE), _spline_slopes(v, knots))
@@ -114,9 +114,9 @@ class FieldSlice:
         return np.stack([by_x, by_y], axis=2)
 
     def inverse(self, target: Array) -> Array:
-        """Raw positions (n, 2) that the field moves to ``target`` (n, 2); NaN where there are none.
+        """Return raw positions (n, 2) that the field moves to ``target`` (n, 2); NaN without one.
 
-        By Newton's method, from the displacement at the target.
+        Newton's method starts from the displacement at the target.
         """
         q = target - self.displacement(target)
         active = np.flatnonzero(np.all(np.isfinite(q), axis=1))
@@ -184,7 +184,7 @@ class ResidualField:
         return self.size // len(self.coefficients)
 
     def weights(self, g: float) -> Array:
-        """(ng,) weights of the coefficients at a magnification; they are positive and sum to 1."""
+        """Return (ng,) weights of the coefficients at a magnification, none negative, of sum 1."""
         count = len(self.coefficients)
         low, high = np.log(self.g_range)
         if count == 1 or low == high:
@@ -196,7 +196,7 @@ class ResidualField:
     def at(
         self, g: float, covariance: Array | None = None, cross: Array | None = None
     ) -> FieldSlice:
-        """The field at a magnification.
+        """Return the field at a magnification.
 
         ``covariance`` (size, size) of all coefficients and ``cross`` (10, size) with the camera at ``g`` are optional.
         """
@@ -216,7 +216,7 @@ class ResidualField:
         )
 
     def overlaps(self) -> Array:
-        """(8, slice_size) inner products with what the rest of the model describes.
+        """Return (8, slice_size) inner products with the patterns of the rest of the model.
 
         These are the shifts, the linear maps, and the patterns of the radial and of the tangential distortion, each
         with a mean square of 1 over the domain. A field whose coefficients they annul leaves all of that to the camera
@@ -237,7 +237,7 @@ class ResidualField:
 
 
 def _quadrature(knots_x: Array, knots_y: Array) -> tuple[Array, Array]:
-    """Gauss nodes (n, 2) over the cells of the knots and their weights (n,), which sum to 1.
+    """Return Gauss nodes (n, 2) over the cells of the knots and weights (n,) of sum 1.
 
     Six nodes are exact for a cubic spline times a pattern of third degree.
     """
@@ -256,7 +256,7 @@ def _quadrature(knots_x: Array, knots_y: Array) -> tuple[Array, Array]:
 def zero_field(
     image_size: tuple[int, int], g_range: tuple[float, float], count: int
 ) -> ResidualField:
-    """A field without displacement, with ``count`` coefficients in log g."""
+    """Make a field without displacement, with ``count`` coefficients in log g."""
     aspect = image_size[1] / image_size[0]
     knots_x = _clamped(np.array(_BREAKS_X), _DEGREE)
     knots_y = _clamped(aspect * np.array(_BREAKS_Y), _DEGREE)

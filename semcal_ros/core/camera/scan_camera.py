@@ -24,7 +24,7 @@ __all__ = ["ScanCamera", "as_points"]
 
 
 def as_points(values: ArrayLike, dimensions: int) -> Array:
-    """``values`` as an (n, dimensions) float64 array, or :class:`InvalidValueError`."""
+    """Return ``values`` as an (n, dimensions) float64 array, or raise :class:`InvalidValueError`."""
     points = np.asarray(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != dimensions:
         raise InvalidValueError(
@@ -65,7 +65,7 @@ class ScanCamera:
     in_range
         False when ``magnification`` lies outside of the calibrated range.
     residual
-        What the distortion parameters do not describe (see :mod:`semcal_ros.core.camera.residual_field`), or None.
+        Distortion that the parameters do not describe (see :mod:`semcal_ros.core.camera.residual_field`), or None.
 
     Examples
     --------
@@ -110,7 +110,7 @@ class ScanCamera:
     def nominal(
         cls, magnification: float, width: int, height: int, display_width_m: float
     ) -> ScanCamera:
-        """The camera that the display width alone predicts: parallel projection, no distortion.
+        """Return the camera that the display width alone predicts: parallel, without distortion.
 
         Its covariance is that of an instrument that nobody has calibrated: a scale good to 3 %, an
         axis within 3 % of the width from the middle, an unknown distortion of a few tenths of a
@@ -151,15 +151,15 @@ class ScanCamera:
     # -- projection -------------------------------------------------------------------------------
 
     def project(self, xyz_m: ArrayLike) -> Array:
-        """Raw (distorted) pixels (n, 2) of sem-frame points (n, 3) in m; NaN where there is none."""
+        """Project sem-frame points (n, 3) in m to raw (distorted) pixels (n, 2); NaN without one."""
         return self.distort(self.project_ideal(xyz_m))
 
     def project_ideal(self, xyz_m: ArrayLike) -> Array:
-        """Undistorted pixels (n, 2) of sem-frame points (n, 3) in m."""
+        """Project sem-frame points (n, 3) in m to undistorted pixels (n, 2)."""
         return project_ideal_points(self.parameters, as_points(xyz_m, 3))
 
     def project_sigma(self, xyz_m: ArrayLike) -> Array:
-        """1-sigma (n, 2) in px of :meth:`project`, from the covariance of the calibration.
+        """Return 1-sigma (n, 2) in px of :meth:`project`, from the covariance of the calibration.
 
         Raises
         ------
@@ -178,7 +178,10 @@ class ScanCamera:
         return np.sqrt(np.maximum(variance, 0.0))
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
-        """Derivative (n, 2, 10 + F) of :meth:`project` by the parameters and by the F coefficients of the field."""
+        """Return the derivative (n, 2, 10 + F) of :meth:`project`.
+
+        It is by the 10 parameters, followed by the F coefficients of the residual field.
+        """
         points = as_points(xyz_m, 3)
         jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
         if self.residual is None:
@@ -211,7 +214,7 @@ class ScanCamera:
         )
 
     def sem_from_ideal(self, xy: ArrayLike, z_m: float = 0.0) -> Array:
-        """Sem-frame points (n, 3) in m at height ``z_m`` that are seen at undistorted pixels (n, 2)."""
+        """Return the sem-frame points (n, 3) in m at height ``z_m`` of undistorted pixels (n, 2)."""
         points = as_points(xy, 2)
         w = 1.0 + self.rho * z_m
         if w <= 0.0:
@@ -229,38 +232,38 @@ class ScanCamera:
         return np.array([self.ex, self.ey])
 
     def _normalised(self, xy: Array) -> Array:
-        """Pixels in half image widths from the middle of the image, as the residual field takes them."""
+        """Return pixels in half image widths from the image centre, as for the residual field."""
         return (xy - 0.5 * np.array([self.width - 1.0, self.height - 1.0])) / self.norm_px
 
     def without_residual(self, xy: ArrayLike) -> Array:
-        """Where raw pixels (n, 2) would lie if there were only the parametric distortion."""
+        """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
         points = as_points(xy, 2)
         if self.residual is None:
             return points
         return points + self.norm_px * self.residual.displacement(self._normalised(points))
 
     def _with_residual(self, xy: Array) -> Array:
-        """Inverse of :meth:`without_residual`."""
+        """Invert :meth:`without_residual`."""
         if self.residual is None:
             return xy
         q = self._normalised(xy)
         return xy + self.norm_px * (self.residual.inverse(q) - q)
 
     def distort(self, xy: ArrayLike) -> Array:
-        """Raw pixels (n, 2) of undistorted pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
+        """Distort undistorted pixels (n, 2) to raw pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
         q = (as_points(xy, 2) - self._centre) / self.norm_px
         parametric = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t)
         return self._with_residual(parametric)
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """Undistorted pixels (n, 2) of raw pixels (n, 2).
+        """Undistort raw pixels (n, 2) to undistorted pixels (n, 2).
 
         Rows are NaN where the model has no answer; :meth:`undistort_report` says why.
         """
         return self._centre + self.norm_px * self.undistort_report(xy).q
 
     def undistort_report(self, xy: ArrayLike) -> Undistortion:
-        """As :meth:`undistort`, in normalised coordinates and with convergence flags and residuals."""
+        """Undistort to normalised coordinates, with convergence flags and residuals."""
         q_d = (self.without_residual(xy) - self._centre) / self.norm_px
         return undistort_normalised(q_d, self.xi_r, self.xi_t)
 
@@ -336,9 +339,9 @@ class ScanCamera:
     # -- other image sizes ------------------------------------------------------------------------
 
     def resized(self, width: int, height: int) -> ScanCamera:
-        """The same field of view sampled with another number of pixels.
+        """Return the camera of the same field of view sampled with another number of pixels.
 
-        The field width is kept and the pixels stay as they are in shape, so a change of the height-to-width ratio
+        The field width and the shape of the pixels are kept, so a change of the height-to-width ratio
         crops or extends the field symmetrically about the image centre.
         """
         if (width, height) == (self.width, self.height):

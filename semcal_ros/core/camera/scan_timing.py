@@ -1,7 +1,7 @@
 """When each pixel of a scanned frame was acquired.
 
-The beam visits pixels one after the other, so a frame is no instant: with a frame period ``T`` over ``rows`` lines and
-a flyback that takes the fraction ``f`` of each line, pixel (row, col) of pass ``k`` is seen at
+The beam visits pixels one after the other, so a frame has no single time: with a frame period ``T`` over ``rows`` lines and
+a flyback that takes the fraction ``f`` of each line, pixel (row, col) of pass ``k`` is acquired at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 
@@ -63,11 +63,11 @@ class ScanTiming:
 
     @property
     def pass_variance_s2(self) -> float:
-        """Variance of the times at which the passes see one pixel, s^2."""
+        """Variance of the times at which the passes acquire one pixel, s^2."""
         return self.frame_time_s**2 * (self.averages**2 - 1) / 12.0
 
     def pixel_offset_s(self, row: ArrayLike, col: ArrayLike, rows: int, cols: int) -> Array:
-        """Mean time of pixels over all passes, in seconds after the stamp.
+        """Return the mean time of pixels over all passes, in seconds after the stamp.
 
         Parameters
         ----------
