@@ -142,8 +142,8 @@ def refine(
     """Minimise the robust reprojection error from ``state``.
 
     With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost
-    that ends the iteration. The function never raises for lack of convergence: the result says how it
-    ended.
+    that ends the iteration. The function never raises for lack of convergence: the result says how
+    it ended.
     """
     costs = view_costs(problem, state)
     cost = float(costs.sum()) + prior_cost(problem, state)

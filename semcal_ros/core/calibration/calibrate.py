@@ -138,8 +138,8 @@ class CalibrationResult:
     fit
         Poses and residuals of these views under the model.
     held_out_rms_px
-        RMS reprojection error of each magnification's views under a calibration from all others; the two outermost
-        ones are extrapolated.
+        RMS reprojection error of each magnification's views under a calibration from all others;
+        the two outermost ones are extrapolated.
     warnings
         Plain sentences about what the data could not determine.
     outliers
@@ -206,7 +206,8 @@ def calibrate_views(
     Parameters
     ----------
     views
-        Views at one or more magnifications; three per magnification with different tilts are enough.
+        Views at one or more magnifications; three per magnification with different tilts are
+        enough.
     image_size
         (width, height) of the images, px.
     display_width_m
@@ -214,8 +215,8 @@ def calibrate_views(
     options
         Method, breakpoints and residual field; None for the defaults.
     priors
-        Weak prior knowledge; the defaults suit any SEM, and follow the views where their perspective is that of a
-        photograph.
+        Weak prior knowledge; the defaults suit any SEM, and follow the views where their
+        perspective is that of a photograph.
     on_stage
         Called with the name of the stage that begins and the fraction of the work that is done, 0
         to 1 (only ``"joint"``, which starts again after leaving out views).

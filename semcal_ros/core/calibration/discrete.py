@@ -1,9 +1,9 @@
 """Calibration of each magnification on its own: Algorithm 2 of the paper (method "discrete").
 
-Per magnification: scale and poses with zero distortion, the distortion centre by Algorithm 1, then bundle adjustment of
-everything from zero distortion. Where there is no distortion, its centre is put on the image centre and only the
-tangential term is estimated. Directions that one magnification cannot determine (principal point and pivot distance at
-high magnification) are held by the priors.
+Per magnification: scale and poses with zero distortion, the distortion centre by Algorithm 1, then
+bundle adjustment of everything from zero distortion. Where there is no distortion, its centre is
+put on the image centre and only the tangential term is estimated. Directions that one magnification
+cannot determine (principal point and pivot distance at high magnification) are held by the priors.
 """
 
 from __future__ import annotations

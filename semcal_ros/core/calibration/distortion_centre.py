@@ -1,9 +1,10 @@
 """Evidence of radial distortion and its centre (Algorithm 1 of the paper).
 
-The centre is the common left epipole of the radial fundamental matrices between a plane and its images (Hartley and
-Kang 2007, doi:10.1109/TPAMI.2007.1147). Without distortion the matrices are arbitrary. The paper detects that by an
-error below 1e-3 px, which no real corner reaches; here an F-test asks whether the plane's homography leaves anything
-but noise, and the fixed threshold stays as an option.
+The centre is the common left epipole of the radial fundamental matrices between a plane and its
+images (Hartley and Kang 2007, doi:10.1109/TPAMI.2007.1147). Without distortion the matrices are
+arbitrary. The paper detects that by an error below 1e-3 px, which no real corner reaches; here an
+F-test asks whether the plane's homography leaves anything but noise, and the fixed threshold stays
+as an option.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class DistortionCentre:
 def _radial_fundamental(board: Array, image: Array, from_image: Array) -> Array:
     """Return the (3, 3) F with image' F board = 0 in normalised coordinates; unit norm, rank 2.
 
-    Normalised 8-point algorithm. ``from_image`` normalises the image of all views alike, so that their matrices share
-    the left epipole.
+    Normalised 8-point algorithm. ``from_image`` normalises the image of all views alike, so that
+    their matrices share the left epipole.
     """
     b = np.column_stack(
         [transform_points(normalising_similarity(board), board), np.ones(len(board))]
@@ -94,7 +95,8 @@ def find_distortion_centre(
     views
         Views of at least 12 corners each (the cubic needs 10); those with fewer are ignored.
     tau_px
-        With a value, the paper's threshold on the RMS homography error decides instead of the F-test.
+        With a value, the paper's threshold on the RMS homography error decides instead of the
+        F-test.
     """
     usable = [v for v in views if len(v.board_xy_m) >= 12]
     mean = np.mean([v.image_xy.mean(axis=0) for v in views], axis=0)

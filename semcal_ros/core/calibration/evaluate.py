@@ -59,8 +59,9 @@ def fit_poses(
 ) -> ViewPose:
     """Fit the pose of every view with the camera of its magnification held fixed.
 
-    ``height_sigma_m`` is the prior 1-sigma of the heights, one number or (V,). ``starts`` are rotations (V, 3, 3) and
-    translations (V, 3) near the solution; without starts both signs of the tilt are tried.
+    ``height_sigma_m`` is the prior 1-sigma of the heights, one number or (V,). ``starts`` are
+    rotations (V, 3, 3) and translations (V, 3) near the solution; without starts both signs of the
+    tilt are tried.
 
     Raises
     ------

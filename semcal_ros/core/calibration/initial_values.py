@@ -42,8 +42,8 @@ class InitialValues:
     rotations, translations_m
         (V, 3, 3) and (V, 3).
     wide
-        Whether the perspective within the widest view is so strong that it determines ``rho`` by itself, as in a
-        photograph.
+        Whether the perspective within the widest view is so strong that it determines ``rho`` by
+        itself, as in a photograph.
     """
 
     scale_factor: float
@@ -94,7 +94,8 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     Returns
     -------
     rotations, translations_m
-        (2, 3, 3) and (2, 3): the pose from the affine part of the undistorted view, and its mirrored tilt.
+        (2, 3, 3) and (2, 3): the pose from the affine part of the undistorted view, and its
+        mirrored tilt.
 
     Raises
     ------

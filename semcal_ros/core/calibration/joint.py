@@ -1,7 +1,8 @@
 """The default calibration: one adjustment over all images at all magnifications.
 
-Its unknowns are the coefficients of the continuous functions themselves, so a magnification with few views borrows
-from its neighbours, and nothing needs to be interpolated afterwards (design section 6.4).
+Its unknowns are the coefficients of the continuous functions themselves, so a magnification with
+few views borrows from its neighbours, and nothing needs to be interpolated afterwards (design
+section 6.4).
 """
 
 from __future__ import annotations
@@ -143,8 +144,9 @@ class JointFit:
     adjustment
         The adjustment with the chosen number of coefficients.
     padded, covariance
-        The same functions with a few more coefficients, which are zero, and the covariance of all of them, followed by
-        that of the coefficients of the field, for unit variance of the residuals.
+        The same functions with a few more coefficients, which are zero, and the covariance of all
+        of them, followed by that of the coefficients of the field, for unit variance of the
+        residuals.
     field
         The residual field, or None.
     excess_px
@@ -225,7 +227,8 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
     problem = build_problem(setup, functions, setup.views, height)
     result = adjust(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
     for _ in range(_HEIGHT_UPDATES):
-        # Before anything is selected: too wide a prior of the heights would let them imitate the scale.
+        # Before anything is selected: too wide a prior of the heights would let them imitate the
+        # scale.
         height = _update_height_sigma(setup, result)
         problem = replace(problem, height_sigma_m=height)
         result = refine(problem, result.state, tolerance=_COARSE)
@@ -370,10 +373,11 @@ def fit_joint(
 ) -> JointFit:
     """Calibrate from nominal values alone.
 
-    The poses come first, with a camera that does not depend on the magnification; then moderately flexible functions,
-    both from a part of the corners; from there the number of coefficients of every function is chosen by leaving out
-    one magnification at a time, until the choice no longer changes. With ``residual`` ``"on"``, or ``"auto"`` where
-    cross-validation finds it worthwhile, a residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
+    The poses come first, with a camera that does not depend on the magnification; then moderately
+    flexible functions, both from a part of the corners; from there the number of coefficients of
+    every function is chosen by leaving out one magnification at a time, until the choice no longer
+    changes. With ``residual`` ``"on"``, or ``"auto"`` where cross-validation finds it worthwhile, a
+    residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
     """
     thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
     on_stage("start values", 0.0)

@@ -130,9 +130,9 @@ def select_functions(
 ) -> dict[str, tuple[str, int]]:
     """Choose (kind, size) of the functions named in ``free`` greedily.
 
-    Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the cross-validation gains
-    more than :data:`_GAIN_PER_COEFFICIENT` for each, and removed where that costs less. The ``current``
-    choice stays unless another one is clearly better.
+    Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the
+    cross-validation gains more than :data:`_GAIN_PER_COEFFICIENT` for each, and removed where that
+    costs less. The ``current`` choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions)
     limit = min(_MAX_SIZE, len(setup.magnifications) - 1)

@@ -1,9 +1,9 @@
 """Reprojection errors of grid views, and their normal equations with the poses eliminated.
 
-The unknowns are one vector ``theta`` of coefficients, from which the camera of each magnification follows linearly
-(``camera = design @ theta``), and six pose unknowns per view. The poses are eliminated view by view (Schur complement),
-so the reduced system has the size of ``theta`` for any number of views; a view leaves a 10 x 10 information matrix on
-the camera of its magnification.
+The unknowns are one vector ``theta`` of coefficients, from which the camera of each magnification
+follows linearly (``camera = design @ theta``), and six pose unknowns per view. The poses are
+eliminated view by view (Schur complement), so the reduced system has the size of ``theta`` for any
+number of views; a view leaves a 10 x 10 information matrix on the camera of its magnification.
 
 Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 6.
 """
@@ -52,7 +52,8 @@ class Problem:
     Attributes
     ----------
     board_m, observed_px
-        (N, 3) and (N, 2): grid points, and observed raw pixels (corrected by the residual field where there is one).
+        (N, 3) and (N, 2): grid points, and observed raw pixels (corrected by the residual field
+        where there is one).
     whitening
         (N, 3): the lower triangle (xx, yx, yy) that turns a residual into one of unit covariance.
     starts
@@ -259,7 +260,10 @@ def normal_equations(problem: Problem, state: State) -> NormalEquations:
 def schur_complement(
     problem: Problem, normal: NormalEquations, damping: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Eliminate the poses: information (M, 10, 10), gradient (M, 10), V^-1 W' and V^-1 b per view."""
+    """Eliminate the poses.
+
+    Returns information (M, 10, 10) and gradient (M, 10), and V^-1 W' and V^-1 b for each view.
+    """
     pose = normal.matrix[:, 10:, 10:].copy()
     diagonal = np.arange(6)
     pose[:, diagonal, diagonal] *= 1.0 + damping

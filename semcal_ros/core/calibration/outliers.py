@@ -27,8 +27,8 @@ from semcal_ros.core.errors import Rejection
 __all__ = ["ChangePoint", "find_change_point", "find_outliers"]
 
 
-# Gain in half chi-squares, 2.7 standard deviations: a recording without a jump is suspected in one of
-# twenty cases.
+# Gain in half chi-squares, 2.7 standard deviations: a recording without a jump is suspected in one
+# of twenty cases.
 _LEAST_GAIN = 3.65
 
 
@@ -53,8 +53,8 @@ class ChangePoint:
 def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> ChangePoint | None:
     """Find the jump that would improve an adjustment most, or None if none is significant.
 
-    ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has are
-    left out.
+    ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has
+    are left out.
     """
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
@@ -98,8 +98,8 @@ _FEW = 0.1
 def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the views that disagree with the others; index and reason of each.
 
-    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification disagree, or many in
-    all, the fault is not in single views, and none is returned.
+    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification
+    disagree, or many in all, the fault is not in single views, and none is returned.
     """
     height = result.state.translations_m[:, 2]
     square = np.add.reduceat(

@@ -1,10 +1,11 @@
 """Principal differential analysis of separate calibrations: appendix A of the paper (method "pda").
 
 Each parameter x(g) is taken to obey a linear differential equation with constant coefficients,
-``D^k x + w_(k-1) D^(k-1) x + ... + w_0 x = 0`` (16)-(18). Derivatives come from finite differences, the weights w from
-weighted least squares (19)-(21), and the equation is solved through fitted boundary values. Equation (21) is printed as
-``(A'A)^-1 A b``; this module uses ``-(A'A)^-1 A' b``. The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials
-of degree 3 and 5 prone to oscillate; all of these can be selected here so that the comparison can be repeated.
+``D^k x + w_(k-1) D^(k-1) x + ... + w_0 x = 0`` (16)-(18). Derivatives come from finite differences,
+the weights w from weighted least squares (19)-(21), and the equation is solved through fitted
+boundary values. Equation (21) is printed as ``(A'A)^-1 A b``; this module uses ``-(A'A)^-1 A' b``.
+The paper keeps order 2 and finds 3 and 4 worse, and Legendre polynomials of degree 3 and 5 prone to
+oscillate; all of these can be selected here so that the comparison can be repeated.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Ar
         derivatives.append(np.gradient(derivatives[-1], position, edge_order=1))
     a = np.stack(derivatives[:order], axis=1) * weight[:, None]
     b = derivatives[order] * weight
-    # Column scaling: the derivatives differ by orders of magnitude, and lstsq cuts small singular values.
+    # Column scaling: the derivatives differ by orders of magnitude, and lstsq cuts small singular
+    # values.
     scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     return -np.linalg.lstsq(a / scale, b, rcond=1e-10)[0] / scale
 
@@ -81,8 +83,8 @@ def pda_functions(
     Returns
     -------
     functions, covariance
-        One function per parameter and the covariance of all coefficients. Correlations between parameters are
-        not known to this method and are left at zero.
+        One function per parameter and the covariance of all coefficients. Correlations between
+        parameters are not known to this method and are left at zero.
 
     Raises
     ------

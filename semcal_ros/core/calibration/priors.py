@@ -23,9 +23,11 @@ class Priors:
     Attributes
     ----------
     centre_fraction, distortion_centre_fraction
-        1-sigma of the principal point and of the distortion centre about the image centre, in image widths.
+        1-sigma of the principal point and of the distortion centre about the image centre, in image
+        widths.
     rho_mean, rho_sigma
-        Inverse pivot distance, 1/m: 20 mm is typical, and 8 mm as well as a parallel projection are within 1.5 sigma.
+        Inverse pivot distance, 1/m: 20 mm is typical, and 8 mm as well as a parallel projection are
+        within 1.5 sigma.
     xi_r_sigma, xi_t_sigma
         Distortion about zero.
     aspect_sigma, skew_sigma, scale_sigma
@@ -33,9 +35,10 @@ class Priors:
     scale_jump, aspect_jump, skew_jump
         1-sigma of the jump at a breakpoint.
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
-        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times k squared. A few
-        times what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors promise of a
-        magnification. A change that the data do not determine is uncertain by this much, and not assumed to be zero.
+        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times
+        k squared. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
+        what vendors promise of a magnification. A change that the data do not determine is
+        uncertain by this much, and not assumed to be zero.
     """
 
     centre_fraction: float = 0.08

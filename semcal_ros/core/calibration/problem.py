@@ -114,7 +114,7 @@ def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> Bundle
 
 
 def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
-    """Fit the poses from both signs of the tilt; return the better ones and the number of changes."""
+    """Fit the poses from both signs of the tilt; return the better ones and how many changed."""
     pairs = zip(problem.starts[:-1], problem.starts[1:], strict=True)
     middle = np.stack([problem.board_m[a:b].mean(axis=0) for a, b in pairs])
     rotations = mirrored_tilt(state.rotations)

@@ -36,7 +36,8 @@ __all__ = [
 ]
 
 
-# Standard deviations of a coefficient that are tried, px: from less than the noise to a camera lens.
+# Standard deviations of a coefficient that are tried, px: from less than the noise to a camera
+# lens.
 _STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
 # A prior this narrow holds the field at zero; the same equations then serve without a field.
 _NO_STRENGTH_PX = 1e-7
@@ -87,7 +88,7 @@ class FieldSystem:
     theta_precision: Array
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
-        """Assemble the normal equations of theta and the field, whose prior precision is ``prior``."""
+        """Assemble the normal equations of theta and the field, which has precision ``prior``."""
         count, width = len(self.designs), self.right.shape[1]
         blocks, rights = np.zeros((count, width, width)), np.zeros((count, width))
         for v in np.flatnonzero(keep):
@@ -111,7 +112,7 @@ class FieldSystem:
         return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
 
     def solve(self, keep: Mask, prior: Array) -> Array:
-        """Solve for theta followed by the coefficients of the field, from the members in ``keep``."""
+        """Solve for theta followed by the coefficients of the field, from members in ``keep``."""
         matrix, right = self.assembled(keep, prior)
         scaled, scale = equilibrate(matrix)
         factor = cho_factor(scaled, check_finite=False)
@@ -180,8 +181,8 @@ def field_system(
 ) -> FieldSystem:
     """Compute the reduced system about an adjustment.
 
-    ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the ones that ``field`` has
-    corrected. Weights are scaled to the variance that the residuals show.
+    ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the ones that
+    ``field`` has corrected. Weights are scaled to the variance that the residuals show.
     """
     variance = variance_factor(problem, result)
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
@@ -194,7 +195,8 @@ def field_system(
         part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
         spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px)
         rows = np.zeros((2, width, len(spline)))
-        # Observed plus field minus projected: the field counts as a projection that moves the other way.
+        # Observed plus field minus projected: the field counts as a projection that moves the other
+        # way.
         rows[0, 16:-1:2] = rows[1, 17:-1:2] = -setup.norm_px * spline.T
         whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
         rows[:, :16] = whitened.rows[:, :16, part]
@@ -260,7 +262,8 @@ def _folds(system: FieldSystem) -> list[Mask]:
     """Return masks of the members that are left out together."""
     candidates = np.ones(len(system.group), dtype=bool)
     if len(system.designs) >= _ENOUGH_MAGNIFICATIONS:
-        # The calibration does not claim to hold beyond the outermost magnifications: they are not left out.
+        # The calibration does not claim to hold beyond the outermost magnifications: they are not
+        # left out.
         candidates[[0, -1]] = False
     order = np.cumsum(candidates) - 1
     folds = min(_MAX_FOLDS, int(candidates.sum()))
@@ -272,7 +275,7 @@ def choose_field(
     system: FieldSystem,
     blank: ResidualField,
 ) -> FieldChoice:
-    """Choose the strength that predicts left-out members best, and whether a field is worthwhile."""
+    """Choose the strength that predicts left-out members best, and whether to have a field."""
     folds = _folds(system)
 
     def held_out(strength_px: float) -> Array:

@@ -82,7 +82,7 @@ class GridView:
 
     @property
     def whitening(self) -> Array:
-        """(n, 3) lower triangle (xx, yx, yy) of the matrix that gives observation errors unit covariance."""
+        """(n, 3) lower triangle (xx, yx, yy) of the matrix that whitens the observation errors."""
         if self.covariance_px2 is None:
             weight = 1.0 / self.sigma_px
             return np.stack([weight, np.zeros_like(weight), weight], axis=1)
@@ -209,9 +209,9 @@ def assign_squares(
 ) -> SquareAssignment:
     """Find the square size of each view from how all spacings change with the magnification.
 
-    ``spacing_px / nominal_px_per_m`` is the square size up to one factor common to all views (a wrong display width).
-    Among all factors that map the observed sizes onto the known ones, the one with the smallest spread wins, and of
-    equally good ones the one nearest to 1.
+    ``spacing_px / nominal_px_per_m`` is the square size up to one factor common to all views (a
+    wrong display width). Among all factors that map the observed sizes onto the known ones, the one
+    with the smallest spread wins, and of equally good ones the one nearest to 1.
 
     Parameters
     ----------
@@ -233,7 +233,8 @@ def assign_squares(
         deviation = np.abs(observed - offset - sizes[nearest])
         # The mean, so that a size with few views is not given up for the others.
         spread = float(np.mean(np.minimum(deviation, _FAR)))
-        # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale decides.
+        # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale
+        # decides.
         score = max(spread, 0.05) + 0.02 * abs(offset)
         if best is None or score < best[0]:
             best = (score, offset)

@@ -1,1 +1,1 @@
-"""The scan camera: projection, distortion, and their parameters as functions of the magnification."""
+"""The scan camera: projection and distortion, and parameters as functions of the magnification."""

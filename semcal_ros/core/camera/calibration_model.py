@@ -18,12 +18,19 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["FUNCTION_NAMES", "CalibrationModel", "checked_magnification", "design_matrix"]
 
 
-# The scale is kept relative to the nominal one, width g / display width, so that it is a number near 1 at every g.
+# The scale is kept relative to the nominal one, width g / display width, so that it is a number
+# near 1 at every g.
 FUNCTION_NAMES: tuple[str, ...] = ("scale", *PARAMETER_NAMES[1:])
 
 
 def checked_magnification(magnification: float) -> float:
-    """The magnification as a float, or :class:`InvalidValueError` if it is not finite and positive."""
+    """Return the magnification as a float.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is not finite and positive.
+    """
     g = float(magnification)
     if not (np.isfinite(g) and g > 0.0):
         raise InvalidValueError(
@@ -58,7 +65,8 @@ class CalibrationModel:
     functions
         One :class:`ContinuousFunction` per name in ``FUNCTION_NAMES``.
     covariance
-        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``, then of the residual field.
+        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``, then of the
+        residual field.
     image_width, image_height
         Size in px of the calibration images (without databar).
     display_width_m
@@ -68,8 +76,8 @@ class CalibrationModel:
     method
         "joint", "discrete" or "pda".
     statistics
-        Description of the calibration for its reader: views, corners, residuals, held-out errors, priors and gauge,
-        convergence, warnings. Plain numbers, strings, lists and dicts.
+        Description of the calibration for its reader: views, corners, residuals, held-out errors,
+        priors and gauge, convergence, warnings. Plain numbers, strings, lists and dicts.
     residual
         Distortion that the parameters do not describe, or None.
     """
@@ -123,13 +131,14 @@ class CalibrationModel:
     def at(self, magnification: float) -> ScanCamera:
         """The camera at a magnification.
 
-        Outside of :attr:`magnification_range` the functions continue along their tangents in log g, ``in_range`` is
-        False, and the covariance grows with the distance from the range.
+        Outside of :attr:`magnification_range` the functions continue along their tangents in log g,
+        ``in_range`` is False, and the covariance grows with the distance from the range.
 
         Raises
         ------
         InvalidValueError
-            If the magnification is not finite and positive, or so far out of range that no camera results.
+            If the magnification is not finite and positive, or so far out of range that no camera
+            results.
         """
         g = checked_magnification(magnification)
         low, high = self.magnification_range
@@ -166,8 +175,9 @@ class CalibrationModel:
     def _extrapolation_covariance(self, g: float) -> Array:
         """Return a diagonal (10, 10) allowance for the unknown course of the functions.
 
-        Each parameter may leave its tangent by as much as it varied over the calibrated range, per unit of
-        log g relative to the range, squared with the distance so that it starts smoothly at the edge.
+        Each parameter may leave its tangent by as much as it varied over the calibrated range, per
+        unit of log g relative to the range, squared with the distance so that it starts smoothly at
+        the edge.
         """
         low, high = self.magnification_range
         edge = low if g < low else high

@@ -1,8 +1,9 @@
 """Continuous functions of the magnification.
 
-Every kind is linear in its coefficients, ``f(g) = basis(g) @ coefficients``, so that one covariance matrix of all
-coefficients propagates exactly to any magnification. Outside of the range in which it was determined a function
-continues along its tangent in log g; the caller flags that and widens the uncertainty.
+Every kind is linear in its coefficients, ``f(g) = basis(g) @ coefficients``, so that one covariance
+matrix of all coefficients propagates exactly to any magnification. Outside of the range in which it
+was determined a function continues along its tangent in log g; the caller flags that and widens the
+uncertainty.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ def _hat_row(value: float, knots: Array) -> Array:
 
 
 def _ode_row(value: float, weights: Array) -> Array:
-    """Return the first row of the transition matrix of D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x over ``value``."""
+    """Return the first row of the transition matrix of a differential equation over ``value``.
+
+    The equation is D^k x = -w_0 x - ... - w_(k-1) D^(k-1) x.
+    """
     order = len(weights)
     # Imported here so that programs that use another kind of function start without scipy.
     from scipy.linalg import expm
@@ -78,19 +82,21 @@ class ContinuousFunction:
     Parameters
     ----------
     kind
-        One of :data:`KINDS`: Chebyshev polynomial in log g or in g, Legendre polynomial in g, linear interpolation
-        in log g between knots, or the solution of a linear ordinary differential equation with constant
-        coefficients (principal differential analysis, appendix A of the paper).
+        One of :data:`KINDS`: Chebyshev polynomial in log g or in g, Legendre polynomial in g,
+        linear interpolation in log g between knots, or the solution of a linear ordinary
+        differential equation with constant coefficients (principal differential analysis, appendix
+        A of the paper).
     coefficients
-        (k,) coefficients. For ``"ode"`` they are the value and its derivatives at the lower end of the range, with
-        the range scaled to [0, 1].
+        (k,) coefficients. For ``"ode"`` they are the value and its derivatives at the lower end of
+        the range, with the range scaled to [0, 1].
     g_range
         (lowest, highest) magnification for which the function was determined.
     shape
-        Knots (magnifications) of ``"linear_log"``, weights w_0 ... w_(k-1) of ``"ode"``, empty otherwise.
+        Knots (magnifications) of ``"linear_log"``, weights w_0 ... w_(k-1) of ``"ode"``, empty
+        otherwise.
     breaks
-        Magnifications at which a polynomial jumps, because the microscope switches its scan range there; each
-        belongs to the range above it. The last coefficients are the sizes of the jumps.
+        Magnifications at which a polynomial jumps, because the microscope switches its scan range
+        there; each belongs to the range above it. The last coefficients are the sizes of the jumps.
     """
 
     kind: str
@@ -148,7 +154,7 @@ class ContinuousFunction:
         return len(self.coefficients) - len(self.breaks)
 
     def basis(self, g: float) -> Array:
-        """Return the (size,) row with ``value = basis(g) @ coefficients``; tangential out of range."""
+        """Return the (size,) row with ``value = basis(g) @ coefficients``; tangent out of range."""
         low, high = self.g_range
         edge = min(max(g, low), high)
         row = basis_row(self.kind, self.smooth_size, edge, self.g_range, self.shape)

@@ -1,13 +1,14 @@
 """Static distortion of the scan, forwards and backwards.
 
-The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and half the image width
-``n``:
+The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and
+half the image width ``n``:
 
     f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q),      r2 = |q|^2
 
-The radial term is the closed form of the division model (Fitzgibbon 2001, doi:10.1109/CVPR.2001.990465), the tangential
-one is the consistent reading of equation (2) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed
-bracket adds a squared displacement vector to a scalar.
+The radial term is the closed form of the division model (Fitzgibbon 2001,
+doi:10.1109/CVPR.2001.990465), the tangential one is the consistent reading of equation (2) of Malti
+et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed bracket adds a squared displacement vector
+to a scalar.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Undistortion:
 
 
 def _radial(r2: Array, xi_r: Array) -> tuple[Array, Array]:
-    """Return the root ``s`` and the factor ``lambda = 2 / (1 + s)``; NaN where ``4 xi_r r2 >= 1``."""
+    """Return root ``s`` and factor ``lambda = 2 / (1 + s)``; NaN where ``4 xi_r r2 >= 1``."""
     inside = 1.0 - 4.0 * xi_r * r2
     root = np.sqrt(np.where(inside > 0.0, inside, np.nan))
     return root, 2.0 / (1.0 + root)
@@ -77,7 +78,8 @@ def distort_jacobians(
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 2); the last axis of ``df_dxi`` is (xi_r, xi_t).
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 2); the last axis of ``df_dxi`` is (xi_r,
+        xi_t).
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
     xi_tangential = np.asarray(xi_t, dtype=np.float64)
@@ -104,9 +106,9 @@ def distort_jacobians(
 def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
     """Invert the distortion of (n, 2) normalised points.
 
-    The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's method with the
-    analytic Jacobian. Fails (``converged`` false, NaN) where the point has no ideal counterpart on the branch that
-    contains the centre.
+    The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's
+    method with the analytic Jacobian. Fails (``converged`` false, NaN) where the point has no ideal
+    counterpart on the branch that contains the centre.
     """
     rd2 = np.sum(q_d * q_d, axis=1)
     branch = np.isfinite(rd2) & (1.0 + xi_r * rd2 > 0.0) & (xi_r * rd2 < 1.0)

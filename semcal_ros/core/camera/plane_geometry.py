@@ -1,7 +1,8 @@
 """Poses of a planar grid: rotations and their initial values from an affine view.
 
-At the magnifications of an SEM the perspective within one view is weak. The affine part of the view then gives the
-rotation up to the sign of the tilt (Necker reversal), and the perspective part decides that sign where it can.
+At the magnifications of an SEM the perspective within one view is weak. The affine part of the view
+then gives the rotation up to the sign of the tilt (Necker reversal), and the perspective part
+decides that sign where it can.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def rotations_from_vectors(vectors: Array) -> Array:
 
 
 def normalising_similarity(points: Array) -> Array:
-    """Return the similarity that makes the centroid 0 and the mean distance sqrt(2) (Hartley 1997)."""
+    """Return the similarity that makes centroid 0 and mean distance sqrt(2) (Hartley 1997)."""
     centre = points.mean(axis=0)
     spread = np.mean(np.hypot(*(points - centre).T))
     s = np.sqrt(2.0) / spread if spread > 0 else 1.0
@@ -109,8 +110,8 @@ def view_affine(board_xy_m: Array, image_xy: Array, at_px: Array) -> AffineView:
 def rotation_from_affine(matrix: Array, gradient: Array) -> Array:
     """Return the rotation whose upper left block is ``matrix`` scaled to largest singular value 1.
 
-    The sign of the tilt makes the third row agree with ``gradient`` (depth grows away from the gun); the mirrored
-    solution is :func:`mirrored_tilt`.
+    The sign of the tilt makes the third row agree with ``gradient`` (depth grows away from the
+    gun); the mirrored solution is :func:`mirrored_tilt`.
     """
     block = matrix / np.linalg.norm(matrix, 2)
     third = np.sqrt(np.maximum(1.0 - np.sum(block * block, axis=0), 0.0))

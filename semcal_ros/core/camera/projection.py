@@ -1,7 +1,8 @@
 """Projection of sem-frame points to raw pixels, with derivatives, for arrays of camera parameters.
 
-The model is that of design section 4, equations (9)-(12) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020,
-rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho`` so that nothing diverges at ``rho = 0``:
+The model is that of design section 4, equations (9)-(12) of Malti et al. (2012),
+doi:10.1117/1.JEI.21.3.033020, rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho``
+so that nothing diverges at ``rho = 0``:
 
     w   = 1 + rho Z
     x_u = px + m (a X + sigma Y) / w
@@ -53,7 +54,8 @@ class ProjectionJacobians:
     d_xyz
         (n, 2, 3) derivative with respect to the sem-frame point, px per m.
     d_parameters
-        (n, 2, 10) derivative with respect to the parameters in the order of :data:`PARAMETER_NAMES`.
+        (n, 2, 10) derivative with respect to the parameters in the order of
+        :data:`PARAMETER_NAMES`.
     """
 
     xy: Array

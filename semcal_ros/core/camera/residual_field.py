@@ -1,17 +1,19 @@
 """Residual field: the distortion of a scan that two parameters cannot describe.
 
-Spiral distortion, non-linear scan coils and the settling of the beam at the start of a line are smooth displacements
-of the image that no small set of parameters covers. They are held by a tensor-product B-spline over the raw pixel and
-log g (design section 4): a raw pixel x would lie at
+Spiral distortion, non-linear scan coils and the settling of the beam at the start of a line are
+smooth displacements of the image that no small set of parameters covers. They are held by a
+tensor-product B-spline over the raw pixel and log g (design section 4): a raw pixel x would lie at
 
     x + n G((x - c) / n, g)
 
-if there were only the parametric distortion, with ``c`` the middle of the image and ``n`` half its width. Being defined
-on the raw pixel, the field corrects observations by a fixed linear map of its coefficients.
+if there were only the parametric distortion, with ``c`` the middle of the image and ``n`` half its
+width. Being defined on the raw pixel, the field corrects observations by a fixed linear map of its
+coefficients.
 
-The knots are denser at the start of the lines, where the beam settles. The field excludes what the rest of the
-model describes: shifts, linear maps, and the patterns of the radial and of the tangential distortion. Otherwise two
-descriptions of the same displacement would leave the pixel size undefined.
+The knots are denser at the start of the lines, where the beam settles. The field excludes what the
+rest of the model describes: shifts, linear maps, and the patterns of the radial and of the
+tangential distortion. Otherwise two descriptions of the same displacement would leave the pixel
+size undefined.
 """
 
 from __future__ import annotations
@@ -91,7 +93,7 @@ class FieldSlice:
         return (y[:, :, None] * x[:, None, :]).reshape(len(q), -1)
 
     def displacement(self, q: Array) -> Array:
-        """Return the (n, 2) displacement at normalised raw positions (n, 2); NaN at NaN positions."""
+        """Return (n, 2) displacements at normalised raw positions (n, 2); NaN at NaN positions."""
         out = np.full_like(q, np.nan)
         known = np.all(np.isfinite(q), axis=1)
         ny, nx, _ = self.coefficients.shape
@@ -102,7 +104,7 @@ class FieldSlice:
         return out
 
     def gradient(self, q: Array) -> Array:
-        """Return the (n, 2, 2) derivative of the displacement by position; finite positions only."""
+        """Return (n, 2, 2) derivatives of the displacement by position; finite positions only."""
         ny, nx, _ = self.coefficients.shape
         (x, dx), (y, dy) = (
             (_spline_rows(v, knots, _DEGREE), _spline_slopes(v, knots))
@@ -143,7 +145,8 @@ class ResidualField:
     g_range
         (lowest, highest) magnification of the views; beyond, the field of the nearer end holds.
     coefficients
-        (ng, ny, nx, 2): a spline without inner knots in log g, that is a polynomial of degree ng - 1 in Bernstein form.
+        (ng, ny, nx, 2): a spline without inner knots in log g, that is a polynomial of degree
+        ng - 1 in Bernstein form.
     """
 
     knots_x: Array
@@ -198,7 +201,8 @@ class ResidualField:
     ) -> FieldSlice:
         """Return the field at a magnification.
 
-        ``covariance`` (size, size) of all coefficients and ``cross`` (10, size) with the camera at ``g`` are optional.
+        ``covariance`` (size, size) of all coefficients and ``cross`` (10, size) with the camera at
+        ``g`` are optional.
         """
         weights = self.weights(g)
         spread = between = None
@@ -218,9 +222,9 @@ class ResidualField:
     def overlaps(self) -> Array:
         """Return (8, slice_size) inner products with the patterns of the rest of the model.
 
-        These are the shifts, the linear maps, and the patterns of the radial and of the tangential distortion, each
-        with a mean square of 1 over the domain. A field whose coefficients they annul leaves all of that to the camera
-        and to the poses.
+        These are the shifts, the linear maps, and the patterns of the radial and of the tangential
+        distortion, each with a mean square of 1 over the domain. A field whose coefficients they
+        annul leaves all of that to the camera and to the poses.
         """
         q, weight = _quadrature(self.knots_x, self.knots_y)
         x, y = q.T

@@ -24,7 +24,13 @@ __all__ = ["ScanCamera", "as_points"]
 
 
 def as_points(values: ArrayLike, dimensions: int) -> Array:
-    """Return ``values`` as an (n, dimensions) float64 array, or raise :class:`InvalidValueError`."""
+    """Return ``values`` as an (n, dimensions) float64 array.
+
+    Raises
+    ------
+    InvalidValueError
+        If they have another shape.
+    """
     points = np.asarray(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != dimensions:
         raise InvalidValueError(
@@ -42,7 +48,8 @@ class ScanCamera:
     Parameters
     ----------
     magnification
-        The magnification g that this camera is for, with respect to the calibration's display width.
+        The magnification g that this camera is for, with respect to the calibration's display
+        width.
     m
         Scale at the reference plane, px per m.
     aspect, skew
@@ -50,7 +57,8 @@ class ScanCamera:
     px, py
         Principal point, px.
     rho
-        Inverse distance of the scan pivot from the reference plane, 1/m; 0 is a parallel projection.
+        Inverse distance of the scan pivot from the reference plane, 1/m; 0 is a parallel
+        projection.
     xi_r, xi_t
         Radial and tangential distortion in normalised coordinates.
     ex, ey
@@ -65,7 +73,8 @@ class ScanCamera:
     in_range
         False when ``magnification`` lies outside of the calibrated range.
     residual
-        Distortion that the parameters do not describe (see :mod:`semcal_ros.core.camera.residual_field`), or None.
+        Distortion that the parameters do not describe (see
+        :mod:`semcal_ros.core.camera.residual_field`), or None.
 
     Examples
     --------
@@ -151,7 +160,7 @@ class ScanCamera:
     # -- projection -------------------------------------------------------------------------------
 
     def project(self, xyz_m: ArrayLike) -> Array:
-        """Project sem-frame points (n, 3) in m to raw (distorted) pixels (n, 2); NaN without one."""
+        """Project sem-frame points (n, 3) in m to raw pixels (n, 2); NaN where there is none."""
         return self.distort(self.project_ideal(xyz_m))
 
     def project_ideal(self, xyz_m: ArrayLike) -> Array:
@@ -200,7 +209,7 @@ class ScanCamera:
 
     @property
     def joint_covariance(self) -> Array | None:
-        """(10 + F, 10 + F) covariance of the parameters and of the coefficients of the residual field."""
+        """(10 + F, 10 + F) covariance of the parameters and the coefficients of the field."""
         field = self.residual
         if self.covariance is None or field is None:
             return self.covariance
@@ -214,7 +223,7 @@ class ScanCamera:
         )
 
     def sem_from_ideal(self, xy: ArrayLike, z_m: float = 0.0) -> Array:
-        """Return the sem-frame points (n, 3) in m at height ``z_m`` of undistorted pixels (n, 2)."""
+        """Return sem-frame points (n, 3) in m, at height ``z_m``, of undistorted pixels (n, 2)."""
         points = as_points(xy, 2)
         w = 1.0 + self.rho * z_m
         if w <= 0.0:
@@ -288,7 +297,8 @@ class ScanCamera:
         Raises
         ------
         InvalidValueError
-            For a parallel projection (rho <= 0), whose focal length is not finite; use :attr:`P_affine`.
+            For a parallel projection (rho <= 0), whose focal length is not finite; use
+            :attr:`P_affine`.
         """
         self._require_perspective()
         return self.P_affine / self.rho
@@ -309,14 +319,15 @@ class ScanCamera:
 
     @property
     def ideal_from_sem_jacobian(self) -> Array:
-        """(2, 2) derivative of undistorted pixels by sem-frame (X, Y) at the reference plane, px per m."""
+        """(2, 2) derivative of undistorted pixels by (X, Y) on the reference plane, px per m."""
         return self.m * np.array([[self.aspect, self.skew], [0.0, 1.0 / self.aspect]])
 
     @property
     def pixel_size_m(self) -> tuple[float, float]:
         """Size (x, y) in m of an undistorted pixel at the reference plane.
 
-        These are the steps in X and Y of the sem frame that move the image by one pixel along its columns and rows.
+        These are the steps in X and Y of the sem frame that move the image by one pixel along its
+        columns and rows.
         """
         return 1.0 / (self.m * self.aspect), self.aspect / self.m
 
@@ -341,8 +352,8 @@ class ScanCamera:
     def resized(self, width: int, height: int) -> ScanCamera:
         """Return the camera of the same field of view sampled with another number of pixels.
 
-        The field width and the shape of the pixels are kept, so a change of the height-to-width ratio
-        crops or extends the field symmetrically about the image centre.
+        The field width and the shape of the pixels are kept, so a change of the height-to-width
+        ratio crops or extends the field symmetrically about the image centre.
         """
         if (width, height) == (self.width, self.height):
             return self

@@ -1,7 +1,8 @@
 """When each pixel of a scanned frame was acquired.
 
-The beam visits pixels one after the other, so a frame has no single time: with a frame period ``T`` over ``rows`` lines and
-a flyback that takes the fraction ``f`` of each line, pixel (row, col) of pass ``k`` is acquired at
+The beam visits pixels one after the other, so a frame has no single time: with a frame period ``T``
+over ``rows`` lines and a flyback that takes the fraction ``f`` of each line, pixel (row, col) of
+pass ``k`` is acquired at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 

@@ -86,7 +86,7 @@ class LatticeDetection:
 def find_lattice(
     image: ArrayLike, *, databar_rows: int = 0
 ) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Find the corners of a chess board, of which all or a part is in view, at any rotation and tilt.
+    """Find the corners of a chess board, in view as a whole or in part, at any rotation and tilt.
 
     Candidates are maxima of minus the determinant of the Hessian at several scales; a lattice is
     grown from them with local prediction and the alternating sign of the contrast; every corner in
