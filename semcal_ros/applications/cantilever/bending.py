@@ -263,9 +263,9 @@ def _fit_robustly(
 ) -> tuple[Array, Array, float, Array]:
     """Fit by reweighted least squares (Tukey's biweight), scaled by the scatter of the residuals.
 
-    The model is linear, so each round is one small solve. scipy.optimize.least_squares has no
-    loss that gives outliers no weight at all: with its Cauchy loss, a fit of 60 blocks takes 65 to 80
-    ms instead of 8 to 10 ms, and the error is the same with up to a tenth of an edge covered by
+    The model is linear, so each round is one small solve. scipy.optimize.least_squares has no loss
+    that gives outliers no weight at all: with its Cauchy loss, a fit of 60 blocks takes 65 to 80 ms
+    instead of 8 to 10 ms, and the error is the same with up to a tenth of an edge covered by
     another body, and 5 % larger with a fifth.
     """
     plain = 1.0 / sigma**2

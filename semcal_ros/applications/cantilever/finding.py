@@ -76,7 +76,7 @@ class _Lines:
     size: tuple[int, int]
 
     def across(self, angle: float) -> tuple[Array, float]:
-        """Sum along lines in a direction: sums by distance from the origin, and the first distance."""
+        """Sum along lines in a direction: sums by distance from the origin, first distance."""
         c, s = np.cos(angle), np.sin(angle)
         distance = self.y * c - self.x * s
         first = float(np.floor(distance.min()))

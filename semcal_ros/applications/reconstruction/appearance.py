@@ -2,8 +2,8 @@
 
 The yield of secondary electrons grows with the slope of the surface, so shading stays with the
 slope while the texture turns with the specimen: tracked features would be pulled against the
-movement, most of all near the limb. Texture multiplies shading; after a square root (which also makes shot
-noise uniform) and with the local mean and contrast divided out, only texture remains.
+movement, most of all near the limb. Texture multiplies shading; after a square root (which also
+makes shot noise uniform) and with the local mean and contrast divided out, only texture remains.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class Appearance:
     def corner_response(self, block: int = 7) -> tuple[Image, float]:
         """Compute the smaller eigenvalue of the structure tensor, and its mean for noise alone."""
         response = cv2.cornerMinEigenVal(self.smooth, block, ksize=3)
-        # Sobel of size 3 is 8 derivatives; OpenCV divides by 4 and the block, and sums over the block.
+        # Sobel of size 3 is 8 derivatives; OpenCV divides by 4 and the block, and sums over the
+        # block.
         gradient = self.noise**2 / (8.0 * math.pi * self.smoothing_px**4)
         return np.asarray(response, dtype=np.float32), 4.0 * gradient
 

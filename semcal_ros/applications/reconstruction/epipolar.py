@@ -35,8 +35,8 @@ class AffineEpipolar:
     inliers
         (n,) which points agree with it.
     rms
-        RMS distance of the inliers from the plane, in the unit of the coordinates. With isotropic errors of
-        sigma in both views it is sigma, whatever the geometry.
+        RMS distance of the inliers from the plane, in the unit of the coordinates. With isotropic
+        errors of sigma in both views it is sigma, whatever the geometry.
     """
 
     normal: Array

@@ -53,8 +53,8 @@ class AffineStructure:
     rms_m
         Robust RMS of the residuals per coordinate, m.
     relief
-        RMS extent along the weakest direction of the first block over its residual noise: where it is
-        near 1 there is no depth in the views.
+        RMS extent along the weakest direction of the first block over its residual noise: where it
+        is near 1 there is no depth in the views.
     """
 
     cameras: Array

@@ -1,8 +1,8 @@
 """A triangle mesh over the part of a round surface that was seen.
 
 Directions from a point inside are triangulated on the unit sphere: the convex hull of the
-directions is their Delaunay triangulation. Triangles much larger than the typical spacing span areas that no
-view showed; they are left out, so the mesh has holes where there are no data.
+directions is their Delaunay triangulation. Triangles much larger than the typical spacing span
+areas that no view showed; they are left out, so the mesh has holes where there are no data.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def triangulate_cloud(
     points_m, centre_m, normals, sigma_m
         (n, 3), (3,), (n, 3), (n,).
     largest_gap
-        Triangles whose circumcircle is wider than this many typical distances between neighbours are
-        left out.
+        Triangles whose circumcircle is wider than this many typical distances between neighbours
+        are left out.
 
     Raises
     ------

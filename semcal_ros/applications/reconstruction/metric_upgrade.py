@@ -2,12 +2,13 @@
 
 The tracks are in true scale (see :class:`.Tracks`), so the rows of every camera become orthonormal:
 ``M_i Q M_i^T = I`` for one symmetric Q = A A^T. That is linear in the six entries of Q and
-absolute: scale, aspect and skew are those of the calibration. Two ambiguities remain in parallel projection,
-whatever the number of views:
+absolute: scale, aspect and skew are those of the calibration. Two ambiguities remain in
+parallel projection, whatever the number of views:
 
 - the *bas-relief* direction is weak when the views differ by small rotations; see
   :attr:`MetricUpgrade.condition`;
-- the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well: :func:`mirror_structure`.
+- the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well:
+:func:`mirror_structure`.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
         raise StructureError(
             f"{len(cameras)} views", expected="at least 3: two leave the relief open"
         )
-    # Whiten the points, so that Q is near a multiple of the identity and its condition means something.
+    # Whiten the points, so that Q is near a multiple of the identity and its condition means
+    # something.
     spread = np.linalg.cholesky(np.cov(affine.points[affine.points_placed].T))
     scaled = cameras @ spread
     unit = float(np.sqrt(np.mean(scaled**2)))

@@ -100,8 +100,8 @@ class Structure:
         Relative 1-sigma of a stretch of depth in the reference view: the remaining bas-relief
         ambiguity.
     convexity
-        Fraction of the points about which the surface bulges towards the gun. It decides between the two
-        mirror images: an opaque surface is seen from outside.
+        Fraction of the points about which the surface bulges towards the gun. It decides between
+        the two mirror images: an opaque surface is seen from outside.
     mirror_sigma
         By how many sigma the perspective of the camera prefers this structure to its mirror image;
         near 0 it cannot decide, and negative values speak against the choice.
@@ -307,7 +307,7 @@ class _Refinement:
         self.points = done.points_m
 
     def _prune(self, least: int, worst_px: float | None = None) -> None:
-        """Drop points that few views see or that are too uncertain, and views that see few points."""
+        """Drop points that are uncertain or seen in few views, and views that see few points."""
         certain = np.ones(len(self.points), dtype=bool)
         if worst_px is not None and self.adjusted is not None:
             largest = np.linalg.eigvalsh(self.adjusted.point_covariance_m2)[:, -1]

@@ -22,9 +22,9 @@ class Tracks:
     ----------
     xy_m
         (views, points, 2) sem-frame X and Y at height 0 of the line of sight, m
-        (:meth:`~semcal_ros.core.camera.scan_camera.ScanCamera.sem_from_ideal` of undistorted pixels). The calibrated
-        intrinsics are divided out, so that every view is a parallel projection in true scale, up to
-        ``1 / (1 + rho Z)``. Arbitrary where not seen.
+        (:meth:`~semcal_ros.core.camera.scan_camera.ScanCamera.sem_from_ideal` of undistorted
+        pixels). The calibrated intrinsics are divided out, so that every view is a parallel
+        projection in true scale, up to ``1 / (1 + rho Z)``. Arbitrary where not seen.
     seen
         (views, points) whether each view sees each point.
     """

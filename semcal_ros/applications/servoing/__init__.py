@@ -1,4 +1,4 @@
-"""Visual servoing of the stage: a target that can be found at any magnification, its pose, the control law."""
+"""Visual servoing of the stage: a target for any magnification, its pose, the control law."""
 
 from __future__ import annotations
 

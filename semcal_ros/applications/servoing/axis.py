@@ -1,9 +1,10 @@
-"""Where the optical axis is seen: what a change of magnification tells, and a calibration hardly does.
+"""Estimate where the optical axis is in the image, from changes of magnification.
 
-The origin of the sem frame lies on the axis, and the axis is the one point that stays where it is in the image when
-the magnification changes. A calibration on tilted grids knows it from the perspective alone, to some px. A target
-that rests while the magnification goes from one to another tells it to a fraction of a px: seen through cameras
-whose principal points are both wrong by d px, it lies at ``X + d / m1``, then at ``X + d / m2``.
+The origin of the sem frame lies on the axis, and the axis is the one point that stays in place in
+the image when the magnification changes. A calibration on tilted grids determines it from the
+perspective alone, to some px. A target at rest while the magnification changes determines it to a
+fraction of a px: seen through cameras whose principal points are both wrong by d px, the target
+lies at ``X + d / m1``, then at ``X + d / m2``.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from semcal_ros.core.arrays import Array
 __all__ = ["AxisObserver"]
 
 
-# Cameras of one magnification that differ: another calibration has come into force.
+# Scales that differ by less than this are of one magnification: if the cameras still differ,
+# another calibration has come into force.
 _SAME_SCALE = 0.002
-# What the scale of a camera may be wrong by (1-sigma), as a fraction: that also moves what does not lie on the axis.
+# Relative error of the scale of a camera (1-sigma): it also moves points that are off the axis.
 _SCALE_SIGMA = 0.003
 
 
@@ -28,7 +30,7 @@ class AxisObserver:
     Parameters
     ----------
     sigma_px
-        1-sigma of the principal point that the cameras come with; 0 takes it as it is.
+        1-sigma of the principal point of the given cameras; 0 disables the correction.
     change_px
         1-sigma by which it moves from one magnification to the next.
     """
@@ -38,7 +40,7 @@ class AxisObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was learnt."""
+        """Reset the estimate."""
         self.offset_px: Array = np.zeros(2)
         self.covariance: Array = self._start * np.eye(2)
 
@@ -48,7 +50,7 @@ class AxisObserver:
         return float(np.sqrt(max(float(np.linalg.eigvalsh(self.covariance)[-1]), 0.0)))
 
     def correct(self, camera: PlaneCamera) -> PlaneCamera:
-        """The camera with its axis where it was found."""
+        """Return the camera with its axis moved to the estimated position."""
         if not np.any(self.offset_px):
             return camera
         shift = np.eye(3)
@@ -63,16 +65,17 @@ class AxisObserver:
         surprise_m: Array,
         covariance_m2: Array,
     ) -> bool:
-        """Take in where a target was seen after a change of camera; whether that told anything.
+        """Update the offset with a target seen after a change of camera; True if it was used.
 
         Parameters
         ----------
         before, after
             Both cameras.
         place_m
-            (2,) where it lies.
+            (2,) position of the target.
         surprise_m, covariance_m2
-            (2,) seen through ``after`` minus expected from ``before``, and its (2, 2) covariance.
+            (2,) position seen through ``after`` minus that expected from ``before``, and its (2, 2)
+            covariance.
         """
         if self._start == 0.0:
             return False

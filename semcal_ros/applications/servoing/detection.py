@@ -16,8 +16,8 @@ from semcal_ros.core.arrays import Array, Mask, check_image
 __all__ = ["TargetView", "find_target"]
 
 
-# Larger images are averaged down by a whole factor to find the markers; their sides are then measured at full
-# resolution.
+# Larger images are averaged down by a whole factor to find the markers; their sides are then
+# measured at full resolution.
 _SEARCHED_PX = 1024
 # Three pixels for each of the six squares along a side.
 _SMALLEST_SIDE_PX = 18.0
@@ -32,15 +32,15 @@ class TargetView:
     Attributes
     ----------
     ids
-        (n,) their numbers.
+        (n,) numbers of the markers.
     target_xy_m
-        (n, 4, 2) their corners in the frame of the target, m.
+        (n, 4, 2) corners of the markers in the frame of the target, m.
     xy
         (n, 4, 2) the same corners in the image, px.
     covariance_px2
         (n, 8, 8) covariance of the four corners of each.
     reason
-        Why there are none; empty where there are.
+        Why there are no markers; empty if there are some.
     """
 
     ids: NDArray[np.int64]
@@ -55,7 +55,7 @@ class TargetView:
         return not self.reason
 
     def with_corners(self, xy: Array) -> TargetView:
-        """The same markers with their corners (n, 4, 2) elsewhere."""
+        """Return the same markers with their corners (n, 4, 2) moved."""
         return TargetView(self.ids, self.target_xy_m, xy, self.covariance_px2, self.reason)
 
     def select(self, keep: Mask) -> TargetView:
@@ -70,23 +70,23 @@ class TargetView:
 
 
 def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
-    """Corners of all markers of ``target`` that can be read, to a few hundredths of a pixel.
+    """Find the corners of all readable markers of ``target`` to a few hundredths of a pixel.
 
     Parameters
     ----------
     image
         (h, w) grey levels of integers or floats; markers are dark on white.
     target
-        What to look for.
+        The target to find.
 
     Returns
     -------
-    The markers; none, with a reason, where the target is not in view or the image is blank.
+    The markers; empty, with a reason, if the target is not in view or the image is blank.
 
     Raises
     ------
     InvalidValueError
-        If the image is no two-dimensional array of at least 32 x 32 px.
+        If the image is not a two-dimensional array of at least 32 x 32 px.
     """
     grey = check_image(image, channels=(1,), least_side=32)
     picture = np.ascontiguousarray(grey, dtype=np.float32)
@@ -119,14 +119,14 @@ def _reject(reason: str) -> TargetView:
 
 
 def _stretch(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
-    """8 bits for the search, and less noise; None where there is nothing to see."""
+    """Convert to 8 bits with less noise for the search; return None for a blank image."""
     small = picture
     if factor > 1:
         height, width = (side // factor for side in picture.shape)
         cut = picture[: height * factor, : width * factor]
         small = cut.reshape(height, factor, width, factor).mean(axis=(1, 3), dtype=np.float32)
     smooth = cv2.GaussianBlur(small, (0, 0), _NOISE_BLUR_PX)
-    # What was not scanned is 0 in a rectified image and says nothing of the contrast.
+    # Pixels that were not scanned are 0 in a rectified image and say nothing about the contrast.
     seen = smooth[smooth > 0.0]
     if seen.size < 1024:
         return None
@@ -140,7 +140,7 @@ def _stretch(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | N
 @lru_cache(maxsize=1)
 def _create_detector() -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
-    # A code with a wrong bit is that of another marker as likely as not.
+    # A code with a wrong bit may just as well belong to another marker.
     parameters.errorCorrectionRate = 0.0
     parameters.minMarkerPerimeterRate = 0.04
     parameters.adaptiveThreshWinSizeMin = 5
@@ -152,14 +152,14 @@ def _create_detector() -> cv2.aruco.ArucoDetector:
 def _search_markers(
     picture: NDArray[np.uint8], factor: int, target: NestedTarget
 ) -> tuple[NDArray[np.int64], Array]:
-    """Numbers (n,) and rough corners (n, 4, 2), in px of the whole image, of what can be read."""
+    """Find numbers (n,) and rough corners (n, 4, 2) of readable markers, px of the whole image."""
     found, numbers, _ = _create_detector().detectMarkers(picture)
     if numbers is None or len(found) == 0:
         return np.empty(0, np.int64), np.empty((0, 4, 2))
     ids = np.asarray(numbers, dtype=np.int64).reshape(-1)
     corners = np.asarray(found, dtype=np.float64).reshape(-1, 4, 2)
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    # The same marker twice: one of them is something else, and which is not to be known.
+    # The same marker twice: one of them is something else, and nothing shows which.
     seen, count = np.unique(ids, return_counts=True)
     keep = (ids < target.size) & np.isin(ids, seen[count == 1])
     keep &= sides.min(axis=1) >= _SMALLEST_SIDE_PX

@@ -1,8 +1,9 @@
-"""From the markers of one frame to the velocity of the stage.
+"""Compute the velocity of the stage from the markers of one frame.
 
-Image-based: what is brought to zero is the distance, in pixels of the frame, between the markers and where the goal
-has them. Goal and interaction matrix are those of P_g of the same frame, so a change of the magnification changes
-features, their goal and their derivatives together, and nothing has to converge anew that had converged.
+The law is image-based: it brings the distance, in pixels of the frame, between the markers and
+their goal positions to zero. Goal and interaction matrix are computed with P_g of the same frame,
+so a change of magnification changes features, goal and derivatives together, and a servo that had
+converged stays converged.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 __all__ = ["Servo", "ServoStatus", "ServoStep"]
 
 
-# Part of the error that is taken away per frame, at most. With the latency foretold, up to 2 is stable; without any
-# forecast 0.5 still is for a latency of two frames, whose limit is 0.618.
+# Largest part of the error that is removed per frame. With the latency predicted, up to 2 is
+# stable; without prediction 0.5 is still stable for a latency of two frames, whose limit is 0.618.
 _MOST_PER_FRAME = 0.5
-# Without times the latency cannot be foretold; a quarter does not overshoot with one frame of it.
+# Without times the latency cannot be predicted; a quarter does not overshoot with one frame of it.
 _MOST_WITHOUT_TIMES = 0.25
 # Frames and commands of one clock are not further apart.
 _LONGEST_LATENCY_S = 30.0
-# By how much later than told a stage may obey (1-sigma), in intervals.
+# Delay with which a stage may obey a command (1-sigma), in frame intervals.
 _LATE = 0.5
 
 
@@ -58,35 +59,36 @@ class ServoStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class ServoStep:
-    """What one frame led to.
+    """Result of one frame.
 
     Attributes
     ----------
     twist
-        (3,) commanded velocity in the sem frame: m/s, m/s, rad/s; zero where there is a ``rejection``.
+        (3,) commanded velocity in the sem frame: m/s, m/s, rad/s; zero where there is a
+        ``rejection``.
     error
         (3,) target minus goal at the centre of the frame's acquisition: m, m, rad.
     error_covariance
-        (3, 3) of it, from the picture.
+        (3, 3) covariance of the error, from the image.
     error_px, error_m
         RMS over the features, px, and distance of the target's origin from the goal, m.
     sigma_px, sigma_m
         1-sigma of the origin in the worst direction.
     fit
-        The pose in the frame; None where none was looked for.
+        The pose in the frame; None if no pose was fitted.
     drift_m_s
-        (2,) velocity that is commanded away.
+        (2,) drift velocity that the command compensates.
     axis_px, axis_sigma_px
-        (2,) by how much the optical axis was found to lie beside the principal point of the camera, and how well
-        that is known (1-sigma): the place of the goal in the sem frame is no better known.
+        (2,) offset of the optical axis from the principal point of the camera, and its 1-sigma: the
+        position of the goal in the sem frame is not known any better.
     gain_hz
         Gain in use.
     limited
-        What limited the speed; empty where nothing did.
+        What limited the speed; empty if nothing did.
     converged
         Whether the goal is reached and has been for some frames.
     rejection
-        Why the stage stands still; None where it is servoed.
+        Why the stage stands still; None if it is servoed.
     """
 
     twist: Array = field(default_factory=lambda: np.zeros(3))
@@ -107,13 +109,13 @@ class ServoStep:
 
     @property
     def reason(self) -> str:
-        """Why the stage stands still, in words; empty where it is servoed."""
+        """Why the stage stands still, in words; empty if it is servoed."""
         return "" if self.rejection is None else self.rejection.reason
 
 
 @dataclass(frozen=True, eq=False)
 class _PosedFrame:
-    """The latest frame with a pose; the camera is that which came with it."""
+    """The latest frame with a pose, and the camera that came with it."""
 
     pose: PlanePose
     covariance: Array
@@ -127,12 +129,12 @@ class Servo:
     Parameters
     ----------
     goal
-        Where the target shall lie.
+        Goal pose of the target.
     settings
-        How.
+        Settings of the control law.
     rotation_centre_m
-        Where the axis of the stage's rotation meets the target, in the target's frame: the axis moves with x and y.
-        A wrong one makes the way a curve, and does not keep the target from its goal.
+        Where the axis of the stage's rotation meets the target, in the target's frame: the axis
+        moves with x and y. A wrong one bends the path but does not keep the target from its goal.
     """
 
     def __init__(
@@ -144,14 +146,14 @@ class Servo:
         self.goal = goal
         self.settings = settings or ServoSettings()
         self.rotation_centre_m = np.array(rotation_centre_m, dtype=np.float64)
-        # Of the microscope, and not of this run: it outlives a restart.
+        # The axis belongs to the microscope and not to this run: it outlives a restart.
         self._axis_observer = AxisObserver(
             self.settings.axis_sigma_px, self.settings.axis_change_px
         )
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was seen and commanded, and a fault; not where the axis is."""
+        """Reset observations, commands and fault, but keep the position of the axis."""
         self.history = CommandHistory()
         self.fault = ""
         self._last: _PosedFrame | None = None
@@ -162,7 +164,7 @@ class Servo:
         )
 
     def record_command(self, time_s: float, twist: ArrayLike) -> None:
-        """Tell which velocity (3,) the stage was given and when; stops count, too."""
+        """Record a velocity (3,) sent to the stage and its time; stops count, too."""
         self.history.add(time_s, twist)
 
     def stop(self, status: ServoStatus, reason: str = "", fit: PoseFit | None = None) -> ServoStep:
@@ -180,7 +182,7 @@ class Servo:
         now_s: float | None = None,
         shift_m: ArrayLike = (0.0, 0.0),
     ) -> ServoStep:
-        """The velocity after a frame.
+        """Compute the velocity after a frame.
 
         Parameters
         ----------
@@ -193,11 +195,12 @@ class Servo:
         interval_s
             Time between frames.
         now_s
-            When the command will take effect; the way of the stage until then is foretold. None where the clocks do
-            not allow that.
+            When the command will take effect; the motion until then is predicted. None if the
+            clocks do not allow that.
         shift_m
-            (2,) what was taken out of the picture and has to be added again: the drift of the frame where the goal
-            is a place in the sem frame, nothing where the goal is a place on the specimen.
+            (2,) shift that was removed from the image and has to be added again: the drift of the
+            frame if the goal is a position in the sem frame, zero if it is a position on the
+            specimen.
 
         Raises
         ------
@@ -240,13 +243,13 @@ class Servo:
             )
         return None
 
-    # -- what moves ---------------------------------------------------------------------------------
+    # -- what moves -------------------------------------------------------------------------------
 
     def _way(self, first_s: float, last_s: float, pose: PlanePose) -> Array:
-        """(3,) way of the target's origin between two times by the commands alone."""
+        """Compute the (3,) travel of the target's origin between two times, from commands alone."""
         way = self.history.travel(first_s, last_s)
         arm = -(pose.rotation @ self.rotation_centre_m)
-        # The origin goes around the axis while it turns.
+        # The origin moves around the axis during rotation.
         c, s = math.cos(float(way[2])), math.sin(float(way[2]))
         way[:2] += np.array([(c - 1.0) * arm[0] - s * arm[1], s * arm[0] + (c - 1.0) * arm[1]])
         return way
@@ -254,18 +257,18 @@ class Servo:
     def _compare_travel(
         self, fit: PoseFit, before: _PosedFrame, time_s: float
     ) -> tuple[Array, Array, Array]:
-        """Way (2,) of the target since the frame before as commanded and as seen; variance (2,) of the difference."""
+        """Compare travel since the last frame: (2,) commanded, (2,) seen, (2,) variance of both."""
         way = self._way(before.time_s, time_s, before.pose)
         seen = fit.pose.minus(before.pose)
         variance = np.diag(fit.covariance)[:2] + np.diag(before.covariance)[:2]
         variance = variance + (self.settings.slip * float(np.hypot(way[0], way[1]))) ** 2
-        # A command obeyed late by a part of an interval that nobody knows.
+        # A command takes effect late, by an unknown part of an interval.
         change = self.history.at(time_s) - self.history.at(before.time_s)
         late_m = _LATE * (time_s - before.time_s) * float(np.hypot(change[0], change[1]))
         return way[:2], seen[:2], variance + late_m**2
 
     def _learn_axis(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> bool:
-        """Where the magnification has changed, see by how much that moved the target; whether the axis moved, too."""
+        """Update the axis after a change of magnification; return whether the estimate was used."""
         before = self._last
         if before is None or camera.is_same(before.camera) or time_s <= before.time_s:
             return False
@@ -278,10 +281,10 @@ class Servo:
         )
 
     def _learn(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> None:
-        """Compare with the frame before: drift, and whether the stage does what it is told."""
+        """Compare with the last frame: estimate drift, and check that the stage obeys commands."""
         before = self._last
         self._last = _PosedFrame(fit.pose, fit.covariance, camera, time_s)
-        # Two cameras do not agree on a place to the noise of a picture; that is no drift.
+        # Two cameras disagree on a position by more than image noise; that is not drift.
         if before is None or not camera.is_same(before.camera) or time_s <= before.time_s:
             return
         way, seen, variance = self._compare_travel(fit, before, time_s)
@@ -289,7 +292,7 @@ class Servo:
         self.fault = self._monitor.update(slope @ way, slope @ seen)
         self._observer.update(time_s - before.time_s, seen - way, variance)
 
-    # -- command ------------------------------------------------------------------------------------
+    # -- command ----------------------------------------------------------------------------------
 
     def _command(
         self,
@@ -338,9 +341,9 @@ class Servo:
         )
 
     def _correction(self, fit: PoseFit, camera: PlaneCamera, ahead: PlanePose) -> Array:
-        """(3,) way of the stage that, as far as it is linear, the features are away from their goal."""
+        """Compute the (3,) stage travel that separates features and goal, to second order."""
         own = fit.view.target_xy_m.reshape(-1, 2)
-        # Where the features themselves will be: they are servoed, not the pose.
+        # Predicted features: these are servoed, not the pose.
         seen = fit.view.xy.reshape(-1, 2) - camera.project(fit.pose.apply(own))
         features = camera.project(ahead.apply(own)) + seen
         wanted = camera.project(self.goal.apply(own))
@@ -362,7 +365,7 @@ class Servo:
     def _limit(
         self, twist: Array, fit: PoseFit, camera: PlaneCamera, interval_s: float
     ) -> tuple[Array, str]:
-        """The twist, slower but in the same direction where it is too fast."""
+        """Slow the twist down, in the same direction, if it is too fast."""
         limits = self.settings
         pixels = fit.view.xy.reshape(-1, 2)
         moved = (
@@ -390,7 +393,7 @@ def _shift_view(view: TargetView, camera: PlaneCamera, shift_m: Array) -> Target
 
 
 def _compute_origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:
-    """1-sigma of the target's origin in the worst direction, m and px."""
+    """Compute the 1-sigma of the target's origin in the worst direction, m and px."""
     block = fit.covariance[:2, :2]
     slope = camera.jacobian(fit.pose.values[None, :2])[0]
     worst = [float(np.linalg.eigvalsh(c)[-1]) for c in (block, slope @ block @ slope.T)]

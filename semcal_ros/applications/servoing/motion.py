@@ -1,4 +1,4 @@
-"""What the stage was told, and what moves beside that."""
+"""Commands to the stage, and motion that they do not explain."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["CommandHistory", "DisturbanceObserver", "StageMonitor"]
 
 
-# Commands that are kept: those of 30 s, the longest latency that is foretold, at 34 a second.
+# Commands that are kept: those of 30 s, the longest latency that is predicted, at 34 a second.
 _KEPT = 1024
-# Deviations beyond which a surprise is none of a drift, and how many in a row are one after all.
+# Deviations (sigma) beyond which an innovation is not drift, and how many of them in a row are
+# drift after all.
 _GATE, _ODD = 5.0, 4
-# Then so much more drift is expected.
+# Factor on the expected drift in that case.
 _WIDER = 10.0
 
 
@@ -29,12 +30,12 @@ class CommandHistory:
         self._twists: deque[Array] = deque(maxlen=_KEPT)
 
     def add(self, time_s: float, twist: ArrayLike) -> None:
-        """A command (3,): x, y in m/s, rotation in rad/s.
+        """Add a command (3,): x, y in m/s, rotation in rad/s.
 
         Raises
         ------
         InvalidValueError
-            If it is not finite. A time before the last one counts as that.
+            If the command is not finite. A time before the last one counts as the last one.
         """
         values = np.array(twist, dtype=np.float64)
         if values.shape != (3,) or not np.all(np.isfinite([time_s, *values])):
@@ -43,7 +44,7 @@ class CommandHistory:
         self._twists.append(values)
 
     def at(self, time_s: float) -> Array:
-        """Command (3,) that is valid at a time."""
+        """Return the command (3,) that is valid at a time."""
         valid = np.zeros(3)
         for begin, twist in zip(self._times, self._twists, strict=True):
             if begin > time_s:
@@ -52,7 +53,7 @@ class CommandHistory:
         return valid
 
     def travel(self, first_s: float, last_s: float) -> Array:
-        """(3,) way that was commanded between two times: m, m, rad; negative where the second is the earlier one."""
+        """Integrate commands to (3,) travel between two times, m, m, rad; negative if reversed."""
         if last_s < first_s:
             return -self.travel(last_s, first_s)
         way = np.zeros(3)
@@ -63,7 +64,7 @@ class CommandHistory:
 
 
 class DisturbanceObserver:
-    """Velocity of what moves the target beside the commands, such as drift: a Kalman filter for each axis.
+    """Kalman filter, per axis, of the velocity that commands do not explain, such as drift.
 
     Parameters
     ----------
@@ -80,16 +81,17 @@ class DisturbanceObserver:
         self.variance: Array = np.full(2, sigma_m_s**2)
 
     def update(self, interval_s: float, beside_m: Array, variance_m2: Array) -> None:
-        """Take in by how much the target went beside the commands in an interval.
+        """Update the filter with motion in an interval that the commands do not explain.
 
-        What is far from all that is expected is a touch of the stage and no drift, unless it goes on.
+        An innovation far beyond expectation is a knock on the stage and not drift, unless it
+        persists.
 
         Parameters
         ----------
         interval_s
             Time between two frames.
         beside_m, variance_m2
-            (2,) way that was seen less the one that was commanded, and its variance.
+            (2,) travel seen minus travel commanded, and its variance.
         """
         if interval_s <= 0.0:
             return
@@ -108,29 +110,29 @@ class DisturbanceObserver:
         self.variance = (1.0 - gain) * self.variance
 
 
-# Commanded way after which it is judged: well above what drift and noise move meanwhile.
+# Commanded travel after which the stage is judged: well above drift and noise in that time.
 _JUDGED_PX = 36.0
-# Part of the commanded way that must be seen, at least and at most.
+# Least and largest part of the commanded travel that must be seen.
 _LEAST, _MOST = 0.3, 3.0
 
 
 class StageMonitor:
-    """Adds up commanded and seen ways, and says when they have nothing to do with each other.
+    """Sum commanded and seen travel, and report when they are unrelated.
 
-    A stage that does not move, one whose axes are others than assumed, or a picture that is held still while the
-    stage moves would be driven on for ever, and with a wrong sign ever faster.
+    A stage that does not move or has other axes than assumed, or an image that is stabilised while
+    the stage moves, would be driven for ever, and with a wrong sign ever faster.
     """
 
     def __init__(self) -> None:
         self._path = self._along = self._squared = 0.0
 
     def update(self, commanded_px: Array, seen_px: Array) -> str:
-        """What is wrong, or an empty text.
+        """Return what is wrong, or an empty text.
 
         Parameters
         ----------
         commanded_px, seen_px
-            (2,) way of the target between two frames as commanded and as seen, px.
+            (2,) travel of the target between two frames as commanded and as seen, px.
         """
         self._path += float(np.hypot(commanded_px[0], commanded_px[1]))
         self._along += float(commanded_px @ seen_px)

@@ -15,7 +15,8 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["PlaneCamera", "choose_projection"]
 
 
-# Two matrices that were computed from the same numbers, one of them divided by rho and multiplied by it again.
+# Relative difference of two matrices from the same numbers, one divided and multiplied by rho
+# again.
 _SAME = 1e-9
 
 
@@ -31,7 +32,7 @@ class PlaneCamera:
     Raises
     ------
     InvalidValueError
-        If it is not finite or has no inverse.
+        If the matrix is not finite or has no inverse.
     """
 
     matrix: Array
@@ -50,7 +51,7 @@ class PlaneCamera:
 
     @classmethod
     def from_projection(cls, projection: ArrayLike, height_m: float = 0.0) -> PlaneCamera:
-        """From P_g, the (3, 4) projection of homogeneous sem-frame points in m, and the height of the plane."""
+        """Create from P_g, the (3, 4) projection of points in m, and the height of the plane."""
         p = np.asarray(projection, dtype=np.float64)
         if p.shape != (3, 4):
             raise InvalidValueError(f"a projection of shape {p.shape}", expected="(3, 4)")
@@ -58,25 +59,25 @@ class PlaneCamera:
 
     @classmethod
     def from_camera(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
-        """From a camera, in ideal pixels."""
+        """Create from a camera, in ideal pixels."""
         return cls.from_projection(camera.P_affine, height_m)
 
     def project(self, xy_m: ArrayLike) -> Array:
-        """Ideal pixels (n, 2) of points (n, 2) of the plane, m."""
+        """Project points (n, 2) of the plane, m, to ideal pixels (n, 2)."""
         points = as_points(xy_m, 2)
         image = np.column_stack([points, np.ones(len(points))]) @ self.matrix.T
         pixels: Array = image[:, :2] / image[:, 2:]
         return pixels
 
     def plane_from_px(self, xy: ArrayLike) -> Array:
-        """Points (n, 2) of the plane, m, that are seen at ideal pixels (n, 2)."""
+        """Return the points (n, 2) of the plane, m, that are seen at ideal pixels (n, 2)."""
         pixels = as_points(xy, 2)
         rays = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
         points: Array = rays[:, :2] / rays[:, 2:]
         return points
 
     def jacobian(self, xy_m: ArrayLike) -> Array:
-        """Derivative (n, 2, 2) of :meth:`project`, px per m."""
+        """Compute the derivative (n, 2, 2) of :meth:`project`, px per m."""
         points = as_points(xy_m, 2)
         image = np.column_stack([points, np.ones(len(points))]) @ self.matrix.T
         pixels = image[:, :2] / image[:, 2:]
@@ -85,34 +86,35 @@ class PlaneCamera:
         return slope / image[:, 2][:, None, None]
 
     def is_same(self, other: PlaneCamera | None) -> bool:
-        """Whether another one is the camera of the same magnification."""
+        """Return whether another camera is the same, up to rounding."""
         return other is not None and bool(
             np.allclose(self.matrix, other.matrix, rtol=1e-6, atol=1e-12)
         )
 
 
 def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
-    """P_g (3, 4) of a frame, from its own K and those P_g that were published lately.
+    """Choose the P_g (3, 4) of a frame, given its K, among those published recently.
 
-    K belongs to the frame, by its stamp, but holds f = m / rho only: without the distance 1 / rho of the pivot
-    there are no metres in it. The published P_g has both and no stamp. For one camera its first three columns are
-    rho K: that tells which of them is of the frame.
+    K belongs to the frame, by its stamp, but holds only f = m / rho: without the distance 1 / rho
+    of the pivot it has no metric scale. The published P_g has both but no stamp. For one camera its
+    first three columns are rho K, which identifies the P_g of the frame.
 
-    A parallel projection (rho = 0) has no K, and neither has a frame without calibration. The latest P_g is then
-    taken if it is parallel itself; that it is of the frame's magnification, the size of the target has to tell
-    (:attr:`~semcal_ros.applications.servoing.settings.ServoSettings.scale_tolerance`).
+    A parallel projection (rho = 0) has no K, and neither has a frame without calibration. The
+    latest P_g is then used if it is parallel itself; the size of the target has to confirm that it
+    is of the frame's magnification (see
+    :attr:`~semcal_ros.applications.servoing.settings.ServoSettings.scale_tolerance`).
 
     Parameters
     ----------
     k
-        (3, 3) K of the frame's camera_info, zero where there is none.
+        (3, 3) K of the frame's camera_info, zero if there is none.
     projections
         (3, 4) matrices with the last row ``[0 0 rho 1]``, the oldest first.
 
     Raises
     ------
     InvalidValueError
-        None of them is of this frame, or the frame has no camera.
+        No projection belongs to this frame, or the frame has no camera.
     """
     own = np.asarray(k, dtype=np.float64).reshape(3, 3)
     known = [np.asarray(p, dtype=np.float64).reshape(3, 4) for p in projections]

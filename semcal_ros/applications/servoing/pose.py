@@ -1,4 +1,4 @@
-"""Where a target lies in the stage plane, and how its image moves with the stage."""
+"""Pose of a target in the stage plane, and how its image moves with the stage."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ __all__ = ["PlanePose", "PoseFit", "compute_interaction_matrix", "fit_pose"]
 
 # Gauss-Newton steps, at most: from the similarity they converge quadratically or not at all.
 _MOST_STEPS = 12
-# Movement of the corners in the last step: far below any error of theirs.
+# Movement of the corners in the last step, px: far below their errors.
 _SETTLED_PX = 1e-6
-# A marker that lies further off than this part of its own side is not the one it was read as.
+# A marker further from its expected position than this part of its side was misread.
 _MISREAD = 0.25
 
 
 @dataclass(frozen=True)
 class PlanePose:
-    """Pose in the stage plane: a point x of the target lies at ``R(angle) x + (x_m, y_m)`` in the sem frame.
+    """Pose in the stage plane.
+
+    A point x of the target lies at ``R(angle) x + (x_m, y_m)`` in the sem frame.
 
     Parameters
     ----------
@@ -57,16 +59,16 @@ class PlanePose:
         return np.array([[c, -s], [s, c]])
 
     def apply(self, target_xy_m: ArrayLike) -> Array:
-        """Points (n, 2) of the target in the sem frame, m."""
+        """Transform points (n, 2) of the target to the sem frame, m."""
         moved: Array = as_points(target_xy_m, 2) @ self.rotation.T + self.values[:2]
         return moved
 
     def displace(self, dx_m: float, dy_m: float, turn_rad: float = 0.0) -> PlanePose:
-        """The pose after a displacement and a turn about the target's origin."""
+        """Return the pose after a displacement and a turn about the target's origin."""
         return PlanePose(self.x_m + dx_m, self.y_m + dy_m, self.angle_rad + turn_rad)
 
     def minus(self, other: PlanePose) -> Array:
-        """(3,) difference, the angle between -pi and pi."""
+        """Subtract another pose: (3,) difference, with the angle between -pi and pi."""
         difference: Array = self.values - other.values
         difference[2] = math.remainder(float(difference[2]), 2.0 * math.pi)
         return difference
@@ -79,18 +81,18 @@ class PoseFit:
     Attributes
     ----------
     pose
-        The pose; NaN-free, meaningless where ``reason`` is given.
+        The pose; always finite, but meaningless if ``reason`` is given.
     covariance
-        (3, 3) of x, y in m and the angle in rad, from the scatter of the corners. It does not contain what the
-        camera itself is wrong by.
+        (3, 3) of x, y in m and the angle in rad, from the scatter of the corners. It does not
+        include errors of the camera itself.
     scale, scale_sigma
-        Size at which the target is seen over that which the camera says.
+        Seen size of the target over its size according to the camera, and the 1-sigma of that.
     rms_px
         RMS distance of the corners from where the pose puts them.
     view
         The markers that were used.
     reason
-        Why there is no pose; empty where there is one.
+        Why there is no pose; empty if there is one.
     """
 
     pose: PlanePose
@@ -108,10 +110,10 @@ class PoseFit:
 
 
 def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
-    """Most likely pose of a target from its markers.
+    """Fit the most likely pose of a target to its markers.
 
-    Weighted least squares over all corners in pixels, the scale given by the camera; markers that contradict most
-    others are left out.
+    Weighted least squares over all corners in pixels, the scale given by the camera; markers that
+    contradict most others are left out.
 
     Parameters
     ----------
@@ -145,10 +147,10 @@ def _reject(view: TargetView, reason: str) -> PoseFit:
 
 
 def _fit_similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float]:
-    """Pose and scale by least squares in the plane, as of complex numbers: b = scale exp(i angle) a + c."""
+    """Fit pose and scale by least squares in the plane, as complex b = scale exp(i angle) a + c."""
     seen = camera.plane_from_px(view.xy.reshape(-1, 2)) @ np.array([1.0, 1.0j])
     own = view.target_xy_m.reshape(-1, 2) @ np.array([1.0, 1.0j])
-    # Small markers are as well seen in px as large ones, but say less of the whole.
+    # Small markers are located as well as large ones in px, but constrain the whole less.
     spread = own - own.mean()
     factor = complex(np.sum(np.conj(spread) * (seen - seen.mean())) / np.sum(np.abs(spread) ** 2))
     origin = complex(seen.mean() - factor * own.mean())
@@ -158,7 +160,7 @@ def _fit_similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, f
 def _compute_residual(
     view: TargetView, camera: PlaneCamera, pose: PlanePose, scale: float = 1.0
 ) -> Array:
-    """(n, 4, 2) px."""
+    """Compute the (n, 4, 2) residuals of the corners, px."""
     predicted = camera.project(pose.apply(scale * view.target_xy_m.reshape(-1, 2)))
     residual: Array = view.xy - predicted.reshape(view.xy.shape)
     return residual
@@ -185,7 +187,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     residual = _whiten(whitening, left)
     size = np.linalg.norm(design, axis=0)
     normal = (design / size).T @ (design / size)
-    # Where the corners scatter more than they say, the pose does too.
+    # If the corners scatter more than their covariance says, the pose does, too.
     factor = max(1.0, float(residual @ residual) / max(len(residual) - 3, 1))
     covariance = np.linalg.inv(normal) / np.outer(size, size) * factor
     rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
@@ -195,7 +197,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
 
 
 def _compute_scale_sigma(view: TargetView) -> float:
-    """1-sigma of the scale, from the scatter of the corners and how far they spread."""
+    """Compute the 1-sigma of the scale from the scatter of the corners and their extent."""
     flat = view.xy.reshape(-1, 2)
     reach = float(np.sum((flat - flat.mean(axis=0)) ** 2))
     variance = float(np.trace(view.covariance_px2, axis1=1, axis2=2).mean()) / 8.0
@@ -203,20 +205,20 @@ def _compute_scale_sigma(view: TargetView) -> float:
 
 
 def _form_whitening(view: TargetView) -> Array:
-    """(n, 8, 8) inverse Cholesky factors of the markers' covariances."""
+    """Form (n, 8, 8) inverse Cholesky factors of the markers' covariances."""
     floor = 1e-8 * np.eye(8)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(view.covariance_px2 + floor)))
 
 
 def _whiten(whitening: Array, values: Array) -> Array:
-    """Whitened values (8 n, ...) of (n, 4, 2) or (n, 8, k)."""
+    """Whiten (n, 4, 2) or (n, 8, k) to values (8 n, ...)."""
     if values.ndim == 3 and values.shape[1:] == (4, 2):
         return np.asarray(np.einsum("nij,nj->ni", whitening, values.reshape(-1, 8)).reshape(-1))
     return np.asarray((whitening @ values).reshape(-1, values.shape[-1]))
 
 
 def compute_interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Array) -> Array:
-    """(2n, 3) of points (n, 2) of the plane, m; see :func:`compute_interaction_matrix`."""
+    """As :func:`compute_interaction_matrix`, (2n, 3), for points (n, 2) of the plane, m."""
     slope = camera.jacobian(xy_m)
     arm = xy_m - centre_m
     turned = np.column_stack([-arm[:, 1], arm[:, 0]])
@@ -224,11 +226,11 @@ def compute_interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Ar
 
 
 def compute_interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) -> Array:
-    """Derivative of ideal pixels by the velocity of the stage in the sem frame.
+    """Compute the derivative of ideal pixels with respect to the stage velocity in the sem frame.
 
-    With P_g of the frame known, and with it the depth 1 / rho of the stage plane, a pixel has one place in the
-    plane: nothing is left to be estimated, as the depth has to be for other cameras (Chaumette and Hutchinson 2006,
-    doi:10.1109/MRA.2006.250573).
+    P_g of the frame is known, and with it the depth 1 / rho of the stage plane, so a pixel has one
+    position in the plane. No depth has to be estimated, as it has for other cameras (Chaumette and
+    Hutchinson 2006, doi:10.1109/MRA.2006.250573).
 
     Parameters
     ----------
@@ -241,7 +243,8 @@ def compute_interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: Arr
 
     Returns
     -------
-    (2n, 3): rows u, v of each point; columns px per m for x and y, px per rad for the rotation from x towards y.
+    (2n, 3): rows u, v of each point; columns px per m for x and y, px per rad for the rotation from
+    x towards y.
     """
     centre = np.asarray(centre_m, dtype=np.float64).reshape(2)
     return compute_interaction_of_points(camera, camera.plane_from_px(xy), centre)

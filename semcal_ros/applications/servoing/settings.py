@@ -1,4 +1,4 @@
-"""How the stage is servoed."""
+"""Settings of visual servoing."""
 
 from __future__ import annotations
 
@@ -16,30 +16,31 @@ class ServoSettings:
     Attributes
     ----------
     gain_hz
-        Part of the error that is taken away per second, 1/s.
+        Part of the error that is removed per second, 1/s.
     speed_limit_m_s, turn_limit_rad_s
         Largest commanded speeds.
     travel_limit_px
-        How far a feature may move within a frame: what moves during its acquisition is blurred by that.
+        Largest movement of a feature within a frame, whose acquisition blurs it by that much.
     tolerance_px
-        Converged is what is nearer to the goal than this, RMS over the features, and known to half of it (1-sigma).
+        Distance to the goal, RMS over the features, below which the servo has converged; the
+        distance must be known to half of it (1-sigma).
     settle_frames
-        For so many frames in a row.
+        Number of successive frames in which this must hold.
     scale_tolerance
-        The target must have the size that the camera of the frame says, to this fraction: else the frame is of
-        another magnification than its camera.
+        Largest relative difference between the size of the target and the size that the camera of
+        the frame predicts: beyond it, frame and camera are of different magnifications.
     max_sigma_px
-        A pose that is less certain (1-sigma) is not used.
+        Largest 1-sigma of a pose that is used.
     feed_forward
-        Whether what moves beside the commands (drift) is estimated and commanded away.
+        Whether motion that the commands do not explain (drift) is estimated and compensated.
     drift_sigma_m_s, drift_change_m_s
-        Drift to be expected (1-sigma), and by how much it changes in a second.
+        Expected drift (1-sigma), and its change within a second.
     axis_sigma_px, axis_change_px
-        By how much the cameras may be wrong about where the optical axis is seen (1-sigma), and by how much more
-        that differs from one magnification to the next: what the changes of the magnification tell of it corrects
-        them. 0: they are not corrected.
+        Error of the cameras in the position of the optical axis (1-sigma), and its change from one
+        magnification to the next. Changes of magnification serve to correct it; 0 disables the
+        correction.
     slip
-        Part of a commanded travel by which the stage may miss it (1-sigma): no drift is read from that.
+        Relative error of the stage's travel (1-sigma), which is not taken for drift.
     """
 
     gain_hz: float = 1.0

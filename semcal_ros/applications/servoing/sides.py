@@ -1,10 +1,11 @@
 """Corners of markers to a fraction of a pixel, from straight lines fitted to their sides.
 
-Across a side, between white border and black frame, the grey level steps once. Where it does follows from the mean
-over a window that is centred on the side: a step at delta from the middle of a window of half-width h makes the
-mean ``(black (h + delta) + white (h - delta)) / 2h``. Blur does not move it, since it is the same to both sides. A
-line through the steps of a side is known to a few hundredths of a pixel, and so are the corners, where two lines
-meet: the corner of a blurred image itself is rounded, and a corner detector finds it further inside.
+Across a side, between white border and black frame, the grey level steps once. Its position follows
+from the mean over a window centred on the side: a step at delta from the middle of a window of
+half-width h makes the mean ``(black (h + delta) + white (h - delta)) / 2h``. Blur does not move it,
+since it is the same to both sides. A line through the steps of a side is known to a few hundredths
+of a pixel, and so are the corners, where two lines meet: the corner of a blurred image itself is
+rounded, and a corner detector finds it further inside.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from semcal_ros.core.arrays import Array, Image, Mask
 __all__ = ["RefinedQuads", "refine_quads"]
 
 
-# Part of a side that is left out at both of its ends, where the window would meet the next side.
+# Part of a side that is left out at each end, where the window would meet the next side.
 _ENDS = 0.14
-# Half-width of the window over the side, px at least and at most. Border and frame of a marker are wider.
+# Half-width of the window as a part of the side, and its limits, px. Border and frame of a marker
+# are wider.
 _WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
 # The windows are laid over the corners found last, at most this often.
 _ROUNDS = 4
@@ -30,11 +32,11 @@ _SETTLED_PX = 0.02
 # Largest number of places along a side at which its step is measured: more of them cost time, and
 # neighbours that are closer than a pixel share their noise.
 _MOST_PLACES = 96
-# Steps further off than this from the line of the others are dust.
+# Steps further than this many sigma from the line through the others are dust.
 _OUTLIER = 3.5
-# A line through steps that scatter by more than this part of the window is none.
+# Steps that scatter by more than this part of the window do not form a line.
 _RAGGED = 0.5
-# Least contrast of a side, in deviations of its pixels from the two levels.
+# Least contrast of a side, in standard deviations of its pixels from the two levels.
 _LEAST_CONTRAST = 2.0
 # The least number of places on a side, also after outliers were left out: three per unknown.
 _LEAST_PLACES = 6
@@ -61,7 +63,7 @@ class RefinedQuads:
 
 @dataclass(frozen=True)
 class _Line:
-    """Steps along one side: ``offset + slope * tau`` outward, tau from the middle of the side, px."""
+    """Steps along one side: ``offset + slope * tau`` outward, tau from its middle, px."""
 
     offset: float
     slope: float
@@ -70,7 +72,7 @@ class _Line:
 
 
 def refine_quads(image: Image, corners: Array) -> RefinedQuads:
-    """Refine the corners (n, 4, 2) of dark markers on white, given to about two pixels, in order around them."""
+    """Refine the corners (n, 4, 2) of dark markers on white, in order, given to about 2 px."""
     count = len(corners)
     xy, covariance = np.array(corners, dtype=np.float64), np.zeros((count, 8, 8))
     good = np.zeros(count, dtype=np.bool_)
@@ -107,7 +109,7 @@ def _compute_winding(quad: Array) -> float:
 
 
 def _make_side_frame(first: Array, second: Array, winding: float) -> tuple[float, Array, Array]:
-    """Length of a side, and the unit vectors along it and outward."""
+    """Compute the length of a side, and the unit vectors along it and outward."""
     along = second - first
     length = float(np.hypot(along[0], along[1]))
     along = along / max(length, 1e-9)
@@ -160,7 +162,7 @@ def _fit_line(tau: Array, step: Array, half: float) -> _Line | None:
     if count < _LEAST_PLACES or sigma > _RAGGED * half:
         return None
     centred = tau[keep] - tau[keep].mean()
-    # Neighbouring places share pixels by the interpolation: a step or two px apart they do so half.
+    # Neighbouring places share pixels through interpolation, partly even when a px or two apart.
     variance = max(sigma, 1e-3) ** 2 * 1.5
     return _Line(
         float(offset), float(slope), variance / count, variance / float(np.sum(centred**2))
@@ -168,7 +170,7 @@ def _fit_line(tau: Array, step: Array, half: float) -> _Line | None:
 
 
 def _intersect_lines(quad: Array, lines: list[_Line]) -> tuple[Array, Array]:
-    """Where neighbouring lines meet, and the (8, 8) covariance of that."""
+    """Intersect neighbouring lines: corners and their (8, 8) covariance."""
     winding = _compute_winding(quad)
     frames = [_make_side_frame(quad[k], quad[(k + 1) % 4], winding) for k in range(4)]
     moved, gradient = np.empty((4, 2)), np.zeros((8, 8))

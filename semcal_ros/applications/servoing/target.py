@@ -1,9 +1,9 @@
 """A planar target that shows some of its markers at every magnification.
 
-Square markers of a coded dictionary lie in the eight outer cells of a 3 x 3 board; the middle cell is the same
-board again, a third of the size, with other markers, and so on. A marker can be read from some 20 px to most of the
-field, a factor of about 20, so that at any magnification two levels at least can be read, and the origin, in the
-middle of all boards, is common to all.
+Square markers of a coded dictionary lie in the eight outer cells of a 3 x 3 board; the middle cell
+is the same board again, a third of the size, with other markers, and so on. A marker can be read
+from about 20 px up to most of the field, a factor of about 20, so that at least two levels can be
+read at any magnification. The origin, in the middle of all boards, is common to all.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _MOST_LEVELS = 6
 
 @lru_cache(maxsize=1)
 def dictionary() -> cv2.aruco.Dictionary:
-    """The code of the markers: fifty of 4 x 4 bits, which differ by at least four in any orientation."""
+    """Return the code of the markers: fifty of 4 x 4 bits, at least four bits apart."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 
 
@@ -63,7 +63,7 @@ class NestedTarget:
     Raises
     ------
     InvalidValueError
-        For a size that is not positive, or a number of levels that the code has no markers for.
+        For a size that is not positive, or more levels than the code has markers for.
     """
 
     largest_cell_m: float = 180e-6
@@ -81,17 +81,17 @@ class NestedTarget:
 
     @property
     def size(self) -> int:
-        """Number of markers; their numbers are 0 to ``size - 1``, eight a level, the largest first."""
+        """Number of markers, numbered 0 to ``size - 1``: eight per level, largest first."""
         return len(CELLS) * self.levels
 
     def cell_m(self, level: int) -> float:
-        """Side of a cell of a level, m."""
+        """Return the side of a cell of a level, m."""
         return self.largest_cell_m / float(RATIO**level)
 
     def corners_m(self, ids: NDArray[np.int64]) -> Array:
-        """Corners (n, 4, 2) of markers in the frame of the target, m.
+        """Return the corners (n, 4, 2) of markers in the frame of the target, m.
 
-        They go from the one that is top left as coded to the right and around, x to the right and y down.
+        They start top left in the code's orientation and go clockwise, x to the right and y down.
         """
         level, place = np.divmod(np.asarray(ids, dtype=np.int64), len(CELLS))
         cell = self.largest_cell_m / RATIO ** level.astype(np.float64)
@@ -102,7 +102,7 @@ class NestedTarget:
         return corners
 
     def bits(self, marker: int) -> NDArray[np.uint8]:
-        """(6, 6) squares of a marker, row by row: 1 is white."""
+        """Return the (6, 6) squares of a marker, row by row: 1 is white."""
         if not 0 <= marker < self.size:
             raise InvalidValueError(f"marker {marker}", expected=f"0 to {self.size - 1}")
         drawn = cv2.aruco.generateImageMarker(dictionary(), int(marker), MARKER_BITS)
