@@ -96,7 +96,7 @@ class BundleResult:
         return self.status in (BundleStatus.SMALL_DECREASE, BundleStatus.NO_DESCENT)
 
     def rms_px(self) -> float:
-        """RMS distance of observed and projected corners, px."""
+        """Return the RMS distance of observed and projected corners, px."""
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
 

@@ -92,7 +92,7 @@ class CalibrationOptions:
         skew jump (only ``"joint"``). A jump that the views indicate elsewhere is reported as a
         warning.
     residual
-        Whether a residual field describes what the distortion parameters cannot (only
+        Whether a residual field adds to the distortion parameters (only
         ``"joint"``): ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
 
     Raises
@@ -141,7 +141,7 @@ class CalibrationResult:
         RMS reprojection error of each magnification's views under a calibration from all others;
         the two outermost ones are extrapolated.
     warnings
-        Plain sentences about what the data could not determine.
+        Plain sentences about quantities that the data could not determine.
     outliers
         Views that were left out because they disagree with the others (``"joint"``).
     """

@@ -50,7 +50,7 @@ class DiscreteFit:
     covariances
         (M, 10, 10).
     centres
-        Outcome of Algorithm 1 at each magnification.
+        Result of Algorithm 1 at each magnification.
     results
         The adjustments.
     """
@@ -135,7 +135,7 @@ def table_functions(
 ) -> tuple[dict[str, ContinuousFunction], Array]:
     """Interpolate linearly in log g between separate calibrations; covariance of all nodes.
 
-    This is what the discrete calibrations of the literature offer between their magnifications.
+    The discrete calibrations of the literature offer this between their magnifications.
     """
     g_range = (float(magnifications[0]), float(magnifications[-1]))
     functions = {

@@ -45,7 +45,7 @@ class ViewPose:
     converged: bool
 
     def rms_px(self) -> float:
-        """RMS distance over all corners, px."""
+        """Return the RMS distance over all corners, px."""
         square = np.concatenate([np.sum(r * r, axis=1) for r in self.residuals_px])
         return float(np.sqrt(np.mean(square)))
 

@@ -371,7 +371,7 @@ def fit_joint(
     residual: str = "off",
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> JointFit:
-    """Calibrate from nominal values alone.
+    """Calibrate from views and nominal values alone.
 
     The poses come first, with a camera that does not depend on the magnification; then moderately
     flexible functions, both from a part of the corners; from there the number of coefficients of

@@ -71,7 +71,7 @@ def _fit_curve(
 def pda_functions(
     discrete: DiscreteFit, *, order: int = 2, legendre_degree: int | None = None
 ) -> tuple[dict[str, ContinuousFunction], Array]:
-    """Continuous functions through separate calibrations.
+    """Fit continuous functions through separate calibrations.
 
     Parameters
     ----------

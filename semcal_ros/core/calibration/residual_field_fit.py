@@ -181,8 +181,8 @@ def field_system(
 ) -> FieldSystem:
     """Compute the reduced system about an adjustment.
 
-    ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the ones that
-    ``field`` has corrected. Weights are scaled to the variance that the residuals show.
+    ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the views
+    corrected by ``field``. Weights are scaled to the variance that the residuals show.
     """
     variance = variance_factor(problem, result)
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
@@ -195,8 +195,8 @@ def field_system(
         part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
         spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px)
         rows = np.zeros((2, width, len(spline)))
-        # Observed plus field minus projected: the field counts as a projection that moves the other
-        # way.
+        # The residual is observed plus field minus projected, so the field has the opposite sign of
+        # a projection.
         rows[0, 16:-1:2] = rows[1, 17:-1:2] = -setup.norm_px * spline.T
         whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
         rows[:, :16] = whitened.rows[:, :16, part]

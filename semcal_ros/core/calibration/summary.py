@@ -1,4 +1,4 @@
-"""Statistics of a calibration for its file, and warnings about what the views do not determine."""
+"""Statistics of a calibration for its file, and warnings about parameters that the views leave open."""
 
 from __future__ import annotations
 

@@ -282,7 +282,7 @@ def views_from_detections(
     Raises
     ------
     CalibrationError
-        If there is no detection.
+        If there are no detections.
     """
     if not detections:
         raise CalibrationError(

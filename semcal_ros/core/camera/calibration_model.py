@@ -125,11 +125,11 @@ class CalibrationModel:
         return 0.5 * self.image_width
 
     def nominal_px_per_m(self, g: float) -> float:
-        """Scale in px per m that the display width alone predicts."""
+        """Return the scale in px per m that the display width alone predicts."""
         return g * self.image_width / self.display_width_m
 
     def at(self, magnification: float) -> ScanCamera:
-        """The camera at a magnification.
+        """Return the camera at a magnification.
 
         Outside of :attr:`magnification_range` the functions continue along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range.

@@ -121,7 +121,7 @@ class ScanCamera:
     ) -> ScanCamera:
         """Return the camera that the display width alone predicts: parallel, without distortion.
 
-        Its covariance is that of an instrument that nobody has calibrated: a scale good to 3 %, an
+        Its covariance is that of an uncalibrated instrument: a scale good to 3 %, an
         axis within 3 % of the width from the middle, an unknown distortion of a few tenths of a
         per cent (1-sigma).
         """

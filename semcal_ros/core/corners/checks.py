@@ -149,7 +149,7 @@ class FittedCorners:
 
 
 def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array32) -> Mask:
-    """Select fits that settled near the prediction with the right sign of contrast; (n,)."""
+    """Select fits that converged near the prediction with the right sign of contrast; (n,)."""
     norm = np.linalg.norm(maps.axes, axis=2)
     spacing = np.abs(maps.cell_px2) / norm.max(axis=1)
     expected = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])

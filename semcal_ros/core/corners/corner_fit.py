@@ -86,7 +86,7 @@ class CornerFit:
     freedom
         (n,) degrees of freedom.
     shift_px
-        (n,) size of the last step; large where the fit has not settled.
+        (n,) size of the last step, px; large where the fit has not converged.
     coverage
         (n,) part of the window that lies in the image.
     level, variance

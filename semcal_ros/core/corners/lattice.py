@@ -136,7 +136,7 @@ def _find_seeds(saddles: SaddlePoints, tree: cKDTree) -> _Seeds:
 
 
 class _Growth:
-    """Wavefront growing: each round predicts and looks up the free neighbours of the last front."""
+    """Growth of a wavefront: each round predicts and looks up free neighbours of the last front."""
 
     def __init__(
         self,

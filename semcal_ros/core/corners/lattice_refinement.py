@@ -87,7 +87,7 @@ class RefinedCorners:
 
 @dataclass(frozen=True)
 class _Knowledge:
-    """What the first fits reveal about the image."""
+    """Noise, priors and sign of the contrast, learnt from the first fits."""
 
     noise: NoiseModel
     learnt: Learnt

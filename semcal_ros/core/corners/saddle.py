@@ -107,7 +107,7 @@ def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64],
     radius = max(1, round(1.2 * scale_px))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     peaks = (response >= cv2.dilate(response, kernel)) & (response > 0)
-    # There is no second derivative on the rim of the frame.
+    # The second derivative is undefined on the rim of the frame.
     peaks[[0, -1], :] = False
     peaks[:, [0, -1]] = False
     rows, columns = np.nonzero(peaks)
