@@ -73,7 +73,7 @@ def command(
         )
     track.save_csv(output)
     if plot is not None:
-        # Here, so that those who want no plot do not wait for matplotlib.
+        # Imported here, so that a run without a plot does not wait for matplotlib.
         from semcal_ros.report.drift_figures import write_drift_figure
 
         write_drift_figure(track.path, plot)

@@ -83,7 +83,7 @@ def main(args: list[str] | None = None) -> int:
     except SemcalError as error:
         return _refuse(str(error))
     except BrokenPipeError:
-        return 0  # the reader of our output has seen enough
+        return 0  # the reader of the output has closed the pipe
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{name}{error.strerror or error}")

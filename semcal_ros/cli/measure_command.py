@@ -165,7 +165,7 @@ def _draw(
 ) -> None:
     if plot is None and strip is None and video is None:
         return
-    # Here, so that those who want no figure do not wait for matplotlib.
+    # Imported here, so that a run without a figure does not wait for matplotlib.
     from semcal_ros.report.cantilever_figures import (
         write_bending_video,
         write_poses_figure,

@@ -31,7 +31,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
 
 PATH = click.Path(path_type=Path)
-#: What matplotlib writes by the suffix of a name.
+#: Formats of matplotlib by the suffix of a file name.
 FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 recording_argument = click.argument("recording", type=PATH)
@@ -62,7 +62,7 @@ json_option = click.option(
 
 
 def recording_options(command: Command) -> Command:
-    """How a recording is to be read: ``--config`` and ``--frame-time``."""
+    """Options for reading a recording: ``--config`` and ``--frame-time``."""
     return config_option(frame_time_option(command))
 
 
@@ -101,12 +101,12 @@ def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -
     outputs
         (option, path or None, suffixes that its kind of file may have; none for any).
     recording
-        What must not be written into.
+        Recording that must not be written to.
 
     Raises
     ------
     InvalidValueError
-        A suffix is another one, a folder does not exist, two outputs are one file, or an output
+        A suffix is not accepted, a folder does not exist, two outputs are one file, or an output
         belongs to the recording.
     """
     taken: set[Path] = set()

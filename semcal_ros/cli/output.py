@@ -26,8 +26,8 @@ __all__ = [
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[str, int, int | None], None]]:
-    """An ``on_progress`` of a workflow: bars on stderr, on terminals, for work of over a second."""
-    # Here, so that commands without work do not wait for it.
+    """Make the ``on_progress`` of a workflow: bars on stderr, on terminals, for work of over a second."""
+    # Imported here, so that quick commands do not wait for it.
     from tqdm import tqdm
 
     bar: tqdm[Any] | None = None
@@ -52,7 +52,7 @@ def show_progress() -> Iterator[Callable[[str, int, int | None], None]]:
 
 
 def echo_notes(notes: Iterable[str]) -> None:
-    """Print what a person should know, to stderr."""
+    """Print notes for the user to stderr."""
     for note in notes:
         click.echo(f"note: {note}", err=True)
 

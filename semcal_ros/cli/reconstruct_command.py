@@ -101,7 +101,7 @@ def command(
     if cloud is not None:
         done.save_cloud(cloud, unit=unit)
     if figure is not None:
-        # Here, so that those who want no picture do not wait for matplotlib.
+        # Imported here, so that a run without a figure does not wait for matplotlib.
         from semcal_ros.report.ball_figures import write_ball_figure
 
         write_ball_figure(done.structure, done.ball, figure)

@@ -18,7 +18,7 @@ _NAME_PART = 100
 
 
 def _mode_for(path: Path) -> int:
-    """Permission bits of the finished file: those of the file it replaces, else the usual ones."""
+    """Return the permission bits of the finished file: those of the file it replaces, else the usual ones."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The calibration file: its text, and the checks of what is read."""
+"""The calibration file: its text, and the checks when it is read."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _HEADER = (
 
 # What the rounding of a file's numbers may leave below zero, per coefficient.
 _NEGATIVE_CORRELATION = 1e-7
-# libyaml where it was built in: 20 times faster on the covariance.
+# libyaml if PyYAML was built with it: 20 times faster on the covariance.
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -83,7 +83,7 @@ def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationM
         model = CalibrationModel(**_fields_from(data))
         _check_cameras(model)
     except (ValueError, ArithmeticError) as error:
-        # YAML has integers of any length, and floats whose products overflow.
+        # YAML allows integers of any length, and floats whose products overflow.
         known = isinstance(error, InvalidValueError)
         reason = str(error)[:_MAX_REASON] if known else "numbers that cannot be used"
         raise CalibrationFileError(
@@ -93,7 +93,7 @@ def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationM
 
 
 def format_calibration(model: CalibrationModel) -> str:
-    """The text of the calibration file, with every number in full precision."""
+    """Format the text of the calibration file, with every number in full precision."""
     field = model.residual
     size = len(model.covariance) - (0 if field is None else field.size)
     own = model.covariance[:size, :size]
@@ -137,7 +137,7 @@ def write_calibration(model: CalibrationModel, path: str | os.PathLike[str]) -> 
 
 
 def read_calibration_text(path: Path, max_bytes: int = _MAX_TEXT) -> str:
-    """Text of a calibration file.
+    """Read the text of a calibration file.
 
     Raises
     ------
@@ -222,7 +222,7 @@ def _finite(values: Sequence[Any]) -> list[float]:
 
 
 def _check_cameras(model: CalibrationModel) -> None:
-    """Refuse numbers that are valid one by one and overflow in what the camera is asked for."""
+    """Refuse numbers that are valid one by one but overflow when a camera is evaluated."""
     right, bottom = model.image_width - 1.0, model.image_height - 1.0
     corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
     with np.errstate(over="raise", divide="raise", invalid="raise"):
@@ -340,7 +340,7 @@ def _check_covariance(matrix: Array) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Statistics as plain YAML types."""
+    """Convert statistics to plain YAML types."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Files that are named while a program runs, such as by a service: only inside of one folder."""
+"""Restricts files that are named while a program runs, such as by a service, to one folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _resolve(path: str) -> Path:
 
 
 class AllowedPaths:
-    """Which files may be named.
+    """The files that may be named.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class AllowedPaths:
             self._folders = (folder,)
 
     def resolve(self, path: str) -> Path:
-        """The file itself, behind ``~``, ``..`` and all symbolic links as they are now.
+        """Return the file itself: ``~``, ``..`` and all symbolic links are resolved as they are now.
 
         Raises
         ------

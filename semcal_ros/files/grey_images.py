@@ -43,7 +43,7 @@ def write_grey_image(
     Raises
     ------
     InvalidValueError
-        If a PNG is wanted of other grey levels, or of any other suffix.
+        If a PNG is wanted of other grey levels, or the suffix is not one of these.
     OSError
         If the file cannot be written; an existing one is untouched.
     """
@@ -63,7 +63,7 @@ def write_grey_image(
 
 
 def _tiff(values: NDArray[np.float32], pixel_size_m: tuple[float, float]) -> bytes:
-    """A file of 32-bit grey levels whose pixel size ImageJ understands."""
+    """Encode a file of 32-bit grey levels whose pixel size ImageJ understands."""
     per_um = [1e-6 / size for size in pixel_size_m]
     file = io.BytesIO()
     tifffile.imwrite(

@@ -1,7 +1,7 @@
 """Point clouds and triangle meshes as PLY and STL files.
 
-Lengths in these files are in a unit that the caller chooses, by default nm: mesh viewers show nothing of a mesh that is
-1e-7 wide. A PLY says its unit in a comment; an STL cannot.
+Lengths in these files are in a unit that the caller chooses, by default nm: mesh viewers do not show a mesh that is
+1e-7 wide. A PLY states its unit in a comment; an STL cannot.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def save_mesh(path: str | Path, mesh: SurfaceMesh, *, unit: str = "nm") -> None:
     Raises
     ------
     InvalidValueError
-        Another suffix or unit.
+        The suffix or the unit is not one of these.
     OSError
         As :func:`~semcal_ros.files.atomic.atomic_write_bytes`.
     """
@@ -90,7 +90,7 @@ def save_cloud(
     Raises
     ------
     InvalidValueError
-        Another suffix or unit, or columns of another length.
+        The suffix or the unit is not one of these, or a column has the wrong length.
     """
     target, scale = Path(path), _scale(unit)
     if target.suffix.lower() != ".ply":

@@ -1,4 +1,4 @@
-"""Ordinary image files of one magnification, which the files do not contain."""
+"""Ordinary image files, which do not contain their common magnification."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PLAIN_IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"}
 
 
 def plain_image_paths(path: Path) -> list[Path]:
-    """The image files of a folder in the order of their names, or the one file."""
+    """Return the image files of a folder in the order of their names, or the one file."""
     listed = sorted(path.iterdir()) if path.is_dir() else [path]
     return [p for p in listed if p.is_file() and p.suffix.lower() in PLAIN_IMAGES]
 
 
 def read_plain_image(path: Path) -> NDArray[Any]:
-    """Grey values of an image file, 8 or 16 bit.
+    """Read the grey values of an image file, 8 or 16 bit.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def read_plain_image(path: Path) -> NDArray[Any]:
             cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
         )
     except cv2.error:
-        image = None  # it refuses absurd sizes by raising
+        image = None  # OpenCV raises for absurd sizes
     if image is None or image.dtype.name not in ("uint8", "uint16"):
         raise BagError(f"{path}: not a readable image", expected="an intact 8 or 16 bit image file")
     return image

@@ -46,7 +46,7 @@ class RecordedFrame:
     log_time_ns
         When the recorder received the image.
     magnification
-        Of this frame, on the display width of the configuration.
+        Magnification of this frame, for the display width of the configuration.
     frame_id
         Coordinate frame that the header names.
     encoding
@@ -109,11 +109,11 @@ class Recording(ABC):
     @property
     @abstractmethod
     def frame_count(self) -> int:
-        """Number of images, bad ones included."""
+        """Number of images, including bad ones."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a person should know; complete after :meth:`frames` was read to its end."""
+        """Notes for the user; complete after :meth:`frames` was read to its end."""
         return (*self._notes, *self._pass_notes)
 
     @property
@@ -122,7 +122,7 @@ class Recording(ABC):
         return tuple(self._rejected)
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """Usable frames in the order of the recording, read as asked for; can be called again.
+        """Yield usable frames in the order of the recording, read on demand; can be called again.
 
         Raises
         ------
@@ -331,8 +331,8 @@ def open_recording(
         TIFFs, its display width is what magnifications refer to, and its databar rows, if not
         0, are used in place of what the files say.
     magnification
-        Of all images of a folder of ordinary image files, which do not contain it. It is refused for
-        recordings and SEM TIFFs, which do.
+        Magnification of all images of a folder of ordinary image files, which do not contain it. It is
+        refused for recordings and SEM TIFFs, which contain theirs.
 
     Raises
     ------
@@ -358,7 +358,7 @@ def open_recording(
 
 
 def _frame_kind(path: Path, magnification: float | None) -> str:
-    """``tiff``, ``plain`` or ``bag``; the reader of bags then says what is wrong with anything else."""
+    """Return ``tiff``, ``plain`` or ``bag``; the bag reader reports what is wrong with anything else."""
     kind = "bag"
     if path.exists() and not is_bag(path):
         names = list(path.iterdir()) if path.is_dir() else [path]

@@ -26,7 +26,7 @@ DRIFT_COLUMNS = (
 
 
 def _cell(value: object) -> str:
-    """Text that reads back as the same value; None is written as ``nan``."""
+    """Format a value so that it reads back the same; None is written as ``nan``."""
     if value is None:
         return "nan"
     return repr(float(value)) if isinstance(value, float) else str(value)
@@ -38,7 +38,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
     Raises
     ------
     InvalidValueError
-        A row has another number of values than there are columns.
+        The number of values in a row differs from the number of columns.
     OSError
         The file cannot be written; an existing one is untouched.
     """

@@ -28,11 +28,11 @@ class VideoCodec:
     Attributes
     ----------
     encoder, pixel_format
-        As FFmpeg calls them.
+        Their names in FFmpeg.
     options
-        Of the encoder.
+        Options of the encoder.
     container_options
-        Of the file format.
+        Options of the file format.
     """
 
     encoder: str
@@ -121,7 +121,7 @@ class VideoWriter:
         self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
 
     def finish(self) -> None:
-        """Write what the encoder still holds, and the index; no more frames follow.
+        """Write the frames that the encoder still holds, and the index; no frames may follow.
 
         Raises
         ------
@@ -157,7 +157,7 @@ def open_video(
     path, size, fps, grey
         As for :class:`VideoWriter`.
     frames
-        How many are going to be written.
+        Number of frames that will be written.
 
     Raises
     ------

@@ -36,7 +36,7 @@ __all__ = ["RecordingCalibration", "calibrate", "calibrate_found", "calibrate_re
 
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
-# Octaves: how near to a factor of two the scale of a microscope with the right display width never is.
+# In octaves: with the right display width, the scale of a microscope is never this close to a factor of two.
 _TWICE = 0.12
 
 
@@ -49,9 +49,9 @@ class RecordingCalibration:
     calibration, result
         The calibration, and the adjustment it comes from.
     collected
-        Views that were used, and those that were not.
+        Views that were used, and rejected ones.
     notes
-        What a person should know of the recording.
+        Notes for the user about the recording.
     """
 
     calibration: Calibration
@@ -61,7 +61,7 @@ class RecordingCalibration:
 
 
 def _check_factor(factor: float, display_width_m: float) -> None:
-    """Refuse what confusing the side of a square with the period of the grid gives."""
+    """Refuse a scale that results from confusing the side of a square with the grid's period."""
     if abs(abs(np.log2(factor)) - 1.0) < _TWICE:
         raise CalibrationError(
             f"images that show {factor:.3g} times the scale that squares_m and the display width of "
@@ -72,7 +72,7 @@ def _check_factor(factor: float, display_width_m: float) -> None:
 
 
 def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
-    """The collected views less those that the calibration has left out."""
+    """Return the collected views without those that the calibration left out."""
     if not result.outliers:
         return collected
     kept = {view.name for view in result.views}
@@ -188,7 +188,7 @@ def calibrate(
     display_width_m, squares_m
         Replace the values of ``config``.
     magnification
-        Of a folder of ordinary images, which do not tell it.
+        Magnification of a folder of ordinary images, which do not contain it.
     method, options, breakpoints, residual
         As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
         is ``method_options``.

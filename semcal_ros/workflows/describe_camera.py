@@ -15,15 +15,15 @@ __all__ = ["describe_camera", "parameter_sigma"]
 
 
 def parameter_sigma(camera: ScanCamera) -> dict[str, float]:
-    """1-sigma of each parameter of a calibrated camera."""
+    """Return the 1-sigma of each parameter of a calibrated camera."""
     assert camera.covariance is not None
-    # Of an exactly known parameter, rounding may leave a variance of less than nothing.
+    # Rounding may make the variance of an exactly known parameter negative.
     sigma = np.sqrt(np.maximum(np.diag(camera.covariance), 0.0))
     return dict(zip(PARAMETER_NAMES, sigma.tolist(), strict=True))
 
 
 def describe_camera(calibration: Calibration, magnification: float) -> dict[str, Any]:
-    """K, P, distortion, pixel size and their uncertainty in SI units, as ``semcal at --json`` prints them.
+    """Return K, P, distortion, pixel size and their uncertainty in SI units, as ``semcal at --json`` prints them.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from semcal_ros.workflows.inputs import (
 
 __all__ = ["Evaluation", "MagnificationError", "evaluate"]
 
-# Spread of the heights on a stage, where the calibration does not say it.
+# 1-sigma of the heights on a stage if the calibration does not contain it.
 _HEIGHT_SIGMA_M = 1e-4
 
 
@@ -54,9 +54,9 @@ class Evaluation:
     Attributes
     ----------
     rms_px
-        Of all corners, px.
+        Error over all corners, px.
     views, rejected
-        Numbers of images that were used, and that were not.
+        Numbers of images that were used, and that were rejected.
     by_magnification
         The same for each magnification, ascending.
     """
@@ -82,11 +82,11 @@ def evaluate(
     calibration
         A calibration or its file.
     source
-        A recording that it was not made from, or (image, magnification) tuples in memory.
+        A recording that was not used for the calibration, or (image, magnification) tuples in memory.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     magnification
-        Of a folder of ordinary images, which do not tell it.
+        Magnification of a folder of ordinary images, which do not contain it.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -120,8 +120,8 @@ def evaluate(
 
 
 def _height_sigma_m(statistics: Mapping[str, Any]) -> float:
-    """The prior of the heights in the calibration; its statistics are notes, and may have been
-    edited.
+    """Return the prior of the heights in the calibration; its statistics are notes, which a user
+    may have edited.
     """
     priors = statistics.get("priors")
     height = priors.get("height_sigma_m") if isinstance(priors, Mapping) else None

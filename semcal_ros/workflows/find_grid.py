@@ -1,4 +1,4 @@
-"""Find the grid in the images of a recording, and tell how large its squares are."""
+"""Finds the grid in the images of a recording and the size of its squares."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ __all__ = [
 #: Called with the number of frames that were done since the last call.
 Progress = Callable[[int], object]
 
-# Fewer images are found sooner than other processes have started.
+# Fewer images are processed before other processes have started.
 _TOO_FEW_TO_SHARE = 12
 
 
 @dataclass(frozen=True)
 class CollectedViews:
-    """Accepted views in metres, with what they come from.
+    """Accepted views in metres, with their sources.
 
     ``found[i]`` belongs to ``views[i]``.
     """
@@ -114,12 +114,12 @@ def collect_views(
     display_width_m: float,
     squares_m: Sequence[float],
 ) -> CollectedViews:
-    """Views of one image size, with their square sizes assigned.
+    """Collect the views of one image size, with their square sizes assigned.
 
     Raises
     ------
     CalibrationError
-        If no view is left; the message gives the commonest reason.
+        If no view is left; the message gives the most frequent reason.
     """
     if not found:
         reasons = Counter(r.reason for r in rejected).most_common(1)

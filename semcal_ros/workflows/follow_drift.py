@@ -42,7 +42,7 @@ _FAST_PX = 0.5
 def camera_for(
     frame: RecordedFrame, model: Calibration | None, config: MicroscopeConfig
 ) -> ScanCamera:
-    """The calibrated camera of a frame, or the nominal one of the display width."""
+    """Return the calibrated camera of a frame, or the nominal one from the display width."""
     height, width = frame.image.shape[:2]
     if model is None:
         return ScanCamera.nominal(frame.magnification, width, height, config.display_width_m)
@@ -50,7 +50,7 @@ def camera_for(
 
 
 def start_time_s(frame: RecordedFrame, first_stamp_ns: int, config: MicroscopeConfig) -> float:
-    """Start of the acquisition in seconds after the first frame's stamp."""
+    """Return the start of the acquisition in seconds after the first frame's stamp."""
     return (frame.stamp_ns - first_stamp_ns) * 1e-9 + config.start_offset_s
 
 
@@ -60,7 +60,7 @@ class DriftFollower:
     Parameters
     ----------
     hindsight
-        Whether to keep what smoothing takes; without it only the drift of now is known.
+        Whether to keep the data for smoothing; without them only the current drift is known.
     """
 
     def __init__(self, *, hindsight: bool = True) -> None:
@@ -72,19 +72,19 @@ class DriftFollower:
     def update(
         self, frame: RecordedFrame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
     ) -> DriftUpdate:
-        """Drift at the next frame."""
+        """Update with the next frame and return its drift."""
         update = self.tracker.update(frame.image, time_s, camera, scan)
         if self.history is not None:
             self.updates.append(update)
         return update
 
     def path(self, *, live: bool) -> DriftPath:
-        """Drift of all frames.
+        """Return the drift of all frames.
 
         Parameters
         ----------
         live
-            Whether to return what was known at each frame when it came, without hindsight.
+            Whether to return the drift known live at each frame, without hindsight.
         """
         if live or self.history is None:
             return DriftPath(tuple(self.updates))
@@ -105,7 +105,7 @@ def estimate_timing(
     follower
         It has tracked the recording with that configuration.
     model
-        Calibration, or None where distortion was left in.
+        Calibration, or None if distortion was not removed.
 
     Returns
     -------
@@ -134,13 +134,13 @@ def estimate_timing(
 
 
 def _with_sigma(value: float, sigma: float) -> str:
-    """A value with as many decimals as the first digit of its uncertainty."""
+    """Format a value with as many decimals as the first digit of its uncertainty."""
     digits = int(np.clip(-np.floor(np.log10(sigma)), 0, 9)) if sigma > 0.0 else 3
     return f"{value:.{digits}f} +- {sigma:.{digits}f}"
 
 
 def _largest_step_px(updates: Sequence[DriftUpdate]) -> float:
-    """Drift from one frame to the next, px, which a tenth of the frames exceed."""
+    """Return the drift from one frame to the next, px, that a tenth of the frames exceed."""
     pairs = [
         (before, now)
         for before, now in itertools.pairwise(updates)

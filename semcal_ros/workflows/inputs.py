@@ -1,4 +1,4 @@
-"""What every workflow takes: a recording, a calibration, a configuration; and how it tells its progress."""
+"""The inputs of every workflow: a recording, a calibration, a configuration; and how it reports progress."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ Source = str | os.PathLike[str] | Iterable[tuple[Any, ...]]
 CalibrationSource = Calibration | str | os.PathLike[str]
 #: A configuration, or the name or file of one.
 ConfigSource = MicroscopeConfig | str | os.PathLike[str]
-#: Called with what is being done, how many frames are done, and of how many; None where that is
-#: not known.
+#: Called with the current stage, the number of frames done, and that of all frames; None if
+#: unknown.
 OnProgress = Callable[[str, int, int | None], object]
 
 # Type and, where there is one, number of channels -> ROS name of the pixel format.
@@ -52,7 +52,7 @@ _GREY_TYPES = ("uint8", "uint16", "float32")
 
 
 def ignore_progress(_stage: str, _done: int, _total: int | None) -> None:
-    """Tell nobody."""
+    """Do not report progress."""
 
 
 def count_frames(on_progress: OnProgress, stage: str, total: int | None) -> Callable[[int], None]:
@@ -77,7 +77,7 @@ def resolve_calibration(calibration: CalibrationSource | None) -> Calibration | 
 
 
 def resolve_calibration(calibration: CalibrationSource | None) -> Calibration | None:
-    """The calibration itself, read if it is a file.
+    """Return the calibration itself, read if it is a file.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def resolve_config(
     calibration: Calibration | None = None,
     frame_time_s: float | None = None,
 ) -> MicroscopeConfig:
-    """The configuration that a workflow works with.
+    """Return the configuration that a workflow uses.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig
             f"image {index} of shape {image.shape} and type {image.dtype}",
             expected="(h, w) grey levels, or (h, w, 3) of uint8",
         )
-    # Files that tell no time are read as if they were a second apart, too.
+    # Files without times are also read as if they were a second apart.
     time_s = float(entry[2]) if len(entry) == 3 else index + 1.0
     if not np.isfinite(time_s):
         raise InvalidValueError(f"image {index} at {time_s} s", expected="a finite time")

@@ -70,7 +70,7 @@ class CantileverSeries:
     recording
         Name of the recording.
     images
-        n grey pictures, (h, w).
+        n grey images, (h, w).
     stamps_ns
         n header stamps, ns since 1970.
     poses
@@ -100,9 +100,9 @@ class CantileverMeasurement:
     repeatability
         Means by magnification and pose, and how well the magnifications agree.
     poses
-        Number of poses; None where each frame is one.
+        Number of poses; None if each frame is a pose.
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     series: tuple[CantileverSeries, ...]
@@ -168,20 +168,20 @@ def measure_cantilever(
     length_m
         Length of the cantilever, from its maker.
     poses
-        Each magnification has so many poses with equally many frames, one after the other; None
-        makes each frame a pose.
+        Number of poses at each magnification, which follow each other with equally many frames;
+        None makes each frame a pose.
     shape
         ``"free"``, ``"beam"`` or another of
         :data:`~semcal_ros.applications.cantilever.bending.SHAPES`.
     bases, tips
-        (x, y) pixels of both ends of the cantilever in the first frame where they are not found by
-        themselves: none, one for all magnifications, or one for each.
+        (x, y) pixels of both ends of the cantilever in the first frame, if they are not found
+        automatically: none, one for all magnifications, or one for each.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     frame_time_s
         Seconds of one pass over a frame, in place of what the configuration says.
     magnification
-        Of a folder of ordinary images, which do not tell it.
+        Magnification of a folder of ordinary images, which do not contain it.
     on_progress
         Called with the stage, the number of frames done, and that of all frames; each counts
         twice.

@@ -42,7 +42,7 @@ __all__ = ["Reconstruction", "reconstruct"]
 _CLEAR_CONVEXITY = 0.8
 # Sigmas by which the perspective may prefer the mirror image by chance.
 _MIRROR_DOUBT = 4.0
-# Relative 1-sigma of the depth from which on more views are worth their time.
+# Relative 1-sigma of the depth above which more views are worth their time.
 _LARGE_RELIEF_SIGMA = 0.01
 
 
@@ -59,7 +59,7 @@ class Reconstruction:
     frame_count
         Number of frames that were read.
     notes
-        What a person should know, doubts about the result among it.
+        Notes for the user, including doubts about the result.
     """
 
     structure: Structure
@@ -73,7 +73,7 @@ class Reconstruction:
         Raises
         ------
         InvalidValueError
-            If the suffix or the unit is another one.
+            If the suffix or the unit is not one of these.
         OSError
             If the file cannot be written; an existing one is untouched.
         """
@@ -149,7 +149,7 @@ def reconstruct(
     spacing_px
         Least distance of features, px.
     keyframes
-        The most that are used; they are spread evenly.
+        Largest number of keyframes used; they are spread evenly.
     height_sigma_m
         1-sigma of the height above or below the plane of the calibration, m.
     on_progress
@@ -192,7 +192,7 @@ def reconstruct(
 def _track(
     opened: Recording, model: Calibration, tracker: SequenceTracker, on_progress: OnProgress
 ) -> int:
-    """Track all frames; returns how many were outside of the calibrated range."""
+    """Track all frames; return how many were outside the calibrated range."""
     first_ns, outside = None, 0
     advance = count_frames(on_progress, "tracking", opened.frame_count)
     for frame in opened.frames():
@@ -206,7 +206,7 @@ def _track(
 
 
 def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyframe]:
-    """At most ``most`` keyframes, the first and the last among them."""
+    """Choose at most ``most`` keyframes, including the first and the last."""
     if len(keyframes) <= most:
         return keyframes
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, most).round().astype(int))

@@ -63,7 +63,7 @@ class RectifiedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RectifiedRecording:
-    """What was made of a recording.
+    """The rectified frames of a recording.
 
     Attributes
     ----------
@@ -74,11 +74,11 @@ class RectifiedRecording:
     frames
         The frames themselves; empty where they were written to a bag.
     states
-        How many frames had which kind of drift, the commonest first; empty where it was left in.
+        Number of frames by the kind of drift, the most frequent first; empty where it was left in.
     extrapolated
-        Number of frames outside of the calibrated range.
+        Number of frames outside the calibrated range.
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     frame_count: int
@@ -109,7 +109,7 @@ def rectify(
 ) -> RectifiedRecording:
     """Undo distortion and drift of each frame in one interpolation.
 
-    Each frame is corrected by what is known when it comes, as the nodes do it.
+    Each frame is corrected with what is known when it arrives, as in the nodes.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def rectify(
 def _timing_notes(
     microscope: MicroscopeConfig, follower: DriftFollower | None, model: Calibration
 ) -> list[str]:
-    """What the drift shows of a scan timing that is not configured; it is too late to use it."""
+    """Return notes on an unconfigured scan timing that the drift reveals, too late to use it."""
     if follower is None:
         return []
     timed, note = estimate_timing(microscope, follower, model)

@@ -29,7 +29,7 @@ _LISTED = 12
 # Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a
 # thousand may be clipped at either end.
 _BLACK_WHITE = (0.001, 0.999)
-# Every so many pixels of a row and rows of a picture are enough for its quantiles.
+# Step between the pixels of a row and between the rows that are used for an image's quantiles.
 _SPARSE = 4
 
 
@@ -58,9 +58,9 @@ class FrameSelection:
     path
         Drift of the frames; None where it is not wanted.
     states
-        How many frames had which kind of drift when they came, the commonest first.
+        Number of frames by the kind of drift known live, the most frequent first.
     timing_note
-        What there is to tell of a scan timing that is not configured; may be empty.
+        Note on a scan timing that is not configured; may be empty.
     """
 
     config: MicroscopeConfig
@@ -98,9 +98,9 @@ def select_frames(
     opened
         The recording.
     config
-        How it is to be read.
+        How to read it.
     calibration
-        None for nominal cameras.
+        The calibration; None for nominal cameras.
     at
         The magnification to choose; None where the recording must have only one.
     drift
@@ -163,7 +163,7 @@ class _Reading:
             label = _label(frame.magnification)
             counts[label] += 1
             if label != (wanted or label) or (wanted is None and len(counts) > 1):
-                continue  # to be refused, or of no interest: only the magnification matters
+                continue  # the frame will be refused or ignored: only the magnification matters
             if first is None:
                 on_first(frame)
                 first = frame
@@ -228,7 +228,7 @@ class _Reading:
 
 
 def _label(magnification: float) -> str:
-    """A magnification as people read it: what a topic repeats may differ in the last digits."""
+    """Format a magnification for the user: repeated values of a topic may differ in the last digits."""
     return f"{magnification:.6g}"
 
 

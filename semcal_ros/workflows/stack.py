@@ -57,13 +57,13 @@ class StackResult:
     path
         Drift of the n frames; None where it was left in.
     states
-        How many frames had which kind of drift when they came, the commonest first.
+        Number of frames by the kind of drift known live, the most frequent first.
     other_kind
         Number of frames of another size or encoding, which are left out.
     config
         The configuration that was used; its ``scan`` may have been estimated from the drift.
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     image: StackedImage
@@ -96,7 +96,7 @@ class StackResult:
         Raises
         ------
         InvalidValueError
-            If the suffix is another one, or a PNG cannot hold the grey levels.
+            If the suffix is not one of these, or a PNG cannot hold the grey levels.
         OSError
             If the file cannot be written; an existing one is untouched.
         """
@@ -123,7 +123,7 @@ def stack(
     sigma: str | os.PathLike[str] | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> StackResult:
-    """Average frames, each moved to where the specimen was in the first one.
+    """Average frames, each shifted to the specimen's position in the first frame.
 
     Frames whose drift is not known are left out.
 
@@ -138,11 +138,11 @@ def stack(
     frame_time_s
         Seconds of one pass over a frame, in place of what the configuration says.
     magnification
-        Of a folder of ordinary images, which do not tell it.
+        Magnification of a folder of ordinary images, which do not contain it.
     at
         The magnification whose frames are taken; None where there is only one.
     drift
-        False averages the frames where they are.
+        False averages the frames without shifting them.
     interpolation
         ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
     video, fps
@@ -223,7 +223,7 @@ def _check_output(output: str | os.PathLike[str] | None, frame: RecordedFrame) -
 
 
 def _usable(selection: FrameSelection) -> Mask:
-    """Which of the chosen frames go into the average, (n,) bool."""
+    """Return which of the chosen frames go into the average, (n,) bool."""
     if selection.path is None:
         return np.ones(len(selection.indices), dtype=bool)
     usable = selection.path.trusted
@@ -264,7 +264,7 @@ def _add_frames(
 
 
 def _video_levels(selection: FrameSelection) -> tuple[float, float]:
-    """Grey levels that are shown as black and white."""
+    """Return the grey levels that are shown as black and white."""
     if selection.dtype == np.uint8 or not selection.levels:
         return 0.0, 255.0
     low, high = np.median(selection.levels, axis=0)
@@ -272,6 +272,6 @@ def _video_levels(selection: FrameSelection) -> tuple[float, float]:
 
 
 def _caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
-    """Number and time of a frame."""
+    """Format the number and time of a frame."""
     text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
     return text if used else f"{text}  not tracked"

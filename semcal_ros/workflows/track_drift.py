@@ -50,13 +50,13 @@ class DriftTrack:
         Drift, rate and covariance at each frame. In raw pixels of a nominal size where no
         calibration was given.
     states
-        How many frames had which kind of drift when they came, the commonest first.
+        Number of frames by the kind of drift known live, the most frequent first.
     predictor
-        What a forecast beyond the last frame needs.
+        The predictor for forecasts beyond the last frame.
     config
         The configuration that was used; its ``scan`` may have been estimated from the drift.
     notes
-        What a person should know.
+        Notes for the user.
     """
 
     stamps_ns: tuple[int, ...]
@@ -70,7 +70,7 @@ class DriftTrack:
         return len(self.stamps_ns)
 
     def forecast(self, after_s: float) -> DriftEstimate:
-        """Drift ``after_s`` seconds after the last frame.
+        """Forecast the drift ``after_s`` seconds after the last frame.
 
         Raises
         ------
@@ -121,7 +121,7 @@ def track_drift(
     frame_time_s
         Seconds of one pass over a frame, in place of what the configuration says.
     live
-        Whether to return what was known live, without hindsight of later frames.
+        Whether to return the drift known live, without hindsight from later frames.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -145,7 +145,7 @@ def track_drift(
         stamps_ns, follower = _follow(opened, model, microscope, on_progress)
         timed, note = estimate_timing(microscope, follower, model)
         if timed is not microscope and live:
-            note += f"; {GIVE_FRAME_TIME}"  # live, nobody could have known
+            note += f"; {GIVE_FRAME_TIME}"  # live, this could not have been known
         elif timed is not microscope:
             microscope = timed
             stamps_ns, follower = _follow(opened, model, microscope, on_progress)
@@ -161,7 +161,7 @@ def track_drift(
 
 
 def describe_rate(path: DriftPath) -> str:
-    """The drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
+    """Describe the drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
     if len(path) < 2:
         return ""
     x, y = _format_lengths(path.velocity_m_s[-1], path.velocity_sigma_m_s[-1])
@@ -169,13 +169,13 @@ def describe_rate(path: DriftPath) -> str:
 
 
 def describe_forecast(forecast: DriftEstimate, after_s: float) -> str:
-    """A forecast for ``after_s`` seconds after the last frame, with its 1-sigma in nm."""
+    """Describe a forecast for ``after_s`` seconds after the last frame, with its 1-sigma in nm."""
     x, y = _format_lengths(forecast.drift_m, np.sqrt(np.diag(forecast.covariance)[:2]))
     return f"drift {after_s:g} s after the last frame: x {x}, y {y} nm"
 
 
 def _format_lengths(values: Array, sigmas: Array) -> list[str]:
-    """Lengths in nm with their 1-sigma, to two digits of the smaller uncertainty."""
+    """Format lengths in nm with their 1-sigma, to two digits of the smaller uncertainty."""
     smaller = 1e9 * float(np.min(sigmas))
     digits = int(np.clip(1 - np.floor(np.log10(smaller)), 0, 9)) if smaller > 0.0 else 3
     pairs = zip(1e9 * values, 1e9 * sigmas, strict=True)
@@ -188,7 +188,7 @@ def _follow(
     microscope: MicroscopeConfig,
     on_progress: OnProgress,
 ) -> tuple[list[int], DriftFollower]:
-    """Stamps of all frames, and their drift."""
+    """Track all frames; return their stamps and drift."""
     follower = DriftFollower()
     stamps_ns: list[int] = []
     advance = count_frames(on_progress, "drift", opened.frame_count)

@@ -39,7 +39,7 @@ class CorrectedBagWriter:
     writer
         An open bag.
     namespace
-        Of the topics, without a slash at its end.
+        Namespace of the topics, without a trailing slash.
     calibration_text
         Text of the calibration file, for the topic ``calibration``.
     """
@@ -58,13 +58,13 @@ class CorrectedBagWriter:
         Parameters
         ----------
         frame
-            As it was recorded.
+            The frame as recorded.
         image
-            The corrected picture.
+            The corrected image.
         camera
             Its camera.
         update
-            Its drift; None where drift is left in.
+            Its drift; None if the drift was not removed.
         """
         header = blank_message("std_msgs/msg/Header")
         fill_header(header, frame.stamp_ns, frame.frame_id)

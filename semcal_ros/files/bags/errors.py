@@ -1,4 +1,4 @@
-"""The errors that the bag library and its backends raise on damaged or foreign files, as one."""
+"""Turns the errors that the bag library and its backends raise on damaged or foreign files into one."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ _MAX_NAME = 255  # of DDS
 
 
 def one_line(error: BaseException) -> str:
-    """Short description of a library's error, without line breaks and never empty."""
+    """Describe a library's error briefly, without line breaks and never empty."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
 
 
 def check_types(reader: Reader) -> None:
-    """Check values of an open reader that the library takes as they are.
+    """Check values of an open reader that the library accepts unchecked.
 
     Columns of sqlite3 and values of YAML can have any type and length.
 
@@ -81,7 +81,7 @@ def check_types(reader: Reader) -> None:
 
 
 def unreadable(path: Path, error: BaseException, what: str = "") -> BagError:
-    """The error for a recording that the library could not read."""
+    """Make the error for a recording that the library could not read."""
     subject = f"{what} of {path}" if what else str(path)
     return BagError(
         f"cannot read {subject}: {one_line(error)}",
@@ -93,7 +93,7 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> BagError:
 
 @contextmanager
 def reading(path: Path, what: str = "") -> Iterator[None]:
-    """Turn errors of the bag library inside of the block into one :class:`BagError`."""
+    """Turn errors of the bag library inside the block into one :class:`BagError`."""
     try:
         yield
     except BagError:

@@ -17,14 +17,14 @@ __all__ = ["MagnificationTrack"]
 class MagnificationTrack:
     """All magnification messages of a topic, each valid until the next one.
 
-    Times are header stamps where every message has one, else the times of the recorder. A message
-    with a bad value ends the validity of the one before it, so that no image gets a magnification
-    at which the microscope may no longer have been.
+    Times are header stamps if every message has one, else the times of the recorder. A message with
+    a bad value ends the validity of the one before it, so that no image gets a magnification that the
+    microscope may have left.
 
     Attributes
     ----------
     bad
-        Why messages were ignored.
+        Reasons why messages were ignored.
     usable
         Number of messages with a usable value.
     by_stamp
@@ -57,7 +57,7 @@ class MagnificationTrack:
         return stamp_ns, raw.log_time_ns, reading
 
     def at(self, stamp_ns: int, log_time_ns: int, image_width_px: int) -> float | None:
-        """Magnification at an image, or None before the first message and after a bad one.
+        """Return the magnification at an image, or None before the first message and after a bad one.
 
         Raises
         ------

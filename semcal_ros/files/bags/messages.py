@@ -20,7 +20,7 @@ _NUMPY_NAMES = {"byte": "uint8", "char": "uint8", "bool": "bool"}
 
 @lru_cache(maxsize=1)
 def jazzy_types() -> Typestore:
-    """Message types of ROS 2 Jazzy; those that the project uses are the same in Kilted."""
+    """Return the message types of ROS 2 Jazzy; those that the project uses are the same in Kilted."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -57,7 +57,7 @@ def _blank(typename: str, store: Typestore) -> Any:
 
 
 def blank_message(typename: str) -> Any:
-    """Message with every field at zero, empty or false; its attributes can be set afterwards.
+    """Make a message with every field at zero, empty or false; its attributes can be set afterwards.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def blank_message(typename: str) -> Any:
 
 
 def message_type_name(message: Any) -> str:
-    """Full type name of a message made by :func:`blank_message` or read from a bag."""
+    """Return the full type name of a message made by :func:`blank_message` or read from a bag."""
     name = getattr(message, "__msgtype__", None)
     if not isinstance(name, str):
         raise BagError(
@@ -92,7 +92,7 @@ def _is_numeric_block(description: Any) -> bool:
 
 
 def _as_block(value: Any, dtype: np.dtype[Any]) -> Any:
-    """Contiguous 1-D array of the field's type; buffers are taken without a copy."""
+    """Return a contiguous 1-D array of the field's type; buffers are taken without a copy."""
     if isinstance(value, (bytes, bytearray, memoryview)):
         return np.frombuffer(value, dtype=np.uint8).view(dtype)
     return np.ascontiguousarray(value, dtype=dtype).reshape(-1)
@@ -112,7 +112,7 @@ def _normalise(message: Any, typename: str, store: Typestore) -> None:
 
 
 def serialize_message(message: Any) -> memoryview:
-    """CDR bytes of a message, whose array fields may be arrays, ``bytes``, ``array.array`` or lists.
+    """Serialize a message to CDR bytes; its array fields may be arrays, ``bytes``, ``array.array`` or lists.
 
     Raises
     ------

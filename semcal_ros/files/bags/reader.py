@@ -3,9 +3,9 @@
 Both storage formats (mcap, sqlite3), compressed or not, as a folder with ``metadata.yaml`` or as a
 single file.
 
-``AnyReader`` of rosbags would choose the types of messages too. It registers the definitions of all
-topics when it opens a recording, so that a damaged one on a topic that nobody reads would make the
-recording unreadable, and it writes code for arrays of any fixed length before they can be refused.
+``AnyReader`` of rosbags would choose the message types too. But it registers the definitions of all
+topics when it opens a recording, so that a damaged definition on an unused topic would make the
+recording unreadable, and it generates code for arrays of any fixed length before they can be refused.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether ``path`` looks like a recording: a folder with bag files or a single storage file."""
+    """Return whether ``path`` looks like a recording: a folder with bag files or a single storage file."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_storage_files(path))
     return path.suffix in STORAGE_SUFFIXES
@@ -106,7 +106,7 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _locate(path: Path) -> Path:
-    """The path that the library opens for ``path``."""
+    """Return the path that the library opens for ``path``."""
     if not path.exists():
         raise BagError(f"{path} does not exist", expected=_ACCEPTED, do="check the path")
     if not path.is_dir():
@@ -138,7 +138,7 @@ def _locate(path: Path) -> Path:
 
 
 def _checked_name(path: Path, files: list[Path]) -> Path:
-    """``path``, unless the library would misread it: it opens sqlite3 files by URI."""
+    """Return ``path`` unless the library would misread it: it opens sqlite3 files by URI."""
     odd = [character for character in "?#%" if character in str(path)]
     if odd and any(file.suffix == ".db3" for file in files):
         raise BagError(
@@ -212,12 +212,12 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Messages in the order of their receive times, undecoded, read as they are asked for.
+        """Yield undecoded messages in the order of their receive times; they are read on demand.
 
         Parameters
         ----------
         topics
-            Names of topics to read; all without it.
+            Names of topics to read; by default all.
         start_ns, stop_ns
             Half-open interval of receive times.
 
@@ -275,7 +275,7 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[BagMessage]:
-        """Decoded messages; see :meth:`raw_messages` and :meth:`decode`."""
+        """Yield decoded messages; see :meth:`raw_messages` and :meth:`decode`."""
         for raw in self.raw_messages(topics, start_ns=start_ns, stop_ns=stop_ns):
             yield BagMessage(raw.topic, raw.log_time_ns, self.decode(raw))
 
@@ -283,7 +283,7 @@ class BagReader:
         return self.messages()
 
     def decode(self, raw: RawMessage) -> Any:
-        """The message, with the fields of its ROS type as attributes and arrays as read-only NumPy arrays.
+        """Decode a message: its fields become attributes, its arrays read-only NumPy arrays.
 
         Raises
         ------
@@ -327,7 +327,7 @@ def _is_latched(connection: Connection) -> bool:
 
 
 def _find_typestore(connection: Connection, path: Path) -> Typestore:
-    """Types to decode a topic with: the recording's own where they differ from Jazzy's."""
+    """Find the types to decode a topic with: the recording's own where they differ from Jazzy's."""
     encoding = getattr(connection.ext, "serialization_format", "cdr")
     if encoding != "cdr":
         raise BagError(
@@ -395,6 +395,6 @@ def open_bag(path: str | Path) -> BagReader:
     Raises
     ------
     BagError
-        Missing, empty, truncated, or not a ROS 2 recording.
+        The recording is missing, empty, truncated, or not a ROS 2 recording.
     """
     return BagReader(Path(path))

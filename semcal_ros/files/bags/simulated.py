@@ -1,4 +1,4 @@
-"""Simulated frames into a bag, their truth beside it."""
+"""Writes simulated frames to a bag, with their ground truth beside it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SimulatedFrame(Protocol):
 
     @property
     def magnification(self) -> float:
-        """At which it is scanned."""
+        """Magnification at which it is scanned."""
 
 
 def write_simulated(
@@ -52,18 +52,18 @@ def write_simulated(
     folder
         The bag.
     frames, pictures
-        As many of both; pictures of 8 or 16 bit, drawn while they are written.
+        The same number of both; images of 8 or 16 bit, rendered while they are written.
     truth
         Plain data in SI units.
     delay_s
-        From the stamp of a frame until it was published.
+        Delay from the stamp of a frame to its publication.
     overwrite
-        Whether a bag that is there may be replaced.
+        Whether an existing bag may be replaced.
 
     Raises
     ------
     BagError
-        The folder is there and ``overwrite`` is not set, or cannot be written; then nothing is left of it.
+        The folder exists and ``overwrite`` is not set, or it cannot be written; then no part of it remains.
     """
     magnification = None
     with BagWriter(folder, overwrite=overwrite) as writer:

@@ -15,7 +15,7 @@ _MAX_LISTED = 8  # topics in one line of an error
 
 
 def topic_matches(wanted: str, recorded: str) -> bool:
-    """Whether a recorded topic is the wanted one: relative names match by their last parts."""
+    """Return whether a recorded topic is the wanted one: relative names match by their last parts."""
     if wanted.startswith("/"):
         return recorded == wanted
     return recorded == wanted or recorded.endswith("/" + wanted)
@@ -30,14 +30,14 @@ def _list_topics(topics: Sequence[BagTopic]) -> str:
 def find_topic(
     path: Path, topics: Sequence[BagTopic], *, what: str, wanted: str, type_name: str
 ) -> tuple[BagTopic, str]:
-    """The topic to read, and a note, which is empty if the topic has the configured name.
+    """Find the topic to read; also return a note, empty if the topic has the configured name.
 
     Parameters
     ----------
     topics
         All topics of the recording.
     what
-        What the topic carries, for messages to people.
+        What the topic carries, for messages to the user.
     wanted, type_name
         Name and message type from the configuration.
 
@@ -77,10 +77,10 @@ _SUFFIX = "/compressed"
 def find_image_topic(
     path: Path, topics: Sequence[BagTopic], image: ImageConfig
 ) -> tuple[BagTopic, list[str]]:
-    """The topic to read, and notes.
+    """Find the topic of images to read; also return notes.
 
-    A recorder often takes only one of ``image_raw`` and ``image_raw/compressed``, which show the same; where that is
-    not the configured one, the other is read, with a note.
+    A recorder often takes only one of ``image_raw`` and ``image_raw/compressed``, which show the same; if that is not
+    the configured one, the other is read, with a note.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def find_image_topic(
 
 
 def _source(image: ImageConfig, filled: Sequence[BagTopic]) -> tuple[str, str]:
-    """Name and type to look for."""
+    """Return the name and type to search for."""
     other_name, other_type = f"{image.topic}{_SUFFIX}", COMPRESSED_IMAGE_TYPE
     if image.type == COMPRESSED_IMAGE_TYPE:
         other_name, other_type = image.topic.removesuffix(_SUFFIX), IMAGE_TYPE

@@ -79,8 +79,8 @@ def check_replaceable(path: Path, overwrite: bool) -> None:
 class BagWriter:
     """Context manager that writes a rosbag2 folder (mcap), readable by ``ros2 bag``.
 
-    Everything goes to a temporary folder beside the target, which gets its name only when the block
-    ends without an error; otherwise nothing is left and an existing recording stays as it was.
+    Everything goes to a temporary folder beside the target, which is renamed only when the block ends
+    without an error; otherwise nothing remains and an existing recording stays as it was.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class BagWriter:
     overwrite
         Replace an existing recording, at the very end.
     compress
-        Compress chunks with zstd inside of the mcap file.
+        Compress chunks with zstd inside the mcap file.
 
     Raises
     ------
@@ -255,7 +255,7 @@ class BagWriter:
 
 
 def _move_into_place(new: Path, target: Path, scratch: Path) -> None:
-    """Give ``new`` its name; a recording that is there is moved aside, and back on failure."""
+    """Rename ``new``; an existing recording is moved aside, and back on failure."""
     if not target.exists():
         os.rename(new, target)
         return

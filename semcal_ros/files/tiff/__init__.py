@@ -1,1 +1,1 @@
-"""SEM images as makers store them: TIFF with settings in private tags or a text file."""
+"""SEM images in the formats of their makers: TIFF with settings in private tags or a text file."""

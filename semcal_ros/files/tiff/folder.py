@@ -54,7 +54,7 @@ class TiffEntry:
     databar_rows: int | None
 
     def load(self) -> SemImage:
-        """The picture and its settings; raises :class:`TiffError` if the pixel data are damaged."""
+        """Load the image and its settings; raises :class:`TiffError` if the pixel data are damaged."""
         return read_sem_tiff(self.path, databar_rows=self.databar_rows)
 
 
@@ -71,7 +71,7 @@ class TiffFolder:
     skipped
         Files that look like images and cannot be used.
     notes
-        What a person should know: where stamps and display width come from.
+        Notes for the user: where stamps and display width come from.
     """
 
     path: Path
@@ -112,7 +112,7 @@ def _collect(files: list[Path]) -> tuple[list[_Found], list[Skipped]]:
 
 
 def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
-    """Files in time order with strictly increasing stamps, and where these come from."""
+    """Order files by time with strictly increasing stamps; also say where the stamps come from."""
     if any(item.settings.time is None for item in found):
         pairs = [(item, _SYNTHETIC_START_NS + k * _SECOND_NS) for k, item in enumerate(found)]
         return pairs, "not all files have a time: stamps are 1 s apart, in the order of names"

@@ -33,7 +33,7 @@ def _decode(data: bytes) -> str:
 
 
 def jeol_pairs(data: bytes) -> dict[str, str]:
-    """Settings by name, without their dollar signs; empty if this is not a text of JEOL."""
+    """Settings by name, without their dollar signs; empty if this is not a JEOL text file."""
     pairs: dict[str, str] = {}
     for line in _decode(data[:_MAX_SIDECAR_BYTES]).splitlines():
         if line.startswith("$"):
@@ -43,7 +43,7 @@ def jeol_pairs(data: bytes) -> dict[str, str]:
 
 
 def _scan_size(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows of the scan, which the databar may follow in the file."""
+    """Return the columns and rows of the scan; a databar may follow it in the file."""
     for key in ("CM_FULL_SIZE", "CM_IMAGE_SIZE"):
         numbers = [plain_number(word) for word in pairs.get(key, "").split()]
         if len(numbers) == 2 and numbers[0] and numbers[1]:
@@ -68,7 +68,7 @@ def _from_micron_bar(pairs: dict[str, str]) -> float | None:
 def _pixel_size(
     path: Path, pairs: dict[str, str], columns: int
 ) -> tuple[float, bool, tuple[str, ...]]:
-    """Pixel size in m, whether it rests on an assumed display width, and notes."""
+    """Return the pixel size in m, whether it rests on an assumed display width, and notes."""
     words = pairs.get("CM_FIELD_OF_VIEW", "").split()
     field_m = positive(quantity(words[0], "m", default_unit="um")) if words else None
     if field_m is not None:
@@ -97,7 +97,7 @@ def _pixel_size(
 
 
 def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> VendorSettings:
-    """Settings from the text file.
+    """Read the settings from the text file.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from semcal_ros.core.errors import TiffError
 
 __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
 
-# They bound the memory that a damaged header can ask for: 2^29 pixels of 16 bits are 1 GiB.
+# These limits bound the memory that a damaged header can request: 2^29 pixels of 16 bits are 1 GiB.
 MAX_SIDE_PX = 65_536
 MAX_PIXELS = 2**29  # 1 GiB at 16 bits
 _MAX_SAMPLES = 4  # red, green, blue, alpha
@@ -29,7 +29,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 
 
 def check_counts(path: Path) -> None:
-    """Refuse a first directory with several values in a tag of one: the parser would multiply them.
+    """Refuse a first directory with several values in a single-value tag: the parser would multiply them.
 
     Other damage is left to the parser, ``struct.error`` and ``OSError`` included.
     """
@@ -53,7 +53,7 @@ def check_counts(path: Path) -> None:
 
 
 def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
-    """(width, height) of a page, checked before anything is allocated.
+    """Return the (width, height) of a page, checked before anything is allocated.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
 
 
 def _lookup(image: NDArray[Any], colormap: NDArray[Any]) -> NDArray[Any]:
-    """Grey values of a palette image; the usual grey ramp leaves the indices as they are."""
+    """Return the grey values of a palette image; the usual grey ramp leaves the indices as they are."""
     table = _LUMA @ np.asarray(colormap, dtype=np.float64) / 257.0
     ramp = np.linspace(0.0, 255.0, table.size)
     if image.dtype == np.uint8 and np.allclose(table, ramp, atol=1.0):
@@ -108,7 +108,7 @@ def _to_grey(image: NDArray[Any], page: tifffile.TiffPage) -> NDArray[Any]:
 
 
 def _decode_by_opencv(path: Path) -> NDArray[Any]:
-    """Grey image by OpenCV's TIFF decoder, which knows LZW without further packages."""
+    """Decode a grey image with OpenCV's TIFF decoder, which needs no further packages for LZW."""
     data = np.fromfile(path, dtype=np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
@@ -117,7 +117,7 @@ def _decode_by_opencv(path: Path) -> NDArray[Any]:
 
 
 def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
-    """(h, w) uint8 or uint16 picture of a page whose size was checked.
+    """Decode the (h, w) uint8 or uint16 image of a page whose size was checked.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
 __all__ = ["is_tiff", "read_sem_settings", "read_sem_tiff"]
 
 SUFFIXES = (".tif", ".tiff")
-# What the TIFF parser raises on damaged bytes; only ever caught around calls of it.
+# What the TIFF parser raises on damaged bytes; caught only around calls of it.
 _PARSER_ERRORS: tuple[type[Exception], ...] = (
     tifffile.TiffFileError,
     ValueError,
@@ -42,7 +42,7 @@ _PARSER_ERRORS: tuple[type[Exception], ...] = (
 
 
 def is_tiff(path: Path) -> bool:
-    """Whether the file's name is one of a TIFF."""
+    """Return whether the file's name is that of a TIFF."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -67,7 +67,7 @@ def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
 
 
 def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> VendorSettings:
-    """Settings from the metadata of the maker that the file has."""
+    """Read the settings from the metadata of the file's maker."""
     tags = page.tags
     if zeiss.TAG in tags and isinstance(tags[zeiss.TAG].value, dict):
         return zeiss.zeiss_settings(path, tags[zeiss.TAG].value)
@@ -100,7 +100,7 @@ def _sidecar_settings(path: Path, size_px: tuple[int, int]) -> VendorSettings:
 
 @contextmanager
 def _parsing(path: Path) -> Iterator[None]:
-    """Turn what the parser raises in the block into a :class:`TiffError`, and keep it quiet."""
+    """Turn the parser's errors in the block into a :class:`TiffError`, and keep it quiet."""
     try:
         with _quiet():
             yield
@@ -131,7 +131,7 @@ def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
 
 
 def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
-    """Settings and stored (width, height), pixels undecoded; errors as :func:`read_sem_tiff`."""
+    """Read the settings and the stored (width, height) without decoding pixels; raises as :func:`read_sem_tiff`."""
     path = Path(path)
     with _open(path) as file:
         page = _first_page(file, path)

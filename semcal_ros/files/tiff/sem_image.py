@@ -34,7 +34,7 @@ class VendorSettings:
         Whether the pixel size rests on the maker's usual display width, not on a value in the
         file.
     notes
-        Remarks on these values, for people.
+        Remarks on these values for the user.
     """
 
     vendor: str
@@ -141,7 +141,7 @@ class SemImage:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on these values, for people."""
+        """Remarks on these values for the user."""
         return self.settings.notes
 
     def magnification(self, display_width_m: float) -> float:

@@ -35,12 +35,12 @@ def _text_records(data: bytes) -> list[str]:
 
 
 def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
-    """All ``key=value`` pairs of the tag's bytes or of a ``.hdr`` file's text.
+    """Return all ``key=value`` pairs of the tag's bytes or of a ``.hdr`` file's text.
 
     Raises
     ------
     TiffError
-        There are none, or the pixel size is missing: the tag is damaged.
+        There are no pairs, or the pixel size is missing: the tag is damaged.
     """
     texts = _text_records(data) or [data.decode("utf-8", errors="replace")]
     pairs: dict[str, str] = {}
@@ -58,7 +58,7 @@ def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
 
 
 def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> VendorSettings:
-    """Settings from the raw bytes of the tag (lengths in metres, angles in degrees).
+    """Read the settings from the raw bytes of the tag (lengths in metres, angles in degrees).
 
     Raises
     ------

@@ -14,7 +14,7 @@ __all__ = ["TAGS", "thermo_fisher_settings"]
 
 # Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)
-# Above it a note says that pixels are not square; both sizes are used as they are in any case.
+# Beyond it a note says that pixels are not square; both sizes are used unchanged in any case.
 _SQUARE_TOLERANCE = 1e-3
 
 
@@ -60,12 +60,12 @@ def _magnification(tag: Mapping[str, Any], field_width_m: float) -> tuple[float 
 def thermo_fisher_settings(
     path: Path, tag: Mapping[str, Any], size_px: tuple[int, int]
 ) -> VendorSettings:
-    """Settings from the decoded tag.
+    """Read the settings from the decoded tag.
 
     Raises
     ------
     TiffError
-        The pixel size is missing or unusable, or the file has another size than the tag says.
+        The pixel size is missing or unusable, or the size of the file contradicts the tag.
     """
     beam, scan = _active(tag, "Beam", "EBeam"), _active(tag, "Scan", "EScan")
     common = _section(tag, "Scan")

@@ -1,4 +1,4 @@
-"""Turn a folder of SEM TIFFs into a recording."""
+"""Turns a folder of SEM TIFFs into a recording."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ImportSummary:
     skipped
         Files that could not be used, with reasons.
     notes
-        What a person should know about the values.
+        Notes for the user about the values.
     """
 
     path: Path
@@ -62,7 +62,7 @@ class ImportSummary:
     notes: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The summary for a person, one fact a line."""
+        """The summary for the user, one fact per line."""
         return [
             f"{self.imported} images in {self.path}",
             *(f"note: {note}" for note in self.notes),
@@ -92,7 +92,7 @@ def _check_config(config: MicroscopeConfig) -> None:
 
 
 def _published_number(config: MicroscopeConfig, image: SemImage) -> float:
-    """The number from which a reader with this configuration gets the image's field width."""
+    """Return the number from which a reader with this configuration computes the image's field width."""
     source = config.magnification
     if source.quantity == "magnification":
         return image.magnification(source.display_width_m or config.display_width_m)

@@ -1,4 +1,4 @@
-"""Numbers with units and dates, as metadata of microscopes write them."""
+"""Numbers with units, and dates, in the formats of microscopes' metadata."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _split(text: object) -> tuple[float, str] | None:
 
 
 def _unit_scale(unit: str, base: str) -> float | None:
-    """Factor to SI of a unit such as ``nm``; None if unknown. A micro sign may have lost its encoding."""
+    """Return the factor to SI of a unit such as ``nm``; None if unknown. A micro sign may have lost its encoding."""
     if not unit.endswith(base):
         return None
     prefix = unit[: len(unit) - len(base)].strip()
@@ -70,18 +70,18 @@ def quantity(text: object, base: str, *, default_unit: str = "") -> float | None
 
 
 def plain_number(text: object) -> float | None:
-    """A bare finite number, ``None`` if the text is anything else."""
+    """Parse a bare finite number; return ``None`` for any other text."""
     parts = _split(text)
     return parts[0] if parts is not None and not parts[1] else None
 
 
 def positive(value: float | None) -> float | None:
-    """``value`` if it is a number above zero."""
+    """Return ``value`` if it is a number above zero."""
     return value if value is not None and math.isfinite(value) and value > 0 else None
 
 
 def check_pixel_size(path: Path, value: float | None, key: str, seen: object) -> float:
-    """The pixel size, if an SEM can have it.
+    """Return the pixel size if an SEM can have it.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def check_pixel_size(path: Path, value: float | None, key: str, seen: object) ->
 
 
 def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
-    """First credible date that one of the (text, format) pairs gives, or None.
+    """Return the first credible date that one of the (text, format) pairs gives, or None.
 
     Years that the 32-bit seconds of a ROS stamp cannot hold are not credible.
     """

@@ -28,7 +28,7 @@ _BAR_NOTE = (
 
 
 def _text(tag: Mapping[str, Any], key: str) -> str | None:
-    """Value and unit of a named entry, which come as (name, value) or (name, value, unit)."""
+    """Return value and unit of a named entry, stored as (name, value) or (name, value, unit)."""
     entry = tag.get(key)
     if not isinstance(entry, tuple) or len(entry) < 2:
         return None
@@ -41,7 +41,7 @@ def _head(tag: Mapping[str, Any], index: int) -> float | None:
 
 
 def _refine(rounded: float | None, exact: float | None, tolerance: float) -> float | None:
-    """The value with more digits, where it rounds to the named one."""
+    """Return the value with more digits if it rounds to the named one."""
     if rounded is None or exact is None:
         return rounded
     return exact if abs(exact - rounded) <= tolerance else rounded
@@ -73,7 +73,7 @@ def _rotation(tag: Mapping[str, Any]) -> float | None:
 
 
 def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
-    """Settings from the decoded tag.
+    """Read the settings from the decoded tag.
 
     Raises
     ------
