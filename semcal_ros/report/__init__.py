@@ -1,4 +1,4 @@
-"""Reports with pictures, each one self-contained HTML file."""
+"""Reports with figures, each one self-contained HTML file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Picture of a reconstructed ball: cloud, mesh, distances from the sphere."""
+"""Figure of a reconstructed ball: cloud, mesh, distances from the sphere."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_ball_figure(structure: Structure, ball: Ball, file: Path) -> None:
 
 
 def plot_ball(structure: Structure, ball: Ball) -> Figure:
-    """Cloud and mesh as seen obliquely from the gun, and the points' distances from the sphere."""
+    """Plot cloud and mesh, seen obliquely from the gun, and distances from the sphere."""
     figure = create_figure(9.6, 3.4)
     on_ball = ball.sphere.inliers
     centre = ball.sphere.centre_m
@@ -85,7 +85,7 @@ def plot_ball(structure: Structure, ball: Ball) -> Figure:
 
 
 def _turn_upright(points_m: Array) -> Array:
-    """nm, with y and z turned so that the gun is above."""
+    """Convert to nm, with y and z reversed so that the gun is above."""
     return np.asarray(points_m * np.array([1.0, -1.0, -1.0]) * _NM, dtype=np.float64)
 
 

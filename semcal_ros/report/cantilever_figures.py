@@ -51,7 +51,7 @@ _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
 _MARKS = "osD^vX"
 # Columns of the figure of frames: first, most bent and last pose.
 _SHOWN_POSES = 3
-# Frames are shown smaller than they are: noise averages out, and the file is smaller.
+# Width of the shown frames: averaging pixels reduces noise and the size of the file.
 _SHOWN_PX = 128
 # Quantiles of the grey levels that a video shows as black and white: one pixel in a thousand may be
 # clipped at either end.
@@ -85,7 +85,7 @@ def write_bending_video(
     Parameters
     ----------
     images
-        (h, w) grey pictures of the frames of each series.
+        (h, w) grey images of the frames of each series.
     series
         What was measured in them.
     poses
@@ -98,9 +98,9 @@ def write_bending_video(
     Raises
     ------
     BagError
-        The pictures have different sizes, or the video did not come out with all of its frames.
+        The images have different sizes, or the video is missing some of its frames.
     InvalidValueError
-        OpenCV has no encoder for it.
+        There is no encoder for the file.
     """
     shapes = {pictures[0].shape for pictures in images}
     if len(shapes) > 1:
@@ -133,7 +133,7 @@ def _write(figure: Figure, file: Path) -> None:
 
 
 def plot_poses(agreed: Repeatability) -> Figure:
-    """Deflection of each pose at each magnification with 95 % bars; deviations from their mean."""
+    """Plot the deflection of each pose and magnification with 95 % bars; also minus the mean."""
     figure = create_figure(7.2, 5.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
     pose = np.arange(1, agreed.deflection_m.shape[1] + 1)
@@ -171,7 +171,7 @@ def plot_poses(agreed: Repeatability) -> Figure:
 def plot_strip(
     images: Sequence[Sequence[NDArray[Any]]], series: Sequence[Series], firsts: Sequence[int]
 ) -> Figure:
-    """The first, the most bent and the last pose at each magnification, with the centre line.
+    """Plot the first, most bent and last pose at each magnification, with the centre line.
 
     Parameters
     ----------
@@ -226,12 +226,12 @@ _FRACTION_BITS = 4
 def draw_deflection(
     image: NDArray[Any], frame: Deflection, grey: tuple[float, float]
 ) -> NDArray[np.float32]:
-    """The picture with the centre line and the end of the beam, in black and white.
+    """Draw the centre line and the end of the beam into an image, in black and white.
 
     Parameters
     ----------
     image
-        (h, w) raw grey picture.
+        (h, w) raw grey image.
     frame
         What was measured in it.
     grey

@@ -40,7 +40,7 @@ _DPI = 160.0
 _BAND = 1.96
 # Letters in a line of the legend.
 _LINE_LENGTH = 64
-# Colours and marks of the reasons; those beyond are put together.
+# Colours and marks of the reasons; further reasons are grouped together.
 _MARKS = ((SECOND, "X"), (REFERENCE, "D"), (ACCENT, "^"), ("#8a6d00", "v"))
 # Part of the height of a plot that is kept free below the curves for the marks of rejected frames.
 _TICK_ROOM = 0.09
@@ -65,7 +65,7 @@ class _Kind:
 
 
 def write_drift_figure(path: DriftPath, file: Path) -> None:
-    """Write :func:`plot_draw_drift` completely or not at all.
+    """Write :func:`plot_drift` completely or not at all.
 
     Parameters
     ----------
@@ -87,9 +87,9 @@ def write_drift_figure(path: DriftPath, file: Path) -> None:
 
 
 def plot_drift(path: DriftPath, title: str = "") -> Figure:
-    """Path in the plane; drift, rate and residual against time, with 95 % bands.
+    """Plot the path in the plane, and drift, rate and residual against time with 95 % bands.
 
-    Frames whose picture was not used are marked in each plot, by the kind of reason, and counted
+    Frames whose image was not used are marked in each plot, by the kind of reason, and counted
     in the legend.
 
     Parameters
@@ -129,7 +129,7 @@ def plot_drift(path: DriftPath, title: str = "") -> Figure:
 
 
 def _group_rejections(path: DriftPath) -> list[_Kind]:
-    """Frames that were not used, by the reason without its numbers, the most frequent first."""
+    """Group unused frames by reason, without its numbers; the most frequent reason first."""
     texts = [omit_numbers(update.reason) for update in path.updates]
     counts = Counter(t for t in texts if t).most_common()
     last = len(_MARKS) - 1
@@ -143,7 +143,7 @@ def _group_rejections(path: DriftPath) -> list[_Kind]:
 
 
 def _choose_time_unit(path: DriftPath) -> tuple[Array, str]:
-    """Times since the first frame and their unit."""
+    """Return times since the first frame and their unit."""
     seconds = path.time_s - path.time_s[0]
     longest = float(np.max(np.abs(seconds)))
     for name, size in (("h", 3600.0), ("min", 60.0)):
@@ -153,7 +153,7 @@ def _choose_time_unit(path: DriftPath) -> tuple[Array, str]:
 
 
 def _choose_unit(path: DriftPath, values: Array, suffix: str = "") -> _Unit:
-    """The unit in which the largest value is no long number."""
+    """Choose the unit in which the largest value is a short number."""
     if not path.calibrated:
         return _Unit("px" + suffix, 1.0)
     known = values[np.isfinite(values)]
@@ -200,7 +200,7 @@ def _draw_path(
 
 
 def _set_equal_axes(axes: Axes, x: Array, y: Array) -> None:
-    """Both axes at one scale, y down as in the picture, with room for the texts at the ends."""
+    """Give both axes one scale, y down as in the image, with room for texts at the ends."""
     half = 0.67 * max(float(np.ptp(x)), float(np.ptp(y))) or 1.0
     middle_x, middle_y = 0.5 * float(x.min() + x.max()), 0.5 * float(y.min() + y.max())
     axes.set_xlim(middle_x - half, middle_x + half)
@@ -209,12 +209,12 @@ def _set_equal_axes(axes: Axes, x: Array, y: Array) -> None:
 
 
 def _choose_dot_area(frames: int) -> float:
-    """Smaller dots where there are many."""
+    """Choose smaller dots if there are many."""
     return float(np.clip(900.0 / frames, 3.0, 18.0))
 
 
 def _find_free_direction(x: Array, y: Array, at: int) -> tuple[float, float]:
-    """Direction on the page from the neighbours of an end to it: where the path is not."""
+    """Find the direction on the page from the neighbours of an end to it: away from the path."""
     near = slice(0, max(2, len(x) // 8)) if at == 0 else slice(-max(2, len(x) // 8), None)
     dx, dy = float(x[at] - x[near].mean()), float(y[at] - y[near].mean())
     length = float(np.hypot(dx, dy))
@@ -239,7 +239,7 @@ def _mark_end(
 
 
 def _draw_key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
-    """What the marks mean, with the number of frames of each kind."""
+    """Explain the marks, with the number of frames of each kind."""
     axes.set_axis_off()
     keyframes = sum(u.status is DriftStatus.KEYFRAME for u in path.updates)
     used = int(path.accepted.sum())
@@ -270,14 +270,14 @@ def _draw_key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
         labelspacing=0.4,
         borderaxespad=0.0,
     )
-    # A long reason must not make the path above it small.
+    # A long reason must not shrink the plot above it.
     drawn.set_in_layout(False)
     for text in drawn.get_texts():
         text.set_parse_math(False)
 
 
 def _shorten(text: str) -> str:
-    """On two lines at most."""
+    """Wrap a text to two lines at most."""
     lines = textwrap.wrap(text, _LINE_LENGTH, max_lines=2, placeholder=" …")
     return "\n".join(lines)
 
@@ -296,7 +296,7 @@ def _draw_drift(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) ->
 
 
 def _draw_rate(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
-    # A frame on its own tells no rate: there the uncertainty is stated as zero.
+    # A single frame gives no rate: its uncertainty is stated as zero.
     known = path.velocity_sigma_m_s > 0.0
     rate = np.where(known, path.velocity_m_s, np.nan)
     unit = _choose_unit(path, rate, "/s")
@@ -332,7 +332,7 @@ def _draw_residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array)
 
 
 def _draw_bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> None:
-    """Both axes with their bands, and limits that a few very uncertain frames do not set."""
+    """Draw both axes with bands; a few very uncertain frames do not set the limits."""
     for k, (name, color, line) in enumerate((("x", OURS, "-"), ("y", SECOND, "--"))):
         half = np.where(np.isfinite(values[:, k]), _BAND * sigma[:, k], np.nan)
         axes.fill_between(
@@ -366,7 +366,7 @@ def _draw_bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask
 
 
 def _mark_rejected(axes: Axes, kinds: list[_Kind], time: Array) -> None:
-    """A line through the plot at each frame that was not used, with its mark at the lower edge."""
+    """Draw a line at each unused frame, with its mark at the lower edge of the plot."""
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     if not kinds:
         return

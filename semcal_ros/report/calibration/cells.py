@@ -1,4 +1,4 @@
-"""The image field in cells, with the corners of all views in them."""
+"""Divide the image field into cells, and assign the corners of all views to them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Cells:
-    """A lattice of nearly square cells over the field, with the cell of every corner."""
+    """A lattice of nearly square cells over the field, and the cell of every corner."""
 
     columns: int
     rows: int
@@ -34,13 +34,13 @@ class Cells:
 
 
 def compute_empty_share(result: CalibrationResult, across: int = 12) -> float:
-    """Share of the field, in cells of which ``across`` are side by side, without any corner."""
+    """Compute the share of cells without a corner, with ``across`` cells across the field."""
     counts = assign_cells(result, np.concatenate([v.image_xy for v in result.views]), across).counts
     return float(np.mean(counts == 0))
 
 
 def assign_cells(result: CalibrationResult, xy: Array, across: int) -> Cells:
-    """The field in cells, ``across`` of them side by side, with the cell of each pixel ``xy``."""
+    """Divide the field, ``across`` cells wide, and assign each pixel ``xy`` to a cell."""
     width, height = result.model.image_size
     rows = max(1, round(across * height / width))
     size = np.array([width / across, height / rows])
@@ -52,7 +52,7 @@ def assign_cells(result: CalibrationResult, xy: Array, across: int) -> Cells:
 
 
 def compute_reached_shares(result: CalibrationResult, across: int = 6) -> dict[float, float]:
-    """At each magnification, the share of the field's cells, ``across`` in a row, with a corner."""
+    """Compute, for each magnification, the share of cells, ``across`` in a row, with a corner."""
     xy: dict[float, list[Array]] = {}
     for view in result.views:
         xy.setdefault(float(view.magnification), []).append(view.image_xy)
@@ -63,7 +63,7 @@ def compute_reached_shares(result: CalibrationResult, across: int = 6) -> dict[f
 
 
 def concatenate_corners(result: CalibrationResult) -> tuple[Array, Array]:
-    """All corners (n, 2) with their residuals (n, 2), px."""
+    """Concatenate all corners (n, 2) and their residuals (n, 2), px."""
     return (
         np.concatenate([v.image_xy for v in result.views]),
         np.concatenate(result.fit.residuals_px),

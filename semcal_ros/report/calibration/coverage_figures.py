@@ -1,4 +1,4 @@
-"""Where the corners are, and how the grid was tilted."""
+"""Figures of the coverage of the field by corners, and of the tilts of the grid."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _CELLS = 24
 
 
 def plot_coverage(result: CalibrationResult) -> Picture:
-    """How many corners of all views lie in each cell of the field."""
+    """Plot how many corners of all views lie in each cell of the field."""
     xy, _ = concatenate_corners(result)
     cells = assign_cells(result, xy, _CELLS)
     counts = cells.counts
@@ -75,7 +75,7 @@ def plot_coverage(result: CalibrationResult) -> Picture:
 
 
 def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
-    """Tilt of the grid in each view, and direction of its normal in the image, degrees."""
+    """Compute the tilt of the grid in each view, and the direction of its normal, degrees."""
     normals = result.fit.rotations[:, :, 2]
     upright = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     tilt = np.degrees(np.arccos(np.clip(upright[:, 2], -1.0, 1.0)))
@@ -83,7 +83,7 @@ def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
 
 
 def plot_tilt_directions(result: CalibrationResult) -> Picture:
-    """Tilt of the grid and its direction in every view."""
+    """Plot the tilt of the grid and its direction in every view."""
     tilt, azimuth = compute_tilts_deg(result)
     figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
@@ -130,7 +130,7 @@ def plot_tilt_directions(result: CalibrationResult) -> Picture:
 
 
 def plot_reached_shares(result: CalibrationResult) -> Picture:
-    """How much of the field the corners of each magnification reach."""
+    """Plot how much of the field the corners of each magnification reach."""
     shares = compute_reached_shares(result)
     g = np.array(list(shares))
     percent = 100.0 * np.array(list(shares.values()))
@@ -152,7 +152,7 @@ def plot_reached_shares(result: CalibrationResult) -> Picture:
 
 
 def plot_tilts(result: CalibrationResult) -> Picture:
-    """Tilt of every view against its magnification, with the direction as a line."""
+    """Plot the tilt of every view against its magnification, with its direction as an arrow."""
     tilt, azimuth = compute_tilts_deg(result)
     g = result.fit.magnifications
     low, high = result.model.magnification_range
@@ -189,7 +189,7 @@ def plot_tilts(result: CalibrationResult) -> Picture:
 
 
 def _add_color_bar(axes: Axes, shown: ScalarMappable, label: str) -> Colorbar:
-    """Colour bar as high as the axes, at their right."""
+    """Add a colour bar to the right of the axes, as high as they are."""
     figure = axes.figure
     bar = figure.colorbar(shown, cax=axes.inset_axes((1.04, 0.0, 0.05, 1.0)))
     bar.set_label(label, fontsize=9, color=INK)

@@ -25,14 +25,14 @@ _SAMPLES = 81
 
 
 def sample_cameras(model: CalibrationModel) -> list[ScanCamera]:
-    """Cameras over the calibrated range, evenly in log g; one if the range is a single value."""
+    """Sample cameras over the calibrated range, evenly in log g; one for a single value."""
     low, high = model.magnification_range
     count = _SAMPLES if high > low else 1
     return [model.at(float(g)) for g in np.clip(np.geomspace(low, high, count), low, high)]
 
 
 def sample_cameras_around(model: CalibrationModel, beyond: float, count: int) -> list[ScanCamera]:
-    """Cameras from the factor ``beyond`` below the calibrated range to as much above it.
+    """Sample cameras from a factor ``beyond`` below the calibrated range to as much above it.
 
     Magnifications at which the calibration has no camera are left out.
     """
@@ -51,7 +51,7 @@ def _find_camera(model: CalibrationModel, g: float) -> ScanCamera | None:
 
 
 def mark_magnifications(axes: Axes, model: CalibrationModel) -> None:
-    """Short marks on the x axis where images were taken."""
+    """Mark the magnifications of the images on the x axis."""
     g = np.array(model.magnifications)
     axes.plot(
         g,
@@ -75,7 +75,7 @@ def draw_curve(
     label: str = "",
     style: str = "-",
 ) -> None:
-    """Line with its interval, or a point with a bar where there is one magnification only."""
+    """Draw a line with its interval, or a point with a bar for a single magnification."""
     if len(g) == 1:
         axes.errorbar(
             g, values, yerr=half_widths, fmt="o", color=color, capsize=4, label=label or None
@@ -87,7 +87,7 @@ def draw_curve(
 
 
 def set_limits_with_room(axes: Axes, values: Array, half_widths: Array) -> None:
-    """Limits with room, also for a constant that is exactly known."""
+    """Set limits with room around the curve, also for a constant without uncertainty."""
     low, high = float(np.min(values - half_widths)), float(np.max(values + half_widths))
     room = max(0.12 * (high - low), 1e-4 * max(abs(low), abs(high)), 1e-6)
     axes.set_ylim(low - room, high + room)

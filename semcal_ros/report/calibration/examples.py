@@ -29,8 +29,7 @@ __all__ = [
 
 # Width of a thumbnail with marks, px: two fit beside each other in the column of a page.
 _OVERLAY_WIDTH = 320
-# Half the size of a cross: this part of the spacing of the corners, within limits, in px of the
-# thumbnail.
+# Half the size of a cross, as a part of the corner spacing, within the limits below.
 _MARK_OF_SPACING = 0.2
 # Smaller crosses cannot be seen, larger ones cover the corner.
 _MARK_LIMITS_PX = (0.8, 4.0)
@@ -67,7 +66,7 @@ class Overlay:
 
 
 def choose_examples(views: Sequence[FoundView]) -> list[FoundView]:
-    """For each magnification, ascending, the view with most corners."""
+    """Choose the view with most corners for each magnification, ascending."""
     best: dict[float, FoundView] = {}
     for view in views:
         known = best.get(view.magnification)
@@ -89,7 +88,7 @@ def _crosses(xy: Array, k: float) -> str:
 
 
 def overlay_corners(view: FoundView) -> Overlay:
-    """The view shrunk to a thumbnail, with a cross at each corner and a square where one was refused."""
+    """Shrink a view, with a cross at each corner and a square at each refused one."""
     small, factor = shrink(convert_to_8_bits(view.image), _OVERLAY_WIDTH)
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
     xy, refused_xy = (
@@ -115,7 +114,7 @@ def overlay_corners(view: FoundView) -> Overlay:
 
 
 def show_rejected(views: Sequence[RejectedView], count: int) -> list[Picture]:
-    """Thumbnails of rejected images that carry their pixels, different reasons first."""
+    """Make thumbnails of rejected images that have pixels, different reasons first."""
     ranked: list[tuple[int, int]] = []
     seen: Counter[str] = Counter()
     for index, view in enumerate(views):

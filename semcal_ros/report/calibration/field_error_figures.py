@@ -1,4 +1,4 @@
-"""Figures over the image field: how the corners fit, what the distortion does."""
+"""Figures over the image field: residuals of the corners, displacement by the distortion."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ __all__ = [
 _RESIDUAL_CELLS = 12
 # More arrows overlap in a figure of this size.
 _MAX_ARROWS = 700
-# Corners in a cell below which the mean of its residuals says little.
+# Least number of corners in a cell: the mean of fewer residuals says little.
 _MIN_IN_CELL = 5
 
 
 def plot_mean_residuals(result: CalibrationResult) -> Picture:
-    """Mean residual vector in each cell: what the model cannot describe, without the noise."""
+    """Plot the mean residual vector in each cell: systematic errors, with noise averaged out."""
     xy, residuals = concatenate_corners(result)
     cells = assign_cells(result, xy, _RESIDUAL_CELLS)
     size = cells.columns * cells.rows
@@ -74,7 +74,7 @@ def plot_mean_residuals(result: CalibrationResult) -> Picture:
 
 
 def plot_residuals(result: CalibrationResult) -> Picture:
-    """Residual vectors of single corners, at most some of them, the same ones every time."""
+    """Plot residual vectors of single corners; if there are too many, a fixed random sample."""
     xy, residuals = concatenate_corners(result)
     chosen = np.arange(len(xy))
     if len(xy) > _MAX_ARROWS:
@@ -115,7 +115,7 @@ def _draw_arrows(axes: Axes, xy: Array, vectors: Array, factor: float, color: st
 
 
 def plot_distortion(camera: ScanCamera) -> Picture:
-    """Displacement of the pixels by the distortion at one magnification."""
+    """Plot the displacement of pixels by the distortion at one magnification."""
     xy, moved = compute_displacements(camera)
     g = format_magnification(camera.magnification)
     figure, factor, largest = _draw_displacements(camera, xy, moved)
@@ -132,7 +132,7 @@ def plot_distortion(camera: ScanCamera) -> Picture:
 
 
 def plot_residual_field(model: CalibrationModel, cameras: Sequence[ScanCamera]) -> list[Picture]:
-    """What the residual field of a calibration adds to the distortion; empty without such a field."""
+    """Plot what a residual field adds to the distortion; empty without such a field."""
     if model.residual is None:
         return []
     pictures = []
@@ -154,7 +154,7 @@ def plot_residual_field(model: CalibrationModel, cameras: Sequence[ScanCamera]) 
 
 
 def _draw_displacements(camera: ScanCamera, xy: Array, moved: Array) -> tuple[Figure, float, float]:
-    """Figure with arrows and lines of equal length, the arrows' factor, the largest length in px."""
+    """Draw arrows and contours of length; also return arrow factor and largest length, px."""
     known = np.all(np.isfinite(moved), axis=1)
     lengths = np.hypot(moved[:, 0], moved[:, 1])
     largest = float(lengths[known].max()) if np.any(known) else 0.0

@@ -1,4 +1,4 @@
-"""What a reader should know before trusting a calibration, in plain sentences."""
+"""Warnings that a reader should know before trusting a calibration, in plain sentences."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ _HELD_OUT_RATIO = 1.5
 _FILLED_SHARE = 0.5
 # More rejected views than this are no accident: something is wrong with the recording.
 _REJECTED_SHARE = 1.0 / 3.0
-# A view whose corners fit this much worse than they should.
+# RMS error of a view over its prediction from the corners' 1-sigma, above which it is named.
 _VIEW_RATIO = 3.0
-# Mean squares of the cells' mean residuals over those of chance, and their size in px, beyond which
-# they are a pattern.
+# Mean square of the cells' mean residuals over that expected by chance, above which they form a
+# pattern.
 _PATTERN_RATIO = 3.0
-# A smaller one may be certain but matters to nobody.
+# RMS of a pattern, px: a smaller one may be significant but does not matter.
 _PATTERN_PX = 0.02
 # Beyond this predicted error, between two calibrated magnifications or at one, more images help.
 _SIGMA_PX = 2.0
-# Cells across the field in which a pattern is looked for, and corners in each: larger cells than in
-# the figure, so that the noise of their means is smaller.
+# Cells across the field for the test: larger than in the figure, so that their means are less
+# noisy.
 _PATTERN_CELLS = 8
 # With fewer corners a cell is left out.
 _MIN_IN_CELL = 5
@@ -65,7 +65,7 @@ def _join_names(items: Sequence[str]) -> str:
 
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
-    """The warnings of the calibration, then what an expert would see in the report's pictures."""
+    """Collect the calibration's warnings, then what an expert would see in the figures."""
     found = [
         *result.warnings,
         *_check_views(result, rejected),
@@ -107,7 +107,7 @@ def _check_field(result: CalibrationResult) -> list[str]:
         )
     shares = compute_reached_shares(result)
     poor = [f"{g:g}×" for g, share in shares.items() if share < _FILLED_SHARE]
-    # All of them: that is the sentence before, or a very coarse grid.
+    # If all of them are poor, the sentence above says so, or the grid is very coarse.
     if 0 < len(poor) < len(shares):
         found.append(
             f"at {_join_names(poor)} the corners reach less than half of the image field: the "
@@ -140,7 +140,7 @@ def _check_held_out(result: CalibrationResult) -> list[str]:
 
 
 def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
-    """Size in px of a pattern in the residuals over the field, and its ratio to chance.
+    """Estimate the size in px of a pattern in the residuals, and its ratio to chance.
 
     The ratio compares the squares of the cells' weighted mean residuals with what independent
     corners of the same spread would give; 1 is pure chance.
@@ -156,7 +156,7 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     sums = np.stack(
         [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
     )
-    # The median does not see outliers; 0.6745 is that of a normal distribution.
+    # The median is robust; 0.6745 is the median absolute value of a standard normal variable.
     spread = float(np.median(np.abs(normalise_residuals(result)))) / 0.6745
     chance = spread**2 / total
     squares = np.sum((sums / total[:, None]) ** 2, axis=1)
@@ -177,7 +177,7 @@ def _check_pattern(result: CalibrationResult) -> list[str]:
 
 
 def _check_predicted_error(result: CalibrationResult) -> list[str]:
-    """The gap between calibrated magnifications in which positions are least certain."""
+    """Check the magnification at which positions are least certain."""
     model = result.model
     low, high = model.magnification_range
     lattice = make_field_lattice(*model.image_size, 5)

@@ -1,4 +1,4 @@
-"""What the report computes from a calibration: predicted errors, and errors without distortion."""
+"""Predicted errors of a calibration, and errors without distortion correction."""
 
 from __future__ import annotations
 
@@ -21,27 +21,28 @@ __all__ = [
 ]
 
 
-# How far a pose may move when the distortion is left out: what a view cannot see must not run away.
+# Prior on the change of a pose without distortion, rad: directions that a view does not constrain
+# must not diverge.
 _TURN_RAD = 0.1
 # The same for the height, m.
 _HEIGHT_M = 1e-4
 
 
 def make_field_lattice(width: int, height: int, across: int) -> Array:
-    """(n, 2) pixels on a regular lattice from edge to edge of the field, row by row."""
+    """Make (n, 2) pixels on a regular lattice from edge to edge of the field, row by row."""
     down = max(2, round(across * height / width))
     x, y = np.meshgrid(np.linspace(0, width - 1, across), np.linspace(0, height - 1, down))
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def compute_displacements(camera: ScanCamera, across: int = 13) -> tuple[Array, Array]:
-    """Ideal pixels on a lattice over the field with their displacement; NaN where there is none."""
+    """Compute ideal pixels on a lattice and their displacements; NaN where undefined."""
     xy = make_field_lattice(camera.width, camera.height, across)
     return xy, camera.distort(xy) - xy
 
 
 def remove_residual_field(camera: ScanCamera) -> ScanCamera:
-    """The camera with its parametric distortion alone."""
+    """Return the camera with only its parametric distortion."""
     return replace(camera, residual=None)
 
 
@@ -50,7 +51,7 @@ def _compute_jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians
 
 
 def _compute_larger_sigma(difference: Array, covariance: Array) -> Array:
-    """(n,) 1-sigma along the worse axis from (n, 2, k) derivatives; NaN where they are not known."""
+    """Compute (n,) 1-sigma along the worse axis from (n, 2, k) derivatives; NaN if unknown."""
     spread = np.einsum("nip,pq,njq->nij", difference, covariance, difference, optimize=True)
     known = np.all(np.isfinite(spread), axis=(1, 2))
     out = np.full(len(difference), np.nan)
@@ -59,11 +60,11 @@ def _compute_larger_sigma(difference: Array, covariance: Array) -> Array:
 
 
 def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
-    """(n,) predicted 1-sigma, px, of positions relative to the image centre, worse axis.
+    """Predict the (n,) 1-sigma, px, of positions relative to the image centre, worse axis.
 
     The points lie in the reference plane and are seen at ideal pixels ``xy``. A common shift of the
-    image drops out: it trades off against the position of the specimen, which no measurement inside
-    of one image needs.
+    image drops out: it trades off against the position of the specimen, which no measurement
+    within one image needs.
     """
     covariance = camera.joint_covariance
     if covariance is None:
@@ -75,9 +76,9 @@ def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
 
 
 def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
-    """(n,) as :func:`predict_shape_sigma_px`, after a shift, a turn and a scale that fit best over ``xy``.
+    """Predict as :func:`predict_shape_sigma_px`, after the best shift, turn and scale.
 
-    This is what stays when the pose of a flat specimen is fitted to the image, so it is the part
+    This is what remains when the pose of a flat specimen is fitted to the image, so it is the part
     of the predicted error that reprojection errors can show.
     """
     covariance = camera.joint_covariance
@@ -103,7 +104,7 @@ def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
 
 
 def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
-    """RMS error in px at each magnification if the distortion were not corrected.
+    """Compute the RMS error in px at each magnification without distortion correction.
 
     The poses are fitted again, linearly about those of the result.
     """

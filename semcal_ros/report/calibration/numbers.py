@@ -1,4 +1,4 @@
-"""Tables of a calibration report, in the units that a person reads."""
+"""Tables of a calibration report, in readable units."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class MagnificationRow:
 
 
 def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]:
-    """Views, errors and pixel size at each calibrated magnification."""
+    """Tabulate views, errors and pixel size at each calibrated magnification."""
     model = result.model
     rms = rms_by_magnification(result.fit)
     rows = []
@@ -78,7 +78,7 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
 
 
 def compute_held_out_px(result: CalibrationResult) -> float | None:
-    """RMS of the held-out errors of all but the two outermost magnifications, px, or None."""
+    """Compute the held-out RMS, px, of all but the two outermost magnifications, or None."""
     inner = [
         result.held_out_rms_px[g]
         for g in result.model.magnifications[1:-1]
@@ -112,7 +112,7 @@ class ViewRow:
 
 
 def tabulate_views(result: CalibrationResult) -> list[ViewRow]:
-    """All views, those first whose corners fit worst for their uncertainty."""
+    """Tabulate all views; those that fit worst for their uncertainty come first."""
     rows = []
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
@@ -130,7 +130,7 @@ def tabulate_views(result: CalibrationResult) -> list[ViewRow]:
 
 
 def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:
-    """How the calibration was computed, as (name, value) pairs."""
+    """Collect how the calibration was computed, as (name, value) pairs."""
     model = result.model
     statistics = model.statistics
     width, height = model.image_size

@@ -55,9 +55,9 @@ __all__ = ["write_calibration_report"]
 
 # Example images on a page, at most: they make most of its size.
 _MAX_OVERLAYS = 24
-# Seen at once; the others unfold.
+# Examples that are visible at once; the others unfold.
 _FIRST_OVERLAYS = 8
-# Pictures of rejected images, at most.
+# Thumbnails of rejected images, at most.
 _MAX_THUMBNAILS = 12
 # Rows in the list of rejected images, at most.
 _MAX_REJECTED = 200
@@ -85,10 +85,9 @@ def write_calibration_report(
     detections
         Images with their corners; the one with most corners is shown for each magnification.
     rejected
-        Images that were not used, with the reason; with their picture where they have an
-        attribute ``image``.
+        Images that were not used, with the reason; shown if their attribute ``image`` is set.
     images
-        More pictures as (caption, image), shown at the end.
+        More images as (caption, image), shown at the end.
     title
         Heading of the page.
 
@@ -152,7 +151,7 @@ def write_calibration_report(
 
 
 def _choose_evenly(views: list[FoundView], count: int) -> list[FoundView]:
-    """At most ``count`` of the views, evenly chosen, with the first and the last."""
+    """Choose at most ``count`` views evenly, including the first and the last."""
     if len(views) <= count:
         return views
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
@@ -166,7 +165,7 @@ def _choose_example_cameras(model: CalibrationModel) -> list[ScanCamera]:
 
 
 def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str, str]]:
-    """The key figures as (name, value, remark)."""
+    """Summarise the key figures as (name, value, remark)."""
     model = result.model
     low, high = model.magnification_range
     held_out = compute_held_out_px(result)

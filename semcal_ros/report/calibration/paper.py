@@ -1,4 +1,4 @@
-"""What the paper reports, beside what a calibration found.
+"""The figures of the paper beside those of a calibration.
 
 Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020.
 """
@@ -30,7 +30,7 @@ class PaperRow:
 
 
 def compute_median_px(errors: Mapping[float, float]) -> float | None:
-    """Median over the magnifications, px, or None."""
+    """Compute the median over the magnifications, px, or None."""
     values = [v for v in errors.values() if not np.isnan(v)]
     return float(np.median(values)) if values else None
 
@@ -38,12 +38,12 @@ def compute_median_px(errors: Mapping[float, float]) -> float | None:
 def tabulate_beside_paper(
     result: CalibrationResult, rms: Mapping[float, float], straight: Mapping[float, float]
 ) -> list[PaperRow]:
-    """Errors of the calibration with the paper's figures for the same.
+    """Tabulate the errors of a calibration beside those of the paper.
 
     Parameters
     ----------
     rms, straight
-        Error in px at each magnification, with correction of the distortion and without.
+        Error in px at each magnification, with and without correction of the distortion.
     """
     abstract, section = PAPER_RMS_PX
     return [

@@ -120,7 +120,7 @@ def compute_focal_length_px(camera: ScanCamera) -> tuple[float, float]:
 def _collect_values(
     model: CalibrationModel, cameras: list[ScanCamera], name: str
 ) -> tuple[Array, Array]:
-    """(G,) values of a parameter and their 1-sigma, the scale relative to nominal."""
+    """Collect (G,) values of a parameter and their 1-sigma; the scale is relative to nominal."""
     if name == "f":
         pairs = np.array([compute_focal_length_px(c) for c in cameras])
         return pairs[:, 0], pairs[:, 1]
@@ -137,7 +137,7 @@ def _collect_values(
 
 
 def plot_parameters(model: CalibrationModel) -> list[ParameterGroup]:
-    """Each camera parameter against the magnification with its 1-sigma band."""
+    """Plot each camera parameter against the magnification with its 1-sigma band."""
     cameras = sample_cameras(model)
     g = np.array([c.magnification for c in cameras])
     groups = []
@@ -160,7 +160,7 @@ def _plot_panel(
     figure = create_figure(4.0, 2.4)
     _draw_panel(figure.add_subplot(), model, panel, g, values, sigmas)
     first, last = (format_with_sigma(values[k], sigmas[k]) for k in (0, -1))
-    # What does not change may be known better at one end than at the other.
+    # A constant may have a different uncertainty at each end.
     if len(g) > 1 and first == last and np.ptp(values) <= 1e-9 * np.abs(values).max():
         ends = f"{first} at every magnification"
     elif len(g) > 1:
@@ -178,7 +178,7 @@ def _plot_panel(
 def _draw_panel(
     axes: Axes, model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
 ) -> None:
-    """A parameter with its 1-sigma band."""
+    """Draw a parameter with its 1-sigma band."""
     style_axes(axes, xlabel="magnification", ylabel=panel.unit)
     draw_curve(axes, g, values, sigmas, OURS)
     set_magnification_axis(axes, g[0], g[-1])
@@ -191,7 +191,7 @@ def _draw_panel(
 
 
 def plot_calibration(model: CalibrationModel) -> Figure:
-    """Pixel size and every parameter against the magnification, with 1-sigma bands, in one figure.
+    """Plot pixel size and all parameters against the magnification, with bands, in one figure.
 
     The focal length is left out: it is the scale over the inverse distance of the scan pivot.
     """
@@ -215,7 +215,7 @@ def plot_calibration(model: CalibrationModel) -> Figure:
 
 
 def _draw_pixel_size(axes: Axes, model: CalibrationModel, g: Array, sizes: Array) -> None:
-    """Mean of both axes; its uncertainty, which no logarithmic axis shows, is in the scale's panel."""
+    """Draw the mean pixel size of both axes; its uncertainty is in the panel of the scale."""
     nm = 1e9 * sizes.mean(axis=1)
     style_axes(axes, xlabel="magnification", ylabel="nm")
     axes.plot(g, nm, "o" if len(g) == 1 else "-", color=OURS, linewidth=1.4)

@@ -1,4 +1,4 @@
-"""Size of a pixel against the magnification."""
+"""Figures of the pixel size against the magnification."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["plot_pixel_sizes"]
 
 
 def plot_pixel_sizes(model: CalibrationModel) -> list[Picture]:
-    """Size of a pixel against the magnification, and how well it is known."""
+    """Plot the size of a pixel against the magnification, and its uncertainty."""
     cameras = sample_cameras(model)
     g = np.array([c.magnification for c in cameras])
     sizes = np.array([c.pixel_size_m for c in cameras])

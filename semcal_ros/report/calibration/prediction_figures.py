@@ -1,4 +1,4 @@
-"""The predicted error over field and magnification."""
+"""Figures of the predicted error over field and magnification."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ from semcal_ros.report.html.text import format_magnification
 __all__ = ["plot_predicted_errors"]
 
 
-# The map goes on to this factor outside of the calibrated range, to show what extrapolation costs.
+# The map extends by this factor beyond the calibrated range, to show what extrapolation costs.
 _BEYOND = 1.5
 # Magnifications across the map.
 _COLUMNS = 61
-# Circles about the image centre in the map, and directions on each of them.
+# Circles around the image centre in the map.
 _RINGS = 24
-# Every 11 degrees; the corners of the field are added.
+# Directions on each circle, every 11 degrees; the corners of the field are added.
 _DIRECTIONS = 32
 # Points across the field in the maps over it.
 _ACROSS = 17
 
 
 def plot_predicted_errors(model: CalibrationModel) -> list[Picture]:
-    """Map over distance and magnification, maps over the field, and curves.
+    """Plot a map over distance and magnification, maps over the field, and curves.
 
-    Empty for a calibration without uncertainty.
+    The list is empty for a calibration without uncertainty.
     """
     cameras = sample_cameras(model)
     if any(c.covariance is None for c in cameras):
@@ -75,7 +75,7 @@ def _has_finite(values: Array) -> bool:
 
 
 def _plot_map(model: CalibrationModel) -> Picture:
-    """Largest predicted error at each distance from the image centre, at each magnification."""
+    """Plot the largest predicted error over magnification and distance from the centre."""
     cameras = sample_cameras_around(model, _BEYOND, _COLUMNS)
     g = np.array([c.magnification for c in cameras])
     radii, points, ring = _sample_rings(model)
@@ -127,7 +127,7 @@ def _get_largest_at(table: Array, g: Array, x: float) -> float:
 
 
 def _sample_rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
-    """Radii (px), points of the field on circles of these radii, and the circle of each point."""
+    """Sample radii (px), points of the field on these circles, and the circle of each point."""
     width, height = model.image_size
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
     radii = np.linspace(0.0, float(np.hypot(*centre)), _RINGS)
@@ -146,7 +146,7 @@ def _sample_rings(model: CalibrationModel) -> tuple[Array, Array, Indices]:
 
 
 def _plot_fields(model: CalibrationModel, worst: ScanCamera) -> Picture:
-    """Predicted error over the field at the ends, in the middle, and where it is largest."""
+    """Plot the predicted error over the field at the ends, in the middle, and at the worst."""
     low, high = model.magnification_range
     chosen = {c.magnification: c for c in (model.at(low), worst, model.at(high))}
     if high > low:
@@ -200,7 +200,7 @@ def _draw_field(axes: Axes, x: Array, y: Array, table: Array, top: float) -> Non
 def _plot_curves(
     model: CalibrationModel, cameras: list[ScanCamera], lattice: Array, shape: Array
 ) -> Picture:
-    """Predicted error against the magnification, with and without what a fitted pose absorbs."""
+    """Plot the predicted error against the magnification, with and without a fitted pose."""
     g = np.array([c.magnification for c in cameras])
     aligned = np.stack([predict_aligned_sigma_px(c, lattice) for c in cameras])
     total = max(float(np.nanmax(c.project_sigma(c.sem_from_ideal(lattice)))) for c in cameras)

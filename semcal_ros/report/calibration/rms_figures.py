@@ -1,4 +1,4 @@
-"""Errors against the magnification, beside what the paper reports."""
+"""Figures of the errors against the magnification, beside those of the paper."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _HISTOGRAM_LIMIT = 5.0
 
 
 def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Picture:
-    """RMS and held-out RMS at each magnification, with what the paper reports.
+    """Plot RMS and held-out RMS at each magnification, beside the values of the paper.
 
     ``straight`` is the error without correction of the distortion.
     """
@@ -74,7 +74,7 @@ def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Pict
 
 
 def _predict_rms(result: CalibrationResult, g: Array) -> Array:
-    """(G,) RMS error that the 1-sigma of the corners alone would give, px."""
+    """Predict the (G,) RMS error from the 1-sigma of the corners alone, px."""
     variances: dict[float, list[Array]] = {float(x): [] for x in g}
     for view in result.views:
         variances[float(view.magnification)].append(view.sigma_px**2)
@@ -100,13 +100,13 @@ def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:
 
 
 def normalise_residuals(result: CalibrationResult) -> Array:
-    """(n, 2) residuals over the 1-sigma of their corners."""
+    """Divide residuals (n, 2) by the 1-sigma of their corners."""
     sigma = np.concatenate([v.sigma_px for v in result.views])
     return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
 
 
 def plot_residual_histogram(result: CalibrationResult) -> Picture:
-    """Residuals over their 1-sigma, beside the normal distribution."""
+    """Plot a histogram of residuals over their 1-sigma, beside the normal distribution."""
     values = normalise_residuals(result).ravel()
     beyond = float(np.mean(np.abs(values) > 3.0))
     spread = float(np.sqrt(np.mean(values**2)))

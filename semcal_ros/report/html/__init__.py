@@ -1,1 +1,1 @@
-"""HTML pages that hold their own pictures and styles."""
+"""Self-contained HTML pages: images and styles are embedded."""

@@ -1,4 +1,4 @@
-"""Pictures as data that an HTML file carries in itself."""
+"""Encode images and figures as data embedded in an HTML file."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ __all__ = [
     "shrink",
 ]
 
-# Two dots of the file per CSS pixel of the page (96 per inch), so that pictures are sharp on fine
-# screens.
+# Two dots of the file per CSS pixel of the page (96 per inch), so that figures are sharp on
+# high-resolution screens.
 _FIGURE_DPI = 192.0
 # By the definition of CSS.
 _CSS_PX_PER_INCH = 96.0
-# Line drawings with soft edges need no more colours; the file is three times smaller than in RGB.
+# Antialiased line drawings need no more colours; the file is three times smaller than in RGB.
 _COLORS = 128
-# Quality of JPEG files. Pictures that a caller hands in are the subject of a page, and get more.
+# Quality of JPEG files. Images given by the caller are the subject of a page, and get more.
 _JPEG_QUALITY = 82
-# That of pictures that a caller hands in.
+# Quality of images given by the caller.
 _CALLER_QUALITY = 88
-# Width of pictures that a caller hands in, px: that of a column of the page.
+# Width of images given by the caller, px: that of a column of the page.
 _CALLER_WIDTH = 640
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of a page.
+    """One image of a page.
 
     Attributes
     ----------
     src
         Data URI.
     alt
-        What the picture shows, for those who cannot see it.
+        What the image shows, for readers who cannot see it.
     caption
-        Sentence below the picture; may be empty.
+        Sentence below the image; may be empty.
     width, height
-        Size in CSS px at which the text in the picture has its normal size.
+        Size in CSS px at which the text in the image has its normal size.
     """
 
     src: str
@@ -73,7 +73,7 @@ def encode_data_uri(kind: str, data: bytes) -> str:
 
 
 def encode_figure(figure: Figure, alt: str, caption: str = "") -> Picture:
-    """Encode a figure for a page, and empty it, so that its memory is free."""
+    """Encode a figure for a page, and clear it to free its memory."""
     width, height = figure.get_size_inches() * _CSS_PX_PER_INCH
     source = encode_data_uri("png", encode_png(figure, _FIGURE_DPI))
     figure.clear()
@@ -86,7 +86,7 @@ def encode_png(figure: Figure, dpi: float, *, keep_rare_colors: bool = False) ->
     Parameters
     ----------
     figure
-        What is drawn.
+        The figure.
     dpi
         Dots per inch.
     keep_rare_colors
@@ -141,7 +141,7 @@ def shrink(image: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], flo
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> bytes:
-    """Encode a gray or RGB image as JPEG: noisy micrographs are several times smaller than as PNG."""
+    """Encode a gray or RGB image as JPEG, for micrographs several times smaller than PNG."""
     ordered = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     ok, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:

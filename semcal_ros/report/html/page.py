@@ -25,7 +25,7 @@ def render(
     template
         File name of the template. It may extend or import the templates of this package.
     values
-        What the template shows. Every value is escaped.
+        Values that the template shows; all are escaped.
     folder
         Folder of the template if it is not one of this package.
 

@@ -1,4 +1,4 @@
-"""Look of all figures: readable on a telephone, dark on white, no global state."""
+"""Style of all figures: readable on a phone, dark on white, no global state."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ _TEXT_PT = 9.0
 
 
 def create_figure(width_in: float = 4.2, height_in: float = 3.0) -> Figure:
-    """An empty figure on the Agg canvas; no figure manager knows it."""
+    """Create an empty figure on the Agg canvas, not registered with any figure manager."""
     figure = Figure(figsize=(width_in, height_in), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def style_axes(axes: Axes, *, xlabel: str, ylabel: str) -> None:
-    """Labels, thin frame, light grid."""
+    """Set labels, a thin frame and a light grid."""
     axes.set_facecolor("white")
     axes.set_xlabel(xlabel, fontsize=_TEXT_PT, color=INK)
     axes.set_ylabel(ylabel, fontsize=_TEXT_PT, color=INK)
@@ -73,14 +73,14 @@ def style_axes(axes: Axes, *, xlabel: str, ylabel: str) -> None:
 
 
 def add_legend(axes: Axes, **options: Any) -> None:
-    """Small legend without a frame of its own."""
+    """Add a small legend without a frame."""
     axes.legend(
         fontsize=_TEXT_PT - 1.5, framealpha=0.85, edgecolor="none", labelcolor=INK, **options
     )
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """At least three round numbers from ``low`` to ``high`` where there are as many."""
+    """Choose at least three round numbers from ``low`` to ``high``, if there are that many."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     for steps in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), tuple(1.0 + 0.5 * k for k in range(18))):
         ticks = [s * 10.0**d for d in decades for s in steps if low <= s * 10.0**d <= high]
@@ -90,7 +90,7 @@ def choose_log_ticks(low: float, high: float) -> list[float]:
 
 
 def set_magnification_axis(axes: Axes, low: float, high: float) -> None:
-    """Logarithmic x axis over the calibrated range, with plain numbers."""
+    """Set a logarithmic x axis over the calibrated range, with plain numbers."""
     margin = 1.12 if high > low else 1.5
     axes.set_xscale("log")
     axes.set_xlim(low / margin, high * margin)
@@ -101,7 +101,7 @@ def set_magnification_axis(axes: Axes, low: float, high: float) -> None:
 
 
 def set_log_axis_y(axes: Axes, low: float, high: float) -> None:
-    """Logarithmic y axis from ``low`` to ``high`` with plain numbers."""
+    """Set a logarithmic y axis from ``low`` to ``high`` with plain numbers."""
     axes.set_yscale("log")
     axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(FixedLocator(choose_log_ticks(low, high)))
@@ -111,7 +111,7 @@ def set_log_axis_y(axes: Axes, low: float, high: float) -> None:
 
 
 def style_field_axes(axes: Axes, width: int, height: int) -> None:
-    """Axes that show the image field, y down, square pixels."""
+    """Set axes that show the image field, y down, square pixels."""
     style_axes(axes, xlabel="column (px)", ylabel="row (px)")
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
@@ -121,7 +121,7 @@ def style_field_axes(axes: Axes, width: int, height: int) -> None:
 
 
 def choose_arrow_factor(length_px: float, target_px: float) -> float:
-    """Factor (1, 2, 5, 10, ...) that makes arrows of ``length_px`` at most ``target_px`` long."""
+    """Choose a factor (1, 2, 5, 10, ...) that scales ``length_px`` to at most ``target_px``."""
     if not (np.isfinite(length_px) and length_px > 0.0):
         return 1.0
     ratio = max(target_px / length_px, 1e-3)
@@ -132,7 +132,7 @@ def choose_arrow_factor(length_px: float, target_px: float) -> float:
 def draw_contours(
     axes: Axes, x: Array, y: Array, table: Array, top: float, *, lines: int = 6
 ) -> None:
-    """Contours at round values up to ``top`` with their numbers, so that no colour has to be read."""
+    """Draw numbered contours at round values up to ``top``; no colour has to be read."""
     known = table[np.isfinite(table)]
     if not known.size or float(np.ptp(known)) <= 1e-12 * max(abs(top), 1.0):
         return

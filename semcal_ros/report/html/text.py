@@ -1,4 +1,4 @@
-"""Text of a page: safe characters, and quantities in the units that a person reads."""
+"""Text of a page: safe characters, and quantities in readable units."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = [
     "remove_control_characters",
 ]
 
-# Beyond this many decimals a number is longer than a table is wide.
+# Most decimals of a number: longer ones do not fit a table.
 _MOST_DECIMALS = 9
 
 
@@ -35,7 +35,7 @@ def format_with_sigma(value: float, sigma: float) -> str:
 
 
 def format_length(length_m: float, sigma_m: float | None = None) -> str:
-    """Format a length in nm or µm, with two digits of its 1-sigma where there is one."""
+    """Format a length in nm or µm, with two digits of its 1-sigma if it is given."""
     unit, factor = ("µm", 1e6) if abs(length_m) >= 1e-6 else ("nm", 1e9)
     value = factor * length_m
     if sigma_m is None or not (np.isfinite(sigma_m) and sigma_m > 0.0):
