@@ -30,8 +30,8 @@ __all__ = ["BundleResult", "BundleStatus", "refine"]
 
 # A guard against endless iteration; the result says where it was reached.
 _MAX_ITERATIONS = 60
-# Levenberg-Marquardt damping relative to the diagonal: nearly Gauss-Newton at the start, and from
-# rounding to steps of no length.
+# Levenberg-Marquardt damping relative to the diagonal: nearly Gauss-Newton at the start; the limits
+# stand for no damping and for steps of no length.
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
 # Ratio of actual to predicted decrease below which the quadratic model of a view has failed.
 _POOR_GAIN = 0.25

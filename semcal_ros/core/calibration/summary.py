@@ -1,4 +1,4 @@
-"""Statistics of a calibration for its file, and warnings about parameters that the views leave open."""
+"""Statistics of a calibration for its file, and warnings about undetermined parameters."""
 
 from __future__ import annotations
 

@@ -121,9 +121,9 @@ class ScanCamera:
     ) -> ScanCamera:
         """Return the camera that the display width alone predicts: parallel, without distortion.
 
-        Its covariance is that of an uncalibrated instrument: a scale good to 3 %, an
-        axis within 3 % of the width from the middle, an unknown distortion of a few tenths of a
-        per cent (1-sigma).
+        Its covariance is that of an uncalibrated instrument: a scale accurate to 3 %, an axis within
+        3 % of the width from the middle, and an unknown distortion of a few tenths of a per cent
+        (1-sigma).
         """
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
         m = magnification * width / display_width_m
