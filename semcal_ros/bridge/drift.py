@@ -18,8 +18,7 @@ __all__ = ["UNKNOWN_VARIANCE", "fill_drift", "fill_drift_velocity"]
 UNKNOWN_VARIANCE = 1e6
 """Variance of what is not observed (height in m2, rotations in rad2): beyond anything physical."""
 
-# Relative to the largest entry: above the rounding of single precision (6e-8), far below what a
-# wrong matrix shows.
+# Relative to the largest entry: above the rounding of single precision (6e-8).
 _SYMMETRY_TOLERANCE = 1e-6
 
 

@@ -41,7 +41,7 @@ _OTHER_CLOCK_S = 30.0
 # markers at the edge can hide.
 _HIDDEN = 0.03
 # Least time between two resets while the target is still found, in addition to two frame intervals:
-# the corrector needs a new keyframe before its drift is small again. Chosen, not measured.
+# frames corrected before a reset still arrive with the old drift. Chosen, not measured.
 _RESET_AGAIN_S = 2.0
 
 

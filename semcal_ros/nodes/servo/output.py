@@ -18,7 +18,7 @@ from semcal_ros.nodes.common.endpoints import Endpoints
 __all__ = ["ErrorOutput", "StageOutput"]
 
 # Longest wait for the acknowledgement of the final zero velocity: a stage that is gone must not
-# hold up the end of the node. Chosen, not measured; on a working network it arrives within ms.
+# hold up the end of the node. Chosen, not measured.
 _LAST_WORD_S = 1.0
 
 
