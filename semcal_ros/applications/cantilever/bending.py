@@ -188,7 +188,7 @@ def evaluate_bending(terms: Array, u: Array) -> Array:
 
 def fit_bending(
     u: Array,
-    compute_displacement_m: Array,
+    displacement_m: Array,
     sigma_m: Array,
     length_m: float,
     offset_sigma_m: float,
@@ -214,12 +214,12 @@ def fit_bending(
     Bending
         With an infinite sigma if too little of the beam was seen.
     """
-    usable = np.isfinite(sigma_m) & np.isfinite(compute_displacement_m)
+    usable = np.isfinite(sigma_m) & np.isfinite(displacement_m)
     cubic = u**3 - u**2
     terms = [u**2, cubic] if shape is None else [u**2 + shape.value * cubic]
     design = np.column_stack([np.ones(len(u)), u, *terms])
     rows = np.repeat(design, 2, axis=0)[usable.ravel()]
-    seen, sigma = compute_displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
+    seen, sigma = displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
     if len(seen) < _LEAST:
         unknown = np.full((2, 2), np.inf)
         nothing = np.full(4, np.nan)

@@ -98,8 +98,7 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
             values = np.linalg.svd(table, compute_uv=False)
             if len(values) < 4:
                 continue
-            free = max(len(values) - 3, 1)
-            noise = float(np.sqrt(np.mean(values[3:] ** 2))) if free else 0.0
+            noise = float(np.sqrt(np.mean(values[3:] ** 2)))
             score = float(values[2]) / max(noise, 1e-30) * np.sqrt(len(points))
             relief = float(values[2]) / max(noise, 1e-30)
             if best is None or score > best[0]:

@@ -191,7 +191,7 @@ class Servo:
         camera
             Camera of this frame.
         time_s
-            Centre of its acquisition, on the clock of :meth:`sent`.
+            Centre of its acquisition, on the clock of :meth:`record_command`.
         interval_s
             Time between frames.
         now_s
