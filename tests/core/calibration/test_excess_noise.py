@@ -57,9 +57,9 @@ def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
         "options": CalibrationOptions(residual="off"),
     }
     good, bad = (calibrate_views(v, **options) for v in (even, uneven))
-    assert good.model.statistics["fit"]["estimate_excess_sigma_px"] == 0.0
+    assert good.model.statistics["fit"]["excess_sigma_px"] == 0.0
     # Some thousand corners: known to a few percent.
-    assert bad.model.statistics["fit"]["estimate_excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
+    assert bad.model.statistics["fit"]["excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
     assert not any("residuals are" in w for w in good.warnings)
     assert any("residuals are 10" in w or "residuals are 9" in w for w in bad.warnings)
     # Where there are views, ten times the scatter makes what they determine much less certain.
