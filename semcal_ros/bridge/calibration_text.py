@@ -12,7 +12,10 @@ __all__ = ["MAX_TEXT_BYTES", "calibration_text_from_message", "fill_calibration_
 # A file's size grows with the square of its coefficients, 49 MB for 3000; ours have a few hundred,
 # so about 0.5 MB.
 MAX_TEXT_BYTES = 16 * 1024 * 1024
-"""Limit far above any calibration, so that a wrong topic cannot exhaust memory in the parser."""
+"""Limit far above any calibration, so that a wrong file or topic cannot exhaust memory in the parser.
+
+It is the same for files and topics, so that a node can publish whatever it can read.
+"""
 
 
 def calibration_text_from_message(message: Any) -> str:

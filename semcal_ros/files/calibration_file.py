@@ -16,6 +16,7 @@ import jsonschema
 import numpy as np
 import yaml
 
+from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -38,8 +39,6 @@ __all__ = [
 # The format's only version so far; a file with any other number is refused.
 FILE_VERSION = 1
 _FORMAT = "semcal-calibration"
-# A residual field of 3000 coefficients fills 49 MB with its covariance; ours have a few hundred.
-_MAX_TEXT = 64 * 1024 * 1024
 # Characters of a reason: it may repeat a value from the file, which can have any length.
 _MAX_REASON = 400
 _HEADER = (
@@ -72,9 +71,10 @@ def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationM
     CalibrationFileError
         As :func:`read_calibration`.
     """
-    if len(text) > _MAX_TEXT:
+    if len(text) > MAX_TEXT_BYTES:
         raise CalibrationFileError(
-            f"{source}: {len(text)} characters", expected=f"a calibration below {_MAX_TEXT}"
+            f"{source}: a text of {len(text)} characters",
+            expected=f"a calibration of at most {MAX_TEXT_BYTES}",
         )
     data = load_plain_yaml(text, source)
     try:
@@ -136,7 +136,7 @@ def write_calibration(model: CalibrationModel, path: str | os.PathLike[str]) -> 
         ) from error
 
 
-def read_calibration_text(path: Path, max_bytes: int = _MAX_TEXT) -> str:
+def read_calibration_text(path: Path) -> str:
     """Read the text of a calibration file.
 
     Raises
@@ -146,7 +146,7 @@ def read_calibration_text(path: Path, max_bytes: int = _MAX_TEXT) -> str:
     """
     return read_text_file(
         path,
-        max_bytes,
+        MAX_TEXT_BYTES,
         error=CalibrationFileError,
         expected="a readable calibration file",
         do="check the path, or make one with `semcal calibrate`",

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from semcal_ros import Calibration, SemcalError
+from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
@@ -122,3 +123,13 @@ def test_a_failed_save_leaves_the_old_file(calibration, tmp_path, monkeypatch):
 
 def test_errors_are_in_one_tree():
     assert issubclass(CalibrationFileError, SemcalError)
+
+
+def test_a_file_has_the_same_limit_as_the_topic(tmp_path):
+    path = tmp_path / "cal.yaml"
+    text = "#" * (MAX_TEXT_BYTES + 1)
+    path.write_text(text)
+    with pytest.raises(CalibrationFileError, match=f"at most {MAX_TEXT_BYTES}"):
+        Calibration.load(path)
+    with pytest.raises(CalibrationFileError, match=f"at most {MAX_TEXT_BYTES}"):
+        Calibration.loads(text)

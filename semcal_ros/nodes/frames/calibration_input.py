@@ -12,7 +12,6 @@ from typing import Any
 from std_msgs.msg import String
 
 from semcal_ros.bridge.calibration_text import (
-    MAX_TEXT_BYTES,
     calibration_text_from_message,
     fill_calibration_text,
 )
@@ -165,7 +164,7 @@ class CalibrationInput:
         self._install(self._read(path))
 
     def _read(self, path: str) -> _Loaded:
-        text = read_calibration_text(self._parameters.allowed_path(path), MAX_TEXT_BYTES)
+        text = read_calibration_text(self._parameters.allowed_path(path))
         return _load(text, path, path, time.time_ns())
 
     def _check_file(self, path: str) -> None:
