@@ -161,10 +161,8 @@ def _check_kind(data: Any, source: str) -> None:
             do="make one with `semcal calibrate`",
         )
     version = data.get("version")
-    if version != FILE_VERSION or isinstance(version, bool):
-        newer = (
-            isinstance(version, int) and not isinstance(version, bool) and version > FILE_VERSION
-        )
+    if version != FILE_VERSION or isinstance(version, bool):  # True equals 1
+        newer = isinstance(version, int) and version > FILE_VERSION
         raise CalibrationFileError(
             f"{source}: file version {repr(version)[:40]}",
             expected=f"version {FILE_VERSION}",
