@@ -47,7 +47,8 @@ __all__ = [
 Functions = Mapping[str, ContinuousFunction]
 
 METHODS = ("joint", "pda", "discrete")
-# Twice as many as determine a homography, so that there are residuals to judge a view by.
+# Twice as many as determine a homography, so that there are residuals to judge a view by. Less than
+# the corner finder accepts (MINIMUM_CORNERS), since views may also come from other corner finders.
 _MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 _MIN_VIEWS = 3

@@ -22,6 +22,7 @@ from semcal_ros.core.camera.plane_geometry import (
     normalising_similarity,
     transform_points,
 )
+from semcal_ros.core.corners.detection import MINIMUM_CORNERS
 
 __all__ = ["DistortionCentre", "find_distortion_centre"]
 
@@ -93,12 +94,13 @@ def find_distortion_centre(
     Parameters
     ----------
     views
-        Views of at least 12 corners each (the cubic needs 10); those with fewer are ignored.
+        Views; those with fewer corners than the corner finder accepts are ignored, since the cubic
+        needs 10.
     tau_px
         With a value, the paper's threshold on the RMS homography error decides instead of the
         F-test.
     """
-    usable = [v for v in views if len(v.board_xy_m) >= 12]
+    usable = [v for v in views if len(v.board_xy_m) >= MINIMUM_CORNERS]
     mean = np.mean([v.image_xy.mean(axis=0) for v in views], axis=0)
     if not usable:
         return DistortionCentre(True, mean, float("nan"), float("nan"), 1.0)

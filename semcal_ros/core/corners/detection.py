@@ -14,15 +14,15 @@ from semcal_ros.core.corners.local_map import fit_local_maps
 from semcal_ros.core.corners.saddle import LatticeStatus, find_saddles, prepare_image, screen_image
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["LatticeDetection", "LatticeStatus", "find_lattice"]
+__all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice"]
 
 
 # Scales of the search for saddle points, px. A quarter of the spacing is best, so that these suit
 # spacings of about 10, 6, 17 and 28 px, in steps of a factor of 1.7. The first suits the small
 # squares of low magnifications; a convincing lattice ends the search.
 SCALES_PX = (2.5, 1.5, 4.2, 7.0)
-# A view with fewer corners is refused; it is also the least that the search for the distortion
-# centre uses.
+# A view with fewer corners is refused. The cubic in the search for the distortion centre has 10
+# terms per coordinate.
 MINIMUM_CORNERS = 12
 # A lattice that covers this part of the image will not be surpassed at another scale.
 FILLED = 0.6

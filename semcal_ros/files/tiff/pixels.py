@@ -11,13 +11,16 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.picture_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
 from semcal_ros.core.errors import TiffError
 
 __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
 
-# These limits bound the memory that a damaged header can request: 2^29 pixels of 16 bits are 1 GiB.
+# These limits bound the memory that a damaged header can request.
 MAX_SIDE_PX = 65_536
-MAX_PIXELS = 2**29  # 1 GiB at 16 bits
+# Twice the largest image of a message, 1 GiB at 16 bits: the largest frame may have a data bar below
+# it, and a user chooses files, whereas messages come from anyone.
+MAX_PIXELS = 2 * MAX_MESSAGE_PIXELS
 _MAX_SAMPLES = 4  # red, green, blue, alpha
 # Above what Deflate (1032) and LZW reach: beyond, the pixels are not in the file.
 _MAX_PACKING = 4096
