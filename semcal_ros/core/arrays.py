@@ -9,6 +9,7 @@ comes within a factor of its size of the best condition that any diagonal scalin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
+    "MEDIAN_CHI2_2",
     "RESAMPLED_TYPES",
     "AnyImage",
     "Array",
@@ -42,6 +44,10 @@ AnyImage = NDArray[np.generic]
 
 #: Types of pixels that OpenCV resamples without a conversion.
 RESAMPLED_TYPES = ("uint8", "uint16", "float32")
+
+#: Median of a chi-square with two degrees of freedom, 2 ln 2: of the squared length of a normal
+#: vector in the plane, in variances per axis.
+MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 
 # Standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
 _SIGMAS_PER_MAD = 1.4826

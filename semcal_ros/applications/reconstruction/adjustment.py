@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.applications.reconstruction.types import Observations, tabulate_cameras
-from semcal_ros.core.arrays import Array, Indices, invert_scaled, solve_scaled
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled, solve_scaled
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
@@ -306,8 +306,7 @@ def _estimate_scale(problem: _Problem, state: _State) -> float:
     size = 2.0 * len(white)
     spent = 3.0 * len(state.points) + 6.0 * problem.views
     median = float(np.median(np.sum(white**2, axis=1)))
-    # The median of a chi-square with two degrees of freedom is 2 ln 2.
-    scale = np.sqrt(median / (2.0 * np.log(2.0)) * size / max(size - spent, 0.05 * size))
+    scale = np.sqrt(median / MEDIAN_CHI2_2 * size / max(size - spent, 0.05 * size))
     return max(float(scale), _LEAST_SCALE)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, AnyImage, Array, Mask
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
@@ -311,8 +311,6 @@ def views_from_detections(
     return views, assignment
 
 
-# Median of the squared length of a normal vector in the plane, in variances per axis.
-_MEDIAN_SQUARE = 2.0 * float(np.log(2.0))
 # Ratio of observed to stated variances up to which the stated uncertainties are kept.
 _GOOD_ENOUGH = 1.5
 
@@ -335,7 +333,7 @@ def estimate_excess_sigma_px(
     """
     own = np.concatenate([v.sigma_px for v in views]) ** 2
     square = np.sum(residuals_px**2, axis=1)
-    target: float = _MEDIAN_SQUARE * max(1.0 - unknowns / (2.0 * len(square)), 0.1)
+    target: float = MEDIAN_CHI2_2 * max(1.0 - unknowns / (2.0 * len(square)), 0.1)
 
     def surplus(variance: float) -> float:
         ratio = float(np.median(square / (own + variance)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from semcal_ros.core.arrays import Array, Array32, Indices, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Array32, Indices, Mask
 from semcal_ros.core.corners.corner_fit import CornerFit
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.window import PixelWindows
@@ -101,8 +101,6 @@ CHI2_SIGMAS = 6.0
 MISFIT_MAX = 0.12
 # Undisturbed corners exceed this score, a chi-square with two degrees of freedom, once in 2000.
 IMBALANCE_MAX = 15.0
-# The median of that chi-square, 2 ln 2.
-IMBALANCE_MEDIAN = 1.39
 # Stains of the board and shortcomings of the model, relative to half the contrast.
 UNLIKE_MAX = 0.05
 # Beyond the border of a board all squares are alike; at a corner of the board the fourth square
@@ -204,7 +202,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
     A grain in one square hardly shows in the sum of the squared residuals of a noisy image, but
     shifts the corner by many standard deviations.
     """
-    usual = max(pooled, float(np.median(fit.imbalance[good])) / IMBALANCE_MEDIAN)
+    usual = max(pooled, float(np.median(fit.imbalance[good])) / MEDIAN_CHI2_2)
     uneven = (fit.imbalance > IMBALANCE_MAX * usual) & (fit.unlike > UNLIKE_MAX)
     pull = np.abs(fit.blur_pull)
     # The median of the absolute value is 0.675 standard deviations.

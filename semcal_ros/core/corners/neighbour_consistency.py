@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, Mask
 from semcal_ros.core.corners.checks import CORNERS_MIN, FittedCorners, inflate_variance
 from semcal_ros.core.corners.local_map import SUPPORT_MIN, fit_local_maps
 from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
@@ -22,8 +22,6 @@ MAP_ERROR_RATIO = 4.0
 # A trend of this degree follows smooth distortions and perspectives to a few hundredths of a pixel.
 # Twice as many corners as terms keep single corners from bending it.
 TREND_DEGREE = 5
-# Median of the squared length of a normal vector in the plane, 2 ln 2, in variances per axis.
-MEDIAN_SQUARE = 1.386
 
 
 def find_consistent(fitted: FittedCorners) -> Mask:
@@ -68,7 +66,7 @@ def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Ar
     An uneven board is uneven everywhere; a distortion is too strong for the maps only in a part of
     the image.
     """
-    excess = max(float(np.median(squared[good])) / MEDIAN_SQUARE - 1.0, 0.0)
+    excess = max(float(np.median(squared[good])) / MEDIAN_CHI2_2 - 1.0, 0.0)
     variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
     seen = np.sqrt(excess * float(np.median(variance[good])))
     spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)

@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
-from semcal_ros.core.arrays import Array, Indices, invert_scaled
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS
 from semcal_ros.core.errors import InvalidValueError
@@ -67,7 +67,6 @@ _SCALE_FLOOR = 0.03
 _COMMON_SCALE_FLOOR = 0.04
 # Normalised residuals of two components beyond this weigh less (1 in 20 good ones).
 _HUBER = 2.45
-_MEDIAN_CHI2 = 2.0 * float(np.log(2.0))
 _MAX_ITERATIONS = 50
 # The weights have converged when T changes by less than this part of its sigma.
 _CONVERGED_SIGMAS = 1e-3
@@ -270,7 +269,7 @@ def _fit_robustly(observed: _Observations, shear_of_shift: float, interval_s: fl
         limited_s = float(np.clip(time_s, 0.0, interval_s))
         solution = _solve(observed, design, groups, limited_s, trust, shear_of_shift)
         before, time_s = time_s, float(solution.mean[0])
-        chi2 = float(np.median(solution.squares)) / _MEDIAN_CHI2
+        chi2 = float(np.median(solution.squares)) / MEDIAN_CHI2_2
         sigma = float(np.sqrt(solution.covariance[0, 0]))
         normal = np.sqrt(solution.squares / max(chi2, 1.0))
         trust = np.minimum(1.0, _HUBER / np.maximum(normal, 1e-9))
