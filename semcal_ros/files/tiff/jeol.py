@@ -18,7 +18,12 @@ from semcal_ros.files.tiff.values import (
 __all__ = ["USUAL_DISPLAY_WIDTH_M", "jeol_pairs", "jeol_settings"]
 
 USUAL_DISPLAY_WIDTH_M = 0.128
-"""Width of the photograph (5 x 4 inch film) to which JEOL's magnification usually refers."""
+"""Width of the photograph to which JEOL's magnification usually refers.
+
+JEOL states magnifications for a photograph of 128 mm x 96 mm, which is 0.1 mm per pixel of the usual
+1280 x 960 image. It is not the width of 5 x 4 inch film, 127 mm, which is 0.8 % less. A micron bar
+in the file decides where it contradicts.
+"""
 
 _MAX_SIDECAR_BYTES = 1_000_000  # the text files have a few kB
 
