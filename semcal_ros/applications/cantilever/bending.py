@@ -46,8 +46,10 @@ _TINY = 1e-30
 _TUKEY = 4.685
 # Rounds of reweighting. It settles long before that, and a linear fit costs little.
 _ROUNDS = 12
-# Least number of edges in a fit: it has four unknowns, and two more show the scatter.
-_LEAST = 6
+# Unknowns of a fit with a free shape: r0, r1, and the factors of u^2 and u^3.
+_TERMS = 4
+# Least number of edges in a fit: two more than unknowns show the scatter.
+_LEAST = _TERMS + 2
 
 
 @dataclass(frozen=True)
@@ -173,9 +175,10 @@ def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count
         return 1.0
     own = reference_count / (reference_count + 1.0)
     ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / own
-    # The fits have absorbed what their terms explain.
+    # The fits with a free shape have taken what their four terms explain out of the residuals. With
+    # narrow priors on r0 and r1 it is less, so the excess may come out a little too large.
     number = float(usable.sum())
-    return float(max(ratio * number / max(number - 4.0, 1.0), 1.0))
+    return float(max(ratio * number / max(number - _TERMS, 1.0), 1.0))
 
 
 def evaluate_bending(terms: Array, u: Array) -> Array:
