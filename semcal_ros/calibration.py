@@ -115,8 +115,8 @@ class Calibration(CalibrationModel):
         """
         # An array without dimensions is a number that claims to be iterable.
         if isinstance(magnification, Iterable) and getattr(magnification, "ndim", 1) > 0:
-            return tuple(super(Calibration, self).at(float(g)) for g in magnification)
-        return super().at(float(cast("float", magnification)))
+            return tuple(super(Calibration, self).at(g) for g in magnification)
+        return super().at(cast("float", magnification))
 
     def rectify(
         self, image: AnyImage, magnification: float, *, interpolation: str = "linear"

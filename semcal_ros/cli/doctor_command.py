@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
+from semcal_ros.bridge.names import absolute_namespace
 from semcal_ros.cli.options import config_option
 from semcal_ros.cli.output import echo_json
-from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import Finding, Severity
 
@@ -46,7 +46,7 @@ def command(
     Example:
       semcal doctor --config jsm820 --calibration cal.yaml --seconds 10
     """
-    found = diagnose(config, calibration, _full(namespace), seconds)
+    found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_counts(found)})
     else:
@@ -55,15 +55,6 @@ def command(
         click.echo(", ".join(f"{count} {name}" for name, count in _counts(found).items()))
     if any(finding.level is Severity.PROBLEM for finding in found):
         sys.exit(1)
-
-
-def _full(namespace: str) -> str:
-    parts = namespace.strip("/").split("/")
-    if not all(part.isidentifier() for part in parts):
-        raise InvalidValueError(
-            f"namespace {namespace!r}", expected="a ROS namespace such as /sem", do="correct it"
-        )
-    return "/" + "/".join(parts)
 
 
 def _counts(found: list[Finding]) -> dict[str, int]:

@@ -19,7 +19,7 @@ from semcal_ros.cli.options import (
     recording_options,
 )
 from semcal_ros.cli.output import echo_notes, echo_paths, echo_table, show_progress
-from semcal_ros.files.video import VIDEO_CODECS
+from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.measure_cantilever import CantileverMeasurement, measure_cantilever
 
 __all__ = ["command"]
@@ -73,7 +73,7 @@ def command() -> None:
 @click.option("--plot", type=PATH, help="Deflection of each pose: png, svg, pdf.")
 @click.option("--strip", type=PATH, help="Annotated frames: png, svg or pdf.")
 @click.option("--video", type=PATH, help="Annotated frames: .mp4 or .avi.")
-@click.option("--fps", type=click.FloatRange(0.1, 240.0), default=4.0, show_default=True)
+@click.option("--fps", type=click.FloatRange(*FPS_RANGE), default=4.0, show_default=True)
 @click.option(
     "--poses",
     type=click.IntRange(1),

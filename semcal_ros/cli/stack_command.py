@@ -25,7 +25,7 @@ from semcal_ros.cli.output import (
     show_progress,
 )
 from semcal_ros.files.grey_images import GREY_SUFFIXES, TIFF_SUFFIXES
-from semcal_ros.files.video import VIDEO_CODECS
+from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.stack import StackResult, stack
 
 __all__ = ["command"]
@@ -39,7 +39,7 @@ __all__ = ["command"]
 @click.option("--video", type=PATH, help="Stabilised video: .mp4 or .avi.")
 @click.option(
     "--fps",
-    type=click.FloatRange(0.1, 240.0),
+    type=click.FloatRange(*FPS_RANGE),
     default=10.0,
     show_default=True,
     help="Of the video.",

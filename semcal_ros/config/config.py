@@ -8,9 +8,9 @@ checks a file against them, and the ``description`` of a field is what an error 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -51,7 +51,6 @@ StampMoment = Literal["start", "centre", "end"]
 
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 _MAX_SEEN = 80  # characters of a wrong value in an error, which is one line
-_DO = "compare with msg_configs/generic.yaml"
 
 
 def _whole(value: Any) -> Any:
@@ -90,6 +89,25 @@ _FILE = ConfigDict(extra="forbid")
 _TOPIC = "a ROS topic name such as image_raw"
 
 
+Declared = TypeVar("Declared")
+
+
+def _refuse_in_one_line(declared: type[Declared]) -> type[Declared]:
+    """Let the constructor raise :class:`ConfigError`, as for a file, instead of pydantic's error."""
+    validate = declared.__init__
+
+    @wraps(validate)
+    def construct(self: Declared, *args: Any, **kwargs: Any) -> None:
+        try:
+            validate(self, *args, **kwargs)
+        except ValidationError as error:
+            raise _explain(error, declared) from error
+
+    declared.__init__ = construct  # type: ignore[assignment,method-assign]
+    return declared
+
+
+@_refuse_in_one_line
 @dataclass(frozen=True, config=_FILE)
 class ImageConfig:
     """The image stream.
@@ -119,6 +137,7 @@ class ImageConfig:
     )
 
 
+@_refuse_in_one_line
 @dataclass(frozen=True, config=_FILE)
 class MagnificationConfig:
     """The topic that says how large the field of view is.
@@ -152,7 +171,7 @@ class MagnificationConfig:
         default="1", description="1 for a magnification; m, mm, um, nm or pm for a length"
     )
     display_width_m: _DisplayWidth | None = Field(
-        default=None, description="a positive display width in m"
+        default=None, description="a display width in m, above 0 and at most 100"
     )
     image_width_px: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] | None = Field(
         default=None, description="a positive number of pixels"
@@ -186,6 +205,7 @@ def _scan_timing(value: Any) -> ScanTiming:
     return ScanTiming(keys.frame_time_s, keys.averages, keys.flyback_fraction)
 
 
+@_refuse_in_one_line
 @dataclass(frozen=True, config=_FILE)
 class MicroscopeConfig:
     """One microscope.
@@ -211,7 +231,7 @@ class MicroscopeConfig:
         description="a name of at most 100 characters"
     )
     display_width_m: _DisplayWidth = Field(
-        description="a positive display width in m, such as 0.12"
+        description="a display width in m, above 0 and at most 100, such as 0.12"
     )
     image: ImageConfig = Field(default=ImageConfig(), description="a mapping of image settings")
     magnification: MagnificationConfig = Field(
@@ -223,7 +243,8 @@ class MicroscopeConfig:
     squares_m: Annotated[
         tuple[_SquareSize, ...], Field(min_length=1), AfterValidator(_largest_first)
     ] = Field(
-        default=(25e-6, 10e-6, 5e-6, 2e-6, 1e-6), description="a list of positive square sizes in m"
+        default=(25e-6, 10e-6, 5e-6, 2e-6, 1e-6),
+        description="a list of square sizes in m, each above 0 and at most 1, such as [10.0e-6]",
     )
     frame_id: _Frame = Field(default="sem_optical", description="a frame name such as sem_optical")
 
@@ -251,6 +272,8 @@ _REQUIRED = {"": "magnification", "magnification": "quantity"}
 _UNKNOWN = ("unexpected_keyword_argument", "invalid_key")
 
 Location = tuple[str | int, ...]
+#: What is wrong at which key: pydantic's type of error, and the value.
+Problems = dict[Location, tuple[str, Any]]
 
 
 @lru_cache(maxsize=1)
@@ -288,20 +311,36 @@ def parse_config(text: str, *, source: str = "configuration") -> MicroscopeConfi
     ``source`` is named in the errors, which are those of :func:`load_config`.
     """
     values = load_yaml(text, source)
-    found = {}
+    found: Problems = {}
     try:
         config = _checker().validate_python(values)
     except ValidationError as error:
-        for problem in error.errors(include_url=False, include_context=False):
-            found[problem["loc"]] = (problem["type"], problem["input"])
+        found = _problems(error)
     for location, kind in _omissions(values):
         found.setdefault(location, (kind, None))
     if found:
-        # A misspelt key causes a missing one as well: name the misspelt one.
-        first = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _path(at)))
-        raise _refusal(source, first, *found[first])
+        raise _refusal(source, found, MicroscopeConfig, do="compare with msg_configs/generic.yaml")
     _check_magnification(values["magnification"], config.magnification, source)
     return config
+
+
+def _problems(error: ValidationError) -> Problems:
+    return {
+        problem["loc"]: (problem["type"], problem["input"])
+        for problem in error.errors(include_url=False, include_context=False)
+    }
+
+
+def _explain(error: ValidationError, declared: type[Any]) -> ConfigError:
+    """The error for a constructor, whose arguments may be given by their place."""
+    names = list(declared.__pydantic_fields__)
+    found = {
+        (names[at[0]], *at[1:])
+        if at and isinstance(at[0], int) and at[0] < len(names)
+        else at: problem
+        for at, problem in _problems(error).items()
+    }
+    return _refusal(declared.__name__, found, declared)
 
 
 def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
@@ -318,22 +357,25 @@ def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
         yield from (((*above, key), "none") for key, value in mapping.items() if value is None)
 
 
-def _refusal(source: str, location: Location, kind: str, value: Any) -> ConfigError:
+def _refusal(source: str, found: Problems, declared: type[Any], do: str = "") -> ConfigError:
     """What is wrong with the value of one key, in one line."""
+    # A misspelt key causes a missing one as well: name the misspelt one.
+    location = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _path(at)))
+    kind, value = found[location]
     nested = len(location) > 1 and location[0] in _MAPPINGS
-    mapping: Any = _MAPPINGS[str(location[0])] if nested else MicroscopeConfig
+    mapping: Any = _MAPPINGS[str(location[0])] if nested else declared
     fields = mapping.__pydantic_fields__
     path = _path(location)
     if kind in _UNKNOWN:
         return ConfigError(
-            f"{source}: unknown key {_cut(path)}", expected="one of " + ", ".join(fields), do=_DO
+            f"{source}: unknown key {_cut(path)}", expected="one of " + ", ".join(fields), do=do
         )
     key = location[1 if nested else 0] if location else ""
     expected = fields[key].description if location else "a mapping of settings"
     if kind == "missing":
-        return ConfigError(f"{source}: key {path} is missing", expected=expected, do=_DO)
+        return ConfigError(f"{source}: key {path} is missing", expected=expected, do=do)
     where = f"key {path}" if path else "the whole file"
-    return ConfigError(f"{source}: {where} is {_shown(value)}", expected=expected, do=_DO)
+    return ConfigError(f"{source}: {where} is {_shown(value)}", expected=expected, do=do)
 
 
 def _path(location: Location) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +28,7 @@ __all__ = [
     "Indices",
     "Mask",
     "check_image",
+    "check_positive",
     "equilibrate",
     "invert_scaled",
     "mad_sigma",
@@ -51,6 +53,8 @@ MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 
 # Standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
 _SIGMAS_PER_MAD = 1.4826
+# Characters of a wrong value in an error, which is one line.
+_MAX_SHOWN = 80
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -181,3 +185,30 @@ def check_image(
         expected=f"{shapes} of {'integers or floats' if types is None else ', '.join(types)}{size}",
         do=do,
     )
+
+
+def check_positive(value: Any, name: str, unit: str = "") -> float:
+    """The value as a float, if it is a finite number greater than 0.
+
+    Parameters
+    ----------
+    value
+        A number of any type, but no text.
+    name, unit
+        Its name and unit, for the error.
+
+    Raises
+    ------
+    InvalidValueError
+        For anything else.
+    """
+    try:
+        number = math.nan if isinstance(value, (str, bytes)) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        seen = str(value)[:_MAX_SHOWN]
+        raise InvalidValueError(
+            f"{name} {seen}{unit and ' '}{unit}", expected="a finite number greater than 0"
+        )
+    return number

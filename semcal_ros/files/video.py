@@ -16,9 +16,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.errors import BagError, InvalidValueError
 
-__all__ = ["VIDEO_CODECS", "VideoCodec", "VideoWriter", "open_video"]
+__all__ = ["FPS_RANGE", "VIDEO_CODECS", "VideoCodec", "VideoWriter", "check_video", "open_video"]
+
+#: Frames per second that can be asked for: a frame in ten seconds, and the fastest common displays.
+FPS_RANGE = (0.1, 240.0)
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,23 @@ VIDEO_CODECS: Mapping[str, VideoCodec] = MappingProxyType(
 )
 
 
+def check_video(path: Path, fps: float) -> None:
+    """Refuse a video that :class:`VideoWriter` cannot write, before any work is done for it.
+
+    Raises
+    ------
+    InvalidValueError
+        If the suffix is not one of :data:`VIDEO_CODECS`, or ``fps`` is no rate of a video.
+    """
+    if path.suffix.lower() not in VIDEO_CODECS:
+        raise InvalidValueError(
+            f"video {path}", expected="a name that ends in " + " or ".join(VIDEO_CODECS)
+        )
+    low, high = FPS_RANGE
+    if not low <= check_positive(fps, "fps") <= high:
+        raise InvalidValueError(f"fps {fps}", expected=f"{low:g} to {high:g}")
+
+
 class VideoWriter:
     """A video that is being written.
 
@@ -79,7 +100,7 @@ class VideoWriter:
     Raises
     ------
     InvalidValueError
-        If FFmpeg has no encoder for it.
+        As :func:`check_video`, or if FFmpeg has no encoder for it.
     """
 
     def __init__(
@@ -89,6 +110,7 @@ class VideoWriter:
         # Colour is stored for blocks of 2 x 2 px, so that both numbers must be even.
         even = size[0] + size[0] % 2, size[1] + size[1] % 2
         self._border = even[0] - size[0], even[1] - size[1]
+        check_video(path, fps)
         codec = VIDEO_CODECS[path.suffix.lower()]
         if codec.encoder not in av.codecs_available:
             raise InvalidValueError(

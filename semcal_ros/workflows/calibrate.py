@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.calibration import Calibration
+from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
     CalibrationResult,
@@ -26,6 +27,7 @@ from semcal_ros.workflows.inputs import (
     ConfigSource,
     OnProgress,
     Source,
+    check_positives,
     count_frames,
     ignore_progress,
     open_source,
@@ -145,9 +147,9 @@ def calibrate_recording(
     """
     chosen = resolve_config(config)
     if display_width_m is not None:
-        chosen = replace(chosen, display_width_m=float(display_width_m))
+        chosen = replace(chosen, display_width_m=check_positive(display_width_m, "display_width_m"))
     if squares_m is not None:
-        chosen = replace(chosen, squares_m=tuple(float(s) for s in squares_m))
+        chosen = replace(chosen, squares_m=check_positives(squares_m, "squares_m"))
     with open_source(source, chosen, magnification=magnification) as recording:
         advance = count_frames(on_progress, "finding corners", recording.frame_count)
         found, rejected = find_views(named_frames(recording), on_progress=advance)
@@ -217,7 +219,10 @@ def calibrate(
         squares_m=squares_m,
         magnification=magnification,
         options=CalibrationOptions(
-            method, options or MethodOptions(), tuple(breakpoints), residual
+            method,
+            options or MethodOptions(),
+            check_positives(breakpoints, "breakpoints"),
+            residual,
         ),
         on_progress=on_progress,
     ).calibration

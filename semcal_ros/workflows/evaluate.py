@@ -17,7 +17,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
     open_source,
-    resolve_calibration,
+    require_calibration,
     resolve_config,
 )
 
@@ -95,7 +95,7 @@ def evaluate(
     SemcalError
         If calibration, configuration or recording cannot be read, or no view can be used.
     """
-    model = resolve_calibration(calibration)
+    model = require_calibration(calibration)
     microscope = resolve_config(config, model)
     with open_source(source, microscope, magnification=magnification) as opened:
         advance = count_frames(on_progress, "finding corners", opened.frame_count)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
+from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -23,9 +24,11 @@ __all__ = [
     "ConfigSource",
     "OnProgress",
     "Source",
+    "check_positives",
     "count_frames",
     "ignore_progress",
     "open_source",
+    "require_calibration",
     "resolve_calibration",
     "resolve_config",
 ]
@@ -49,6 +52,19 @@ _ENCODINGS: dict[tuple[Any, ...], str] = {
     ("uint8", 3): "bgr8",
 }
 _GREY_TYPES = ("uint8", "uint16", "float32")
+
+
+def check_positives(values: Iterable[float], name: str) -> tuple[float, ...]:
+    """Return numbers as floats.
+
+    Raises
+    ------
+    InvalidValueError
+        If one is not finite and positive, or there is no list of them.
+    """
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InvalidValueError(f"{name} {values}", expected="a list of numbers")
+    return tuple(check_positive(value, f"{name}:") for value in values)
 
 
 def ignore_progress(_stage: str, _done: int, _total: int | None) -> None:
@@ -83,10 +99,22 @@ def resolve_calibration(calibration: CalibrationSource | None) -> Calibration | 
     ------
     CalibrationFileError
         If it cannot be read.
+    InvalidValueError
+        If it is neither a calibration nor a path.
     """
-    if calibration is None or isinstance(calibration, Calibration):
+    return None if calibration is None else require_calibration(calibration)
+
+
+def require_calibration(calibration: CalibrationSource) -> Calibration:
+    """Return the calibration itself; raises as :func:`resolve_calibration`, for None too."""
+    if isinstance(calibration, Calibration):
         return calibration
-    return Calibration.load(calibration)
+    if isinstance(calibration, (str, os.PathLike)):
+        return Calibration.load(calibration)
+    raise InvalidValueError(
+        f"a calibration of type {type(calibration).__name__}",
+        expected="a Calibration, or the path of its file",
+    )
 
 
 def resolve_config(
@@ -110,12 +138,17 @@ def resolve_config(
     ConfigError
         If it cannot be read.
     InvalidValueError
-        If the time is not finite and positive.
+        If the time is not finite and positive, or ``config`` is of another type.
     """
     if isinstance(config, MicroscopeConfig):
         chosen = config
-    else:
+    elif config is None or isinstance(config, (str, os.PathLike)):
         chosen = load_config("generic" if config is None else os.fspath(config))
+    else:
+        raise InvalidValueError(
+            f"a configuration of type {type(config).__name__}",
+            expected="a MicroscopeConfig, or the name or path of a configuration",
+        )
     if calibration is not None:
         chosen = replace(chosen, display_width_m=calibration.display_width_m)
     if frame_time_s is None:
@@ -154,6 +187,11 @@ def open_source(
         raise InvalidValueError(
             "a magnification stated for images in memory", expected="one beside each image"
         )
+    if not isinstance(source, Iterable):
+        raise InvalidValueError(
+            f"a source of type {type(source).__name__}",
+            expected="a path, or (image, magnification) tuples",
+        )
     return _ImagesInMemory(source, config)
 
 
@@ -180,7 +218,14 @@ def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig
             f"image {index} without a magnification",
             expected="(image, magnification) or (image, magnification, time_s)",
         )
-    image: NDArray[Any] = np.asarray(entry[0])
+    try:
+        image: NDArray[Any] = np.asarray(entry[0])
+        # Files without times are also read as if they were a second apart.
+        time_s = float(entry[2]) if len(entry) == 3 else index + 1.0
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(
+            f"image {index}: {error}", expected="an array of grey levels, and a time in s"
+        ) from error
     if image.ndim == 2 and image.dtype.kind in "iuf" and image.dtype.name not in _GREY_TYPES:
         image = image.astype(np.float32)
     encoding = _ENCODINGS.get((image.dtype.name, *image.shape[2:]))
@@ -189,8 +234,6 @@ def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig
             f"image {index} of shape {image.shape} and type {image.dtype}",
             expected="(h, w) grey levels, or (h, w, 3) of uint8",
         )
-    # Files without times are also read as if they were a second apart.
-    time_s = float(entry[2]) if len(entry) == 3 else index + 1.0
     if not np.isfinite(time_s):
         raise InvalidValueError(f"image {index} at {time_s} s", expected="a finite time")
     stamp_ns = round(1e9 * time_s)

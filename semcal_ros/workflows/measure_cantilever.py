@@ -35,7 +35,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
     open_source,
-    resolve_calibration,
+    require_calibration,
     resolve_config,
 )
 
@@ -201,7 +201,7 @@ def measure_cantilever(
         bending.repeatability.deflection_m          # (magnifications, poses)
         bending.save_csv("bending.csv")
     """
-    model = resolve_calibration(calibration)
+    model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
     runs, notes = _read(_sources(source), model, microscope, magnification)
     ends = _ends(bases, tips, len(runs))
@@ -260,6 +260,8 @@ def _sources(source: Source | Sequence[str | os.PathLike[str]]) -> list[Source]:
     """Recordings, each on its own; images in memory are one."""
     if isinstance(source, (str, os.PathLike)):
         return [source]
+    if not isinstance(source, Iterable):
+        return [source]
     entries = list(source)
     paths = [entry for entry in entries if isinstance(entry, (str, os.PathLike))]
     if paths and len(paths) == len(entries):
@@ -309,6 +311,10 @@ def _ends(
     bases: Sequence[Pixel], tips: Sequence[Pixel], count: int
 ) -> list[tuple[Pixel | None, Pixel | None]]:
     """Base and tip for each of ``count`` magnifications."""
+    for pixel in (*bases, *tips):
+        position = np.asarray(pixel)
+        if position.shape != (2,) or position.dtype.kind not in "iuf":
+            raise InvalidValueError(f"base or tip {pixel}", expected="two numbers, x and y in px")
     if len(bases) != len(tips) or len(bases) not in (0, 1, count):
         raise InvalidValueError(
             f"{len(bases)} bases and {len(tips)} tips for {count} magnifications",

@@ -20,6 +20,7 @@ from semcal_ros.applications.reconstruction import (
 from semcal_ros.applications.reconstruction import reconstruct as reconstruct_structure
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
+from semcal_ros.core.arrays import check_positive
 from semcal_ros.files.meshes import UNITS_PER_M, save_cloud, save_mesh
 from semcal_ros.files.recordings import Recording
 from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
@@ -31,7 +32,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
     open_source,
-    resolve_calibration,
+    require_calibration,
     resolve_config,
 )
 
@@ -170,9 +171,12 @@ def reconstruct(
         found.ball.diameter_m, found.ball.interval_m
         found.save_mesh("ball.ply")
     """
-    model = resolve_calibration(calibration)
+    model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
     tracker = SequenceTracker(TrackerSettings(spacing_px=spacing_px))
+    check_positive(keyframes, "keyframes =")
+    if height_sigma_m != 0.0:
+        check_positive(height_sigma_m, "height_sigma_m =")
     with open_source(source, microscope) as opened:
         outside = _track(opened, model, tracker, on_progress)
         notes = list(opened.notes)

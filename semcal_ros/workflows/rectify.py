@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from semcal_ros.bridge.names import absolute_namespace
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
@@ -32,7 +33,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
     open_source,
-    resolve_calibration,
+    require_calibration,
     resolve_config,
 )
 
@@ -148,10 +149,11 @@ def rectify(
         rectify("recordings/zoom", "zoom_rect", calibration="jsm820.yaml")
         flat = rectify("recordings/zoom", calibration="jsm820.yaml").images
     """
-    model = resolve_calibration(calibration)
+    model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
     follower = DriftFollower(hindsight=microscope.scan is None) if drift else None
     rectifier = Rectifier(interpolation)
+    topics = absolute_namespace(namespace)
     target = None if output is None else Path(output)
     frames: list[RectifiedFrame] = []
     states: Counter[str] = Counter()
@@ -161,7 +163,7 @@ def rectify(
         bag = None
         if target is not None:
             writer = open_files.enter_context(BagWriter(target, overwrite=overwrite))
-            bag = CorrectedBagWriter(writer, namespace.rstrip("/"), model.dumps())
+            bag = CorrectedBagWriter(writer, topics, model.dumps())
         advance = count_frames(on_progress, "rectifying", opened.frame_count)
         for frame in opened.frames():
             first_ns = frame.stamp_ns if first_ns is None else first_ns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ import numpy as np
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.arrays import Mask
+from semcal_ros.core.arrays import Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.stack import Stack, StackedImage
-from semcal_ros.files.grey_images import TIFF_SUFFIXES, write_grey_image
+from semcal_ros.files.grey_images import GREY_SUFFIXES, TIFF_SUFFIXES, write_grey_image
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.files.video import VideoWriter, open_video
+from semcal_ros.files.video import VideoWriter, check_video, open_video
 from semcal_ros.workflows.follow_drift import camera_for
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -173,6 +173,12 @@ def stack(
     model = resolve_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
     film_path = None if video is None else Path(video)
+    if film_path is not None:
+        check_video(film_path, fps)
+    if at is not None:
+        at = check_positive(at, "at =")
+    _check_suffix(output, GREY_SUFFIXES)
+    _check_suffix(sigma, TIFF_SUFFIXES)
     with open_source(source, microscope, magnification=magnification) as opened:
         selection = select_frames(
             opened,
@@ -209,6 +215,13 @@ def stack(
     if output is not None:
         result.save(output)
     return result
+
+
+def _check_suffix(output: str | os.PathLike[str] | None, suffixes: Sequence[str]) -> None:
+    if output is not None and Path(output).suffix.lower() not in suffixes:
+        raise InvalidValueError(
+            f"output {os.fspath(output)}", expected="a name that ends in " + ", ".join(suffixes)
+        )
 
 
 def _check_output(output: str | os.PathLike[str] | None, frame: RecordedFrame) -> None:

@@ -17,6 +17,7 @@ from semcal_ros.config.config import (
     IMAGE_TYPES,
     ImageConfig,
     MagnificationConfig,
+    MicroscopeConfig,
     config_names,
     config_schema,
     load_config,
@@ -340,3 +341,28 @@ def test_ament_prefix_and_working_directory(
     monkeypatch.chdir(tmp_path)
     assert load_config("generic.yaml").name == "test"
     assert load_config("generic").name == "generic"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"display_width_m": -1}, "display_width_m is -1; expected a display width in m"),
+        ({"name": ""}, "name is ''"),
+        ({"squares_m": ()}, "squares_m is"),
+        ({"scan": {"frame_time_s": 0.0}}, "scan.frame_time_s is 0.0"),
+        ({"image": {"topic": ""}}, "image.topic is ''"),
+        ({"widht": 1}, "unknown key widht"),
+    ],
+)
+def test_constructors_refuse_like_files(arguments, reason):
+    with pytest.raises(ConfigError, match=f"MicroscopeConfig: .*{reason}"):
+        dataclasses.replace(load_config("generic"), **arguments)
+    with pytest.raises(ConfigError, match=f"MicroscopeConfig: .*{reason}"):
+        MicroscopeConfig(**{"name": "a", "display_width_m": 0.1, **arguments})
+
+
+def test_arguments_given_by_place_are_named():
+    with pytest.raises(ConfigError, match="MicroscopeConfig: key display_width_m is 0"):
+        MicroscopeConfig("a", 0)
+    with pytest.raises(ConfigError, match="ImageConfig: key databar_rows is -1"):
+        ImageConfig(databar_rows=-1)

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 import semcal_ros
-from semcal_ros import measure_cantilever, rectify, stack, track_drift
+from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stack, track_drift
 from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import open_recording
@@ -188,11 +188,65 @@ def test_the_pixel_size_is_that_of_the_calibration(frames, tmp_path):
         ((np.zeros((4, 4, 3), np.uint16), 1.0), "uint16"),
         ((np.zeros((0, 4), np.uint8), 1.0), "shape"),
         ((texture(), 1.0, float("nan")), "finite time"),
+        ((texture(), 1.0, "noon"), "time in s"),
+        ((texture(), "high"), "magnification high"),
+        (([[1, 2], [3]], 1.0), "array of grey levels"),
     ],
 )
 def test_images_that_cannot_be_used_are_named(entry, reason):
     with pytest.raises(InvalidValueError, match=reason):
         track_drift([entry])
+
+
+@pytest.mark.parametrize(
+    ("workflow", "arguments", "reason"),
+    [
+        (calibrate, {"display_width_m": -1}, "display_width_m -1"),
+        (calibrate, {"display_width_m": "wide"}, "display_width_m wide"),
+        (calibrate, {"display_width_m": 120.0}, "at most 100"),
+        (calibrate, {"squares_m": []}, "squares_m"),
+        (calibrate, {"squares_m": 5e-6}, "squares_m"),
+        (calibrate, {"squares_m": [5e-6, float("nan")]}, "squares_m"),
+        (calibrate, {"breakpoints": 500.0}, "breakpoints"),
+        (calibrate, {"method": "best"}, "method"),
+        (calibrate, {"config": 3}, "configuration of type int"),
+        (track_drift, {"frame_time_s": "1"}, "frame time 1 s"),
+        (track_drift, {"calibration": 3}, "calibration of type int"),
+        (stack, {"at": "all"}, "at = all"),
+        (stack, {"video": "film.mkv"}, "mp4 or .avi"),
+        (stack, {"video": "film.avi", "fps": 1e9}, "0.1 to 240"),
+        (stack, {"output": "mean.jpg"}, "mean.jpg"),
+        (stack, {"sigma": "sigma.png"}, "sigma.png"),
+        (rectify, {"calibration": None}, "calibration of type NoneType"),
+        (rectify, {"calibration": make_calibration(), "namespace": "my sem"}, "namespace"),
+        (rectify, {"calibration": make_calibration(), "interpolation": "no"}, "interpolation"),
+        (measure_cantilever, {"calibration": make_calibration(), "length_m": None}, "length_m"),
+        (
+            measure_cantilever,
+            {"calibration": make_calibration(), "length_m": 35e-6, "poses": 1.5},
+            "1.5 poses",
+        ),
+        (
+            measure_cantilever,
+            {"calibration": make_calibration(), "length_m": 35e-6, "bases": [1], "tips": [2]},
+            "x and y",
+        ),
+        (reconstruct, {"calibration": make_calibration(), "spacing_px": -1.0}, "spacing_px"),
+        (reconstruct, {"calibration": make_calibration(), "keyframes": 0}, "keyframes"),
+        (reconstruct, {"calibration": make_calibration(), "height_sigma_m": -1}, "height_sigma_m"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(workflow, arguments, reason):
+    with pytest.raises(semcal_ros.SemcalError, match=reason) as refused:
+        workflow([(texture(), 1000.0), (texture(), 1000.0)], **arguments)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("workflow", [calibrate, stack, track_drift])
+@pytest.mark.parametrize("source", [None, 5])
+def test_a_source_that_is_none_is_refused(workflow, source):
+    with pytest.raises(InvalidValueError, match="source of type"):
+        workflow(source)
 
 
 def test_grey_levels_of_any_type_and_colours_are_taken():

@@ -58,7 +58,7 @@ def group_frames(frames: int, poses: int | None) -> list[list[int]]:
         If the frames cannot be divided equally.
     """
     count = frames if poses is None else poses
-    if count < 1 or frames % count:
+    if not isinstance(count, (int, np.integer)) or count < 1 or frames % count:
         raise InvalidValueError(
             f"{frames} frames for {count} poses",
             expected="the same number of frames in each pose",

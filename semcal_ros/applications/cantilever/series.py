@@ -27,7 +27,7 @@ from semcal_ros.applications.cantilever.undeformed import (
     UndeformedBeam,
     measure_undeformed_beam,
 )
-from semcal_ros.core.arrays import AnyImage, Array, Indices
+from semcal_ros.core.arrays import AnyImage, Array, Indices, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
@@ -79,9 +79,8 @@ class SeriesSettings:
 
     def __post_init__(self) -> None:
         for name in ("length_m", "largest_m"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise InvalidValueError(f"{name} = {value}", expected="a positive length")
+            if getattr(self, name) is not None or name == "length_m":
+                check_positive(getattr(self, name), name)
         parse_shape(self.shape)
 
     @property

@@ -21,7 +21,7 @@ from semcal_ros.applications.reconstruction.appearance import (
     prepare_appearance,
 )
 from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Indices, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
@@ -74,6 +74,9 @@ class TrackerSettings:
     smoothing_px: float = 1.8
     border_px: int = 14
     room_px: int = 48
+
+    def __post_init__(self) -> None:
+        check_positive(self.spacing_px, "spacing_px =")
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -31,12 +31,7 @@ def checked_magnification(magnification: float) -> float:
     InvalidValueError
         If it is not finite and positive.
     """
-    g = float(magnification)
-    if not (np.isfinite(g) and g > 0.0):
-        raise InvalidValueError(
-            f"magnification {magnification}", expected="a finite number greater than 0"
-        )
-    return g
+    return check_positive(magnification, "magnification")
 
 
 def design_matrix(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["ScanTiming"]
@@ -41,10 +41,7 @@ class ScanTiming:
     flyback_fraction: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.frame_time_s) and self.frame_time_s > 0):
-            raise InvalidValueError(
-                f"frame time {self.frame_time_s} s", expected="a positive number of seconds"
-            )
+        check_positive(self.frame_time_s, "frame time", "s")
         if self.averages < 1:
             raise InvalidValueError(f"{self.averages} averaged passes", expected="at least 1")
         if not 0 <= self.flyback_fraction < 1:

@@ -132,7 +132,7 @@ def test_the_end_recedes_as_the_beam_bends():
 
 
 def test_settings_are_checked():
-    with pytest.raises(InvalidValueError, match="positive length"):
+    with pytest.raises(InvalidValueError, match="finite number greater than 0"):
         SeriesSettings(0.0)
     with pytest.raises(InvalidValueError, match="one of free, beam, parabola"):
         SeriesSettings(LENGTH, "cubic")
