@@ -170,9 +170,10 @@ class CalibrationModel:
     def _extrapolation_covariance(self, g: float) -> Array:
         """Return a diagonal (10, 10) allowance for the unknown course of the functions.
 
-        Each parameter may leave its tangent by as much as it varied over the calibrated range, per
-        unit of log g relative to the range, squared with the distance so that it starts smoothly at
-        the edge.
+        The 1-sigma of a parameter is twice its variation over the calibrated range (highest minus
+        lowest value), times the distance from the range in log g over the length of the range in
+        log g. A range shorter than a factor of e counts as one of a factor of e. So the sigma grows
+        linearly from zero at the edge, and the variance with the square of the distance.
         """
         low, high = self.magnification_range
         edge = low if g < low else high

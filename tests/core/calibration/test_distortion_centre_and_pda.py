@@ -6,15 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from semcal_ros.core.calibration.discrete import DiscreteFit
 from semcal_ros.core.calibration.distortion_centre import find_distortion_centre
-from semcal_ros.core.calibration.pda import ode_weights
+from semcal_ros.core.calibration.pda import ode_weights, pda_functions
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic.grid_views import grid_views
 
 BARREL = ScanCamera(
     500.0, 2.1e6, 1.0, 0.0, 255.5, 255.5, 50.0, 0.01, 0.0, 290.0, 240.0, 256.0, 512, 512
 )
+
+# The centre does not use them.
+SIGMAS = np.full(20, 0.05)
 
 
 def test_radial_centre_is_the_common_epipole():
@@ -38,6 +44,40 @@ def test_the_papers_threshold_never_holds_with_real_noise():
     views = grid_views(lambda g: replace(BARREL, xi_r=0.0), [500.0], views=5, noise_px=0.02)
     assert not find_distortion_centre(views, tau_px=1e-3).degenerate
     assert find_distortion_centre(views, tau_px=0.1).degenerate
+
+
+def test_p_values_and_noise_are_true_of_small_boards():
+    """Few corners leave few degrees of freedom, and each that is counted wrongly shows."""
+    rng = np.random.default_rng(0)
+    board = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    exact = 60.0 * board @ [[1.0, 0.1], [-0.2, 0.9]] + 100.0
+    found = []
+    for _ in range(150):
+        views = [
+            GridView(500.0, 1e-5 * board, exact + rng.normal(scale=0.05, size=exact.shape), SIGMAS)
+            for _ in range(2)
+        ]
+        found.append(find_distortion_centre(views))
+    # Without distortion all p-values are equally frequent.
+    assert stats.kstest([f.p_value for f in found], "uniform").pvalue > 0.01
+    # 150 x 40 degrees of freedom tell a variance to 1.8 %.
+    variance = np.mean([f.noise_rms_px**2 for f in found])
+    assert variance == pytest.approx(2.0 * 0.05**2, rel=0.07)
+
+
+@pytest.mark.parametrize(("scatter", "allowed"), [(3.0, 3.0), (0.2, 1.0)])
+def test_a_curve_is_as_uncertain_as_its_scatter_and_at_least_as_stated(scatter, allowed):
+    """A constant through values with known scatter: its variance is that of their mean."""
+    count, sigma = 8, 0.01
+    # Alternating by so much that their variance with n - 1 is the square of the scatter.
+    values = scatter * sigma * np.sqrt((count - 1) / count) * (-1.0) ** np.arange(count)
+    g = np.geomspace(100.0, 10000.0, count)
+    fit = DiscreteFit(
+        g, np.tile(values[:, None], (1, 10)), np.tile(sigma**2 * np.eye(10), (count, 1, 1)), (), ()
+    )
+    _, covariance = pda_functions(fit, legendre_degree=0)
+    expected = (allowed * sigma) ** 2 / count
+    np.testing.assert_allclose(covariance, expected * np.eye(10), rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,21 @@ def test_known_excess_is_found(excess):
     residuals[:400] *= 30.0
     # The median of 4000 squares is known to 2 %, the outliers raise it by 20 %: 10 % of a sigma.
     assert estimate_excess_sigma_px([view], residuals, 6) == pytest.approx(excess, rel=0.13)
+
+
+def test_unknowns_that_take_up_half_of_the_scatter_are_allowed_for():
+    # An affine map fitted to a hexagon leaves half of the variance, the same at all six corners.
+    turn = np.arange(6) * np.pi / 3.0
+    design = np.stack([np.ones(6), np.cos(turn), np.sin(turn)], axis=1)
+    left = np.eye(6) - design @ np.linalg.pinv(design)
+    rng = np.random.default_rng(3)
+    views = [_view(6, rng) for _ in range(1000)]
+    noise = [rng.normal(size=(6, 2)) * np.hypot(0.05, 0.2) for _ in views]
+    views = [replace(v, sigma_px=np.full(6, 0.05)) for v in views]
+    residuals = np.concatenate([left @ n for n in noise])
+    found = estimate_excess_sigma_px(views, residuals, 6 * len(views))
+    # The median of 6000 squares, half of them independent, is known to 3 %: 1.5 % of a sigma.
+    assert found == pytest.approx(0.2, rel=0.05)
 
 
 def test_excess_is_added_to_every_corner():

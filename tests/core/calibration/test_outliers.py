@@ -8,7 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, BundleStatus
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.normal_equations import Problem, State
+from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
+from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.views import ViewStatus
 from tests.helpers.calibrations import calibrated, seen_views
 
@@ -60,3 +64,101 @@ def test_a_jump_of_the_scale_is_not_a_matter_of_single_views():
     result = calibrate_views(views, **OPTIONS)
     assert result.outliers == ()
     assert any("jump" in w for w in result.warnings)
+
+
+MAGNIFICATIONS = np.array([100.0, 300.0, 1000.0, 3000.0])
+SETUP = Setup((), MAGNIFICATIONS, (512, 512), 0.12, Priors(scale_jump=1e6))
+
+
+def _adjusted(group, residual_sigmas, *, heights_m=0.0, pull=0.0, weight=1.0):
+    """An adjustment of a constant scale only, written down and not computed.
+
+    Views of 10 corners, each off by that many sigmas; every magnification says with the weight
+    ``weight`` that the scale differs from the common one by ``pull``.
+    """
+    count, corners = len(group), 10
+    nominal = SETUP.nominal_px_per_m(MAGNIFICATIONS)
+    designs = np.zeros((4, 10, 1))
+    designs[:, 0, 0] = nominal
+    information, gradient = np.zeros((4, 10, 10)), np.zeros((4, 10))
+    information[:, 0, 0] = weight / nominal**2
+    gradient[:, 0] = weight * pull / nominal
+    miss = np.zeros((count * corners, 2))
+    miss[:, 0] = np.repeat(np.broadcast_to(residual_sigmas, count), corners)
+    translations = np.zeros((count, 3))
+    translations[:, 2] = heights_m
+    problem = Problem(
+        board_m=np.zeros((len(miss), 3)),
+        observed_px=np.zeros((len(miss), 2)),
+        whitening=np.tile([1.0, 0.0, 1.0], (len(miss), 1)),
+        starts=corners * np.arange(count + 1),
+        group=np.asarray(group),
+        designs=designs,
+        unit_m=np.ones(count),
+        norm_px=256.0,
+        prior_mean=np.zeros(1),
+        prior_sigma=np.full(1, np.inf),
+        height_sigma_m=np.ones(count),
+    )
+    result = BundleResult(
+        State(np.ones(1), np.tile(np.eye(3), (count, 1, 1)), translations),
+        miss,
+        np.ones(len(miss)),
+        0.0,
+        information,
+        gradient,
+        np.eye(1),
+        np.zeros(count),
+        1,
+        BundleStatus.SMALL_DECREASE,
+    )
+    return problem, result
+
+
+GROUP = np.repeat(np.arange(4), 6)
+# Degrees of freedom of the 24 views: 480 numbers, 6 for each pose and the scale.
+FREEDOM = 480 - 6 * 24 - 1
+
+
+@pytest.mark.parametrize(("residual", "factor"), [(0.1, 1.0), (1.0, 1.0), (3.0, 3.0)])
+def test_a_jump_counts_in_sigmas_that_are_never_smaller_than_stated(residual, factor):
+    """Two magnifications say -a and two +a, each to 0.001: the jump 2 a is known to 0.001."""
+    off = residual * np.sqrt(FREEDOM / 240.0)
+    for sigmas, found in ((2.5, False), (3.0, True)):
+        half = 0.5e-3 * sigmas * factor
+        pull = np.array([-half, -half, half, half])
+        jump = find_change_point(SETUP, *_adjusted(GROUP, off, pull=pull, weight=1e6))
+        # One of twenty recordings without a jump shows one of 2.7 sigmas somewhere.
+        assert (jump is not None) == found
+        if jump is not None:
+            assert (jump.below, jump.above) == (300.0, 1000.0)
+            assert jump.relative == pytest.approx(2.0 * half)
+            assert jump.sigma == pytest.approx(1e-3 * factor)
+
+
+@pytest.mark.parametrize(("height_m", "odd"), [(35e-6, False), (45e-6, True)])
+def test_heights_that_differ_by_micrometres_are_alike_however_small_the_spread(height_m, odd):
+    heights = np.zeros(24)
+    heights[9] = height_m
+    found = find_outliers(*_adjusted(GROUP, 1.0, heights_m=heights))
+    assert list(found) == ([9] if odd else [])
+
+
+@pytest.mark.parametrize(("times", "odd"), [(5.0, False), (7.0, True)])
+def test_a_view_that_fits_much_worse_than_the_others_is_an_outlier(times, odd):
+    residual = np.ones(24)
+    residual[17] = times
+    assert list(find_outliers(*_adjusted(GROUP, residual))) == ([17] if odd else [])
+
+
+def test_where_half_of_a_magnification_disagrees_no_single_view_is_at_fault():
+    residual = np.ones(24)
+    residual[:2] = 10.0
+    group = np.array([0] * 4 + [1] * 6 + [2] * 7 + [3] * 7)
+    assert not find_outliers(*_adjusted(group, residual))
+    group[3] = 1
+    residual[1] = 1.0
+    assert list(find_outliers(*_adjusted(group, residual))) == [0]
+    # Nor where many disagree in all.
+    residual[[5, 12, 20]] = 10.0
+    assert not find_outliers(*_adjusted(group, residual))

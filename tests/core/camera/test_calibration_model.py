@@ -1,12 +1,15 @@
-"""A calibration outside of its range."""
+"""A calibration outside of its range, and what camera and residual field have in common."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.residual_field import zero_field
 
 LOW, HIGH = 100.0, 10000.0
 
@@ -42,8 +45,47 @@ def test_out_of_range_a_parameter_may_leave_its_tangent_by_twice_its_variation(g
     assert sigma[1] == sigma[5] == 0.0
 
 
+def test_a_range_shorter_than_a_factor_of_e_counts_as_one_of_that_length() -> None:
+    functions = {
+        name: ContinuousFunction(
+            "chebyshev_log",
+            np.array([1.0, 0.01] if name == "scale" else [float(name == "aspect")]),
+            (900.0, 1100.0),
+        )
+        for name in FUNCTION_NAMES
+    }
+    model = CalibrationModel(
+        functions, np.zeros((11, 11)), 512, 512, 0.12, (900.0, 1000.0, 1100.0), "joint"
+    )
+    camera = model.at(1100.0 * np.exp(0.5))
+    sigma = np.sqrt(camera.covariance[0, 0]) / model.nominal_px_per_m(camera.magnification)
+    # Half of a factor of e away, with a variation of 0.02.
+    assert sigma == pytest.approx(2.0 * 0.02 * 0.5)
+
+
 def test_within_the_range_nothing_is_added() -> None:
     for g in (LOW, 777.0, HIGH):
         camera = _model().at(g)
         assert camera.in_range
         assert not np.any(camera.covariance)
+
+
+@pytest.mark.parametrize("g", [LOW, 777.0, HIGH])
+def test_a_shift_that_the_field_takes_back_leaves_no_uncertainty(g: float) -> None:
+    model = _model()
+    field = zero_field((512, 512), (LOW, HIGH), 3)
+    # The principal point and the whole field are uncertain by 0.8 px along x, always together: the
+    # one moves a projection forth, the other moves it back.
+    camera_part = np.zeros(len(model.covariance))
+    before_px = FUNCTION_NAMES.index("px")
+    camera_part[sum(model.functions[name].size for name in FUNCTION_NAMES[:before_px])] = 0.8
+    field_part = np.zeros_like(field.coefficients)
+    field_part[..., 0] = 0.8 / model.norm_px
+    both = np.concatenate([camera_part, field_part.ravel()])
+    points = np.array([[0.0, 0.0, 0.0], [2e-3 / g, -1e-3 / g, 0.0]])
+    together = replace(model, residual=field, covariance=np.outer(both, both)).at(g)
+    # Rounding: the root of 1e-16 of the variance.
+    np.testing.assert_allclose(together.project_sigma(points), 0.0, atol=1e-7)
+    both[: len(camera_part)] *= -1.0
+    apart = replace(model, residual=field, covariance=np.outer(both, both)).at(g)
+    np.testing.assert_allclose(apart.project_sigma(points), [[1.6, 0.0]] * 2, atol=1e-7)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration import register as register_module
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.fractional_delay import (
     FINE,
@@ -16,6 +17,7 @@ from semcal_ros.core.registration.fractional_delay import (
     gradients,
     sample_shifted,
 )
+from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.register import (
     Registration,
     RegistrationSettings,
@@ -296,6 +298,24 @@ def test_every_rejection_has_its_kind() -> None:
         rejection = register_pair(*pair).rejection
         assert rejection is not None
         assert rejection.status is failure
+
+
+@pytest.mark.parametrize(("off_px", "accepted"), [(1.7, True), (2.3, False)])
+def test_a_coarse_shift_that_the_fine_one_contradicts_is_refused(
+    off_px: float, accepted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where coarse and fine structure of a picture move apart: a sample and 1 px are allowed."""
+    reference, image = _pair((3.3, -2.1), 4.0)
+    # Samples of 1 px.
+    peak = CoarsePeak((3.3, -2.1 + off_px), 0.9, 50.0, 1.0)
+    monkeypatch.setattr(
+        register_module, "find_coarse_peaks", lambda *_arguments, **_options: [peak]
+    )
+    result = register_pair(reference, image)
+    np.testing.assert_allclose(result.shift_px, [3.3, -2.1], atol=0.1)
+    assert result.accepted == accepted
+    if result.rejection is not None:
+        assert result.rejection.status is MatchFailure.STAGES_DISAGREE
 
 
 def test_pictures_with_less_than_the_least_correlation_are_refused() -> None:
