@@ -5,17 +5,20 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.normal_equations import (
+    Eliminated,
     NormalEquations,
     Problem,
     State,
+    empty_effects,
     normal_equations,
+    pose_priors,
     prior_cost,
     reduced_normal_equations,
     residuals,
@@ -23,6 +26,7 @@ from semcal_ros.core.calibration.normal_equations import (
     schur_complement,
     select_views,
     view_costs,
+    visit_sigmas,
 )
 
 __all__ = ["BundleResult", "BundleStatus", "refine"]
@@ -68,13 +72,18 @@ class BundleResult:
     cost
         Half the robust sum of squares, with priors.
     information
-        (M, 10, 10) information on each magnification's camera with the poses eliminated.
+        (M, C, C) information on each magnification's camera and the shared unknowns, with poses and
+        visits eliminated.
     gradient
-        (M, 10) the matching right-hand side (its sum over a free camera is zero at the optimum).
+        (M, C) the matching right-hand side (its sum over a free camera is zero at the optimum).
     covariance
         (K, K) of theta for unit variance of the whitened residuals.
-    height_variance_m2
-        (V,) posterior variance of the heights.
+    prior_residuals, prior_variance
+        (V, r) residuals of the priors of the poses, in sigmas, and their posterior variances: of
+        the height, the drift within the image (x, y) and the orientation (about the tilt axis,
+        across it, about the normal), as far as the problem has them.
+    visit_variance
+        (J, 2) posterior variance of the scale and of the height in m2 of each visit.
     iterations, status
         Number of steps, and why there were no more.
     """
@@ -86,7 +95,9 @@ class BundleResult:
     information: Array
     gradient: Array
     covariance: Array
-    height_variance_m2: Array
+    prior_residuals: Array
+    prior_variance: Array
+    visit_variance: Array
     iterations: int
     status: BundleStatus
 
@@ -118,17 +129,22 @@ class _Step:
 
 
 def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
-    information, gradient, back_camera, back_right = schur_complement(problem, normal, damping)
-    matrix, right = reduced_normal_equations(problem, state.theta, information, gradient)
+    reduced = schur_complement(problem, state, normal, damping)
+    matrix, right = reduced_normal_equations(
+        problem, state.theta, reduced.information, reduced.gradient
+    )
     change = solve_scaled(matrix, right, damping)
-    camera_change = (problem.designs @ change)[problem.group]
-    pose = back_right - np.einsum("vpq,vq->vp", back_camera, camera_change)
-    new = retract(problem, state, change, pose)
-    whole = np.concatenate([camera_change, pose], axis=1)
+    camera, visits, pose = reduced.back(problem, change)
+    new = retract(problem, state, change, pose, visits)
+    parts = [camera, pose] if problem.effects is None else [camera, visits[problem.effects.visit], pose]
+    whole = np.concatenate(parts, axis=1)
     bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
     precision = problem.prior_sigma**-2.0
     prior = (problem.prior_mean - state.theta) * precision * change - 0.5 * change**2 * precision
-    return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), float(prior.sum()))
+    gain = float(prior.sum())
+    if problem.effects is not None:
+        gain += float(np.sum((-state.visits * visits - 0.5 * visits**2) / visit_sigmas(problem) ** 2))
+    return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), gain)
 
 
 def refine(
@@ -145,6 +161,10 @@ def refine(
     that ends the iteration. The function never raises for lack of convergence: the result says how
     it ended.
     """
+    effects = problem.effects
+    sizes = (0, 0) if effects is None else (len(effects.visit_group), len(problem.group))
+    if (len(state.visits), len(state.drift_px)) != sizes:
+        state = empty_effects(problem, state)
     costs = view_costs(problem, state)
     cost = float(costs.sum()) + prior_cost(problem, state)
     if not np.isfinite(cost):
@@ -193,11 +213,20 @@ def _refine_following_poses(
     if not np.any(short):
         return trial, trial_costs
     part = select_views(problem, short)
-    start = State(trial.theta, trial.rotations[short], trial.translations_m[short])
+    drift = len(trial.drift_px) > 0
+    start = replace(
+        trial,
+        rotations=trial.rotations[short],
+        translations_m=trial.translations_m[short],
+        drift_px=trial.drift_px[short] if drift else trial.drift_px,
+    )
     own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
     rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
     rotations[short], translations[short] = own.rotations, own.translations_m
-    trial = State(trial.theta, rotations, translations)
+    drift_px = trial.drift_px.copy()
+    if drift:
+        drift_px[short] = own.drift_px
+    trial = replace(trial, rotations=rotations, translations_m=translations, drift_px=drift_px)
     trial_costs[short] = own_costs
     return trial, trial_costs
 
@@ -210,28 +239,31 @@ def _refine_poses(
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
     damping = np.full(len(costs), _FIRST_DAMPING)
+    first, diagonal = problem.shared_columns + problem.visit_columns, np.arange(problem.pose_columns)
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
         normal = normal_equations(problem, state)
-        pose = normal.matrix[:, 10:, 10:].copy()
-        diagonal = np.arange(6)
+        pose = normal.matrix[:, first:, first:].copy()
         pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        change = np.asarray(
-            np.linalg.solve(pose, normal.right[:, 10:, None])[:, :, 0], dtype=np.float64
-        )
-        trial = retract(problem, state, np.zeros_like(state.theta), change)
+        change = solve_scaled(pose, normal.right[:, first:])
+        still = np.zeros_like(state.visits)
+        trial = retract(problem, state, np.zeros_like(state.theta), change, still)
         trial_costs = view_costs(problem, trial)
         better = trial_costs <= costs
         decrease = np.where(better, costs - trial_costs, 0.0)
-        state = State(
-            state.theta,
-            np.where(better[:, None, None], trial.rotations, state.rotations),
-            np.where(better[:, None], trial.translations_m, state.translations_m),
+        pick = better[:, None]
+        state = replace(
+            state,
+            rotations=np.where(pick[:, :, None], trial.rotations, state.rotations),
+            translations_m=np.where(pick, trial.translations_m, state.translations_m),
+            drift_px=np.where(pick, trial.drift_px, state.drift_px)
+            if len(state.drift_px)
+            else state.drift_px,
         )
         costs = np.where(better, trial_costs, costs)
         damping = np.where(better, np.maximum(0.1 * damping, _MIN_DAMPING), 10.0 * damping)
-        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, 10:], change)
+        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, first:], change)
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
             return state, costs, iterations, BundleStatus.SMALL_DECREASE
@@ -242,41 +274,76 @@ def _make_result(
     problem: Problem, state: State, cost: float, iterations: int, status: BundleStatus
 ) -> BundleResult:
     normal = normal_equations(problem, state)
-    information, gradient, back_camera, _ = schur_complement(problem, normal, 0.0)
-    matrix, _ = reduced_normal_equations(problem, state.theta, information, gradient)
+    reduced = schur_complement(problem, state, normal, 0.0)
+    matrix, _ = reduced_normal_equations(
+        problem, state.theta, reduced.information, reduced.gradient
+    )
     # A direction that neither data nor prior hold gets no spurious certainty from rounding.
     covariance = invert_scaled(matrix, rcond=1e-15)
     covariance = 0.5 * (covariance + covariance.T)
-    spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)
-    height_row = back_camera[:, 5]
-    own = np.linalg.inv(normal.matrix[:, 10:, 10:])[:, 5, 5]
-    coupled = np.einsum("vp,vpq,vq->v", height_row, spread[problem.group], height_row)
+    visit_variance, view_covariance = _posterior(problem, reduced, covariance)
+    priors = pose_priors(problem, state)
+    own = priors[:, :, :-1]
     return BundleResult(
         state=state,
         residuals_px=normal.residuals_px,
         huber_weight=normal.huber_weight,
         cost=cost,
-        information=information,
-        gradient=gradient,
+        information=reduced.information,
+        gradient=reduced.gradient,
         covariance=covariance,
-        height_variance_m2=(own + coupled) * problem.unit_m**2,
+        prior_residuals=priors[:, :, -1],
+        prior_variance=np.einsum("vrp,vpq,vrq->vr", own, view_covariance, own, optimize=True),
+        visit_variance=visit_variance,
         iterations=iterations,
         status=status,
     )
 
 
+def _posterior(
+    problem: Problem, reduced: Eliminated, covariance: Array
+) -> tuple[Array, Array]:
+    """Return the (J, w) variances of the visits, and the (V, P, P) covariances of the views.
+
+    The unknowns of a view are those of its magnification, of its visit and its pose.
+    """
+    spread = problem.designs @ covariance @ np.swapaxes(problem.designs, 1, 2)
+    if problem.effects is None:
+        outer = spread[problem.group]
+        variance = np.zeros((0, 0))
+    else:
+        by_visit = _with_inner(
+            spread[problem.effects.visit_group], reduced.visit_by_rest, reduced.visit_inverse
+        )
+        size = problem.shared_columns
+        variance = np.diagonal(by_visit[:, size:, size:], axis1=1, axis2=2)
+        outer = by_visit[problem.effects.visit]
+    return variance, _with_inner(outer, reduced.pose_by_rest, reduced.pose_inverse)
+
+
+def _with_inner(outer: Array, by_outer: Array, inverse: Array) -> Array:
+    """Return the joint covariances of outer unknowns and of inner ones that were eliminated."""
+    cross = -outer @ np.swapaxes(by_outer, 1, 2)
+    inner = inverse - by_outer @ cross
+    return np.block([[outer, cross], [np.swapaxes(cross, 1, 2), inner]])
+
+
 def _make_empty_result(problem: Problem, state: State) -> BundleResult:
     """Return the result where some point has no projection at the start: nothing is known."""
     groups, size = len(problem.designs), len(state.theta)
+    views, rows, _ = pose_priors(problem, state).shape
+    own = problem.shared_columns
     return BundleResult(
         state=state,
         residuals_px=residuals(problem, state),
         huber_weight=np.zeros(len(problem.board_m)),
         cost=float("inf"),
-        information=np.zeros((groups, 10, 10)),
-        gradient=np.zeros((groups, 10)),
+        information=np.zeros((groups, own, own)),
+        gradient=np.zeros((groups, own)),
         covariance=np.full((size, size), np.inf),
-        height_variance_m2=np.full(len(problem.group), np.inf),
+        prior_residuals=np.zeros((views, rows)),
+        prior_variance=np.ones((views, rows)),
+        visit_variance=np.full((len(state.visits), problem.visit_columns), np.inf),
         iterations=0,
         status=BundleStatus.NO_PROJECTION,
     )

@@ -12,10 +12,12 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import ViewPose, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.joint import (
     RESIDUAL_MODES,
     JointFit,
     adapt_priors,
+    add_shared_unknowns,
     fit_joint,
     without_magnification,
 )
@@ -236,6 +238,8 @@ def calibrate_views(
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
     if priors is None:
         setup = adapt_priors(setup)
+    if options.method == "joint":
+        setup = add_shared_unknowns(align_lattices(setup))
     outliers: tuple[RejectedView, ...] = ()
     if options.method == "joint":
         joint, setup, outliers = _fit_without_outliers(setup, options.residual, on_stage)

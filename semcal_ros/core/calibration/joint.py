@@ -17,6 +17,8 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
 from semcal_ros.core.calibration.normal_equations import (
+    GRID_NAMES,
+    MISS_NAMES,
     Problem,
     State,
     reduced_normal_equations,
@@ -31,6 +33,7 @@ from semcal_ros.core.calibration.problem import (
     stack_coefficients,
     variance_factor,
     with_coefficients,
+    with_shared_values,
 )
 from semcal_ros.core.calibration.residual_field_fit import (
     FieldChoice,
@@ -40,6 +43,12 @@ from semcal_ros.core.calibration.residual_field_fit import (
     field_system,
     solve_field,
     undo_field,
+)
+from semcal_ros.core.calibration.stage import OFFSET_NAMES
+from semcal_ros.core.calibration.variance_components import (
+    VarianceComponents,
+    initial_components,
+    update_components,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -51,6 +60,7 @@ __all__ = [
     "FittedField",
     "JointFit",
     "adapt_priors",
+    "add_shared_unknowns",
     "fit_joint",
     "without_magnification",
 ]
@@ -64,17 +74,10 @@ _MAX_ROUNDS = 5
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
 # the views leave open of them enters the covariance.
 _RESERVE, _LEAST_SIZE = 2, 5
-# Updates of the spread of the heights before anything is selected. It has to be near only, since
-# every later adjustment updates it again.
-_HEIGHT_UPDATES = 4
-# Limits of the spread of heights, relative to its prior: a micrometre is less than any view can
-# show, and a depth of field of millimetres does not occur.
-_LEAST_HEIGHT, _MOST_HEIGHT = 0.01, 20.0
-# Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
-# mount, less than tilts that are set on purpose.
-_FLAT_RAD = np.radians(5.0)
-# Fewer views than this do not determine a spread of their own.
-_ENOUGH_HEIGHTS = 4
+# Updates of the variance components before anything is selected: they have to be near only, since
+# every later adjustment updates them again. At most so many after that, until they change by less
+# than the last number.
+_FIRST_UPDATES, _LAST_UPDATES, _SMALL_CHANGE = 4, 12, 0.02
 # Corners per view for what only needs to be near: signs of tilts, poses, start functions.
 _ENOUGH_CORNERS = 60
 # Tolerance of the intermediate adjustments; only the last one needs to be exact.
@@ -122,6 +125,8 @@ class Adjustment:
         The functions.
     problem, result
         The adjustment that gave their coefficients.
+    spread
+        Its variance components.
     rounds
         Number of times that the numbers of coefficients were chosen.
     settled
@@ -131,6 +136,7 @@ class Adjustment:
     functions: Functions
     problem: Problem
     result: BundleResult
+    spread: VarianceComponents
     rounds: int
     settled: bool
 
@@ -158,24 +164,6 @@ class JointFit:
     covariance: Array
     field: FittedField | None
     excess_px: float
-
-
-def _update_height_sigma(setup: Setup, result: BundleResult) -> Array:
-    """Update the (V,) spread of the heights by expectation maximisation.
-
-    Views without tilt have a spread of their own: the axis of the stage hardly ever passes through
-    the point in view, so that tilting changes the height, while views from above may all share one
-    height.
-    """
-    square = result.state.translations_m[:, 2] ** 2 + result.height_variance_m2
-    flat = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
-    if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:
-        flat = np.zeros_like(flat)
-    variance = np.empty(len(square))
-    for group in (flat, ~flat):
-        variance[group] = np.mean(square[group]) if np.any(group) else 0.0
-    prior = setup.priors.height_sigma_m
-    return np.clip(np.sqrt(variance), _LEAST_HEIGHT * prior, _MOST_HEIGHT * prior)
 
 
 def refit_functions(
@@ -211,28 +199,48 @@ def adapt_priors(setup: Setup) -> Setup:
     return replace(setup, priors=setup.priors.of_wide_views(start.rho))
 
 
-def _fit_start(setup: Setup) -> tuple[Functions, State, Array]:
-    """Fit moderately flexible functions, poses and the spread of heights from nominal values."""
+def add_shared_unknowns(setup: Setup) -> Setup:
+    """Return the setup with the unknowns of the grid, of the tilt axis and of the stage.
+
+    A photograph has none of them: its priors (see :func:`adapt_priors`) are those of a lens.
+    """
+    if setup.priors.is_wide:
+        return setup
+    squares = tuple(f"square_{k}" for k in range(1, len(setup.squares_m)))
+    tilted = any(v.stage is not None and v.stage.tilt_rad is not None for v in setup.views)
+    stage = tuple(OFFSET_NAMES) if tilted else ()
+    return replace(setup, shared=(*GRID_NAMES, *squares, *MISS_NAMES, *stage))
+
+
+def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
+    """Fit moderately flexible functions, poses and variance components from nominal values."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     rho = start.rho if start.wide else min(max(start.rho, 0.0), _MAX_START_RHO)
     functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
-    height = np.full(len(setup.views), setup.priors.height_sigma_m)
-    problem = build_problem(setup, functions, setup.views, height)
-    state = State(stack_coefficients(functions), start.rotations, start.translations_m)
+    spread = initial_components(setup)
+    problem = build_problem(setup, functions, setup.views, spread)
+    theta = np.concatenate([stack_coefficients(functions), setup.shared_start()])
+    state = State(theta, start.rotations, start.translations_m)
     state, _ = resolve_mirrored_tilts(problem, state)
 
     size = min(3, max(1, len(setup.magnifications) - 1))
     functions = refit_functions(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
-    problem = build_problem(setup, functions, setup.views, height)
-    result = adjust(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
-    for _ in range(_HEIGHT_UPDATES):
+    problem = build_problem(setup, functions, setup.views, spread)
+    state = replace(state, theta=_theta(setup, functions, state))
+    result = adjust(problem, state, tolerance=_COARSE)
+    for _ in range(_FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
-        height = _update_height_sigma(setup, result)
-        problem = replace(problem, height_sigma_m=height)
+        spread = update_components(setup, problem, result)
+        problem = build_problem(setup, functions, setup.views, spread)
         result = refine(problem, result.state, tolerance=_COARSE)
-    return with_coefficients(functions, result.state.theta), result.state, height
+    return with_coefficients(functions, result.state.theta), result.state, spread
+
+
+def _theta(setup: Setup, functions: Functions, state: State) -> Array:
+    """Return the coefficients of the functions, followed by the shared unknowns of a state."""
+    return with_shared_values(functions, state.theta, len(setup.shared))
 
 
 def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
@@ -258,10 +266,12 @@ def _pad_covariance(
     by as much as all coefficients would move if the omitted ones were free.
     """
     views = setup.views if field is None else undo_field(setup, field.field).views
-    problem = build_problem(setup, padded, views, adjustment.problem.height_sigma_m)
-    state = replace(adjustment.result.state, theta=stack_coefficients(padded))
+    problem = build_problem(setup, padded, views, adjustment.spread)
+    state = adjustment.result.state
+    state = replace(state, theta=_theta(setup, padded, state))
     result = refine(problem, state, max_iterations=0)
     factor = variance_factor(adjustment.problem, adjustment.result)
+    size = len(state.theta) - len(setup.shared)
     if field is None:
         reduced = reduced_normal_equations(
             problem, state.theta, result.information, result.gradient
@@ -274,19 +284,21 @@ def _pad_covariance(
         theta, freed = solve_field(system, field.choice.prior, field.field)
         change = freed.coefficients - field.field.coefficients
         moved = np.concatenate([theta - state.theta, change.ravel()])
-    return covariance + np.outer(moved, moved) / factor
+    keep = np.r_[0:size, len(state.theta) : len(moved)]
+    return (covariance + np.outer(moved, moved) / factor)[np.ix_(keep, keep)]
 
 
 def _select_and_adjust(
     setup: Setup,
     functions: Functions,
     state: State,
-    height_sigma_m: Array,
+    spread: VarianceComponents,
     sizes: Mapping[str, tuple[str, int]] | None = None,
 ) -> Adjustment:
     """Choose the number of coefficients of every function until the choice no longer changes."""
-    problem = build_problem(setup, functions, setup.views, height_sigma_m)
-    result = refine(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
+    problem = build_problem(setup, functions, setup.views, spread)
+    state = replace(state, theta=_theta(setup, functions, state))
+    result = refine(problem, state, tolerance=_COARSE)
     settled, rounds = len(setup.magnifications) < 3, 0
     while rounds < _MAX_ROUNDS and not settled:
         rounds += 1
@@ -296,25 +308,49 @@ def _select_and_adjust(
             break
         sizes = chosen
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
-        problem = build_problem(setup, functions, setup.views, _update_height_sigma(setup, result))
-        result = refine(
-            problem, replace(result.state, theta=stack_coefficients(functions)), tolerance=_COARSE
-        )
+        spread = update_components(setup, problem, result)
+        problem = build_problem(setup, functions, setup.views, spread)
+        state = replace(result.state, theta=_theta(setup, functions, result.state))
+        result = refine(problem, state, tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
-    return Adjustment(functions, problem, result, rounds, settled)
+    return Adjustment(functions, problem, result, spread, rounds, settled)
 
 
 def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
-    """Adjust exactly with the chosen functions, after trying both signs of every tilt."""
+    """Adjust exactly with the chosen functions, after trying both signs of every tilt.
+
+    The variance components are updated until they no longer change.
+    """
     thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
-    height = _update_height_sigma(setup, adjustment.result)
-    turned, _ = resolve_mirrored_tilts(
-        build_problem(thin, adjustment.functions, thin.views, height), adjustment.result.state
+    functions = adjustment.functions
+    spread = update_components(setup, adjustment.problem, adjustment.result)
+    state, _ = resolve_mirrored_tilts(
+        build_problem(thin, functions, thin.views, spread), adjustment.result.state
     )
-    problem = build_problem(setup, adjustment.functions, setup.views, height)
-    result = refine(problem, turned)
-    functions = with_coefficients(adjustment.functions, result.state.theta)
-    return replace(adjustment, functions=functions, problem=problem, result=result)
+    for _ in range(_LAST_UPDATES):
+        problem = build_problem(setup, functions, setup.views, spread)
+        result = refine(problem, state, tolerance=_COARSE)
+        before, state = spread, result.state
+        spread = update_components(setup, problem, result)
+        if _largest_change(before, spread) < _SMALL_CHANGE:
+            break
+    problem = build_problem(setup, functions, setup.views, spread)
+    result = refine(problem, state)
+    functions = with_coefficients(functions, result.state.theta)
+    return replace(
+        adjustment, functions=functions, problem=problem, result=result, spread=spread
+    )
+
+
+def _largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
+    """Return the largest relative change of the variance components."""
+    a, b = (
+        np.concatenate(
+            [[c.scale.sigma, c.visit_height.sigma], c.height_sigma_m, c.drift_sigma_px]
+        )
+        for c in (before, after)
+    )
+    return float(np.max(np.abs(np.log(b / a))))
 
 
 def _add_field(
@@ -352,18 +388,17 @@ def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
 
 def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:
     """Adjust to other views from other coefficients; ``choosing`` selects their number again."""
-    functions, height = (
-        with_coefficients(adjustment.functions, theta),
-        _update_height_sigma(setup, adjustment.result),
-    )
+    functions = with_coefficients(adjustment.functions, theta)
+    spread = update_components(setup, adjustment.problem, adjustment.result)
+    state = replace(adjustment.result.state, theta=theta)
     if choosing:
         return _select_and_adjust(
-            setup, functions, adjustment.result.state, height, _current_sizes(adjustment)
+            setup, functions, state, spread, _current_sizes(adjustment)
         )
-    problem = build_problem(setup, functions, setup.views, height)
-    result = refine(problem, replace(adjustment.result.state, theta=theta), tolerance=_COARSE)
+    problem = build_problem(setup, functions, setup.views, spread)
+    result = refine(problem, state, tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
-    return replace(adjustment, functions=functions, problem=problem, result=result)
+    return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
 
 
 def fit_joint(
@@ -394,9 +429,9 @@ def fit_joint(
         setup = replace(setup, views=add_excess_noise(setup.views, excess))
     final = setup if field is None else undo_field(setup, field.field)
     if excess > 0.0:
-        height = _update_height_sigma(setup, adjustment.result)
+        spread = update_components(setup, adjustment.problem, adjustment.result)
         adjustment = _select_and_adjust(
-            final, adjustment.functions, adjustment.result.state, height, _current_sizes(adjustment)
+            final, adjustment.functions, adjustment.result.state, spread, _current_sizes(adjustment)
         )
     on_stage("final adjustment", 0.75)
     adjustment = _adjust_exactly(final, adjustment)
@@ -423,6 +458,6 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
     information, gradient = result.information.copy(), result.gradient.copy()
     information[index] = 0.0
     gradient[index] = 0.0
-    theta = stack_coefficients(functions)
+    theta = result.state.theta
     matrix, right = reduced_normal_equations(fit.adjustment.problem, theta, information, gradient)
     return with_coefficients(functions, theta + solve_scaled(matrix, right)), None

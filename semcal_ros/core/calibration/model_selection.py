@@ -19,7 +19,7 @@ from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.priors import Setup
-from semcal_ros.core.calibration.problem import variance_factor
+from semcal_ros.core.calibration.problem import variance_factor, with_shared
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
@@ -42,12 +42,17 @@ class Summary:
     Attributes
     ----------
     information, right
-        (M, 10, 10) and (M, 10): the cost of a camera c at magnification i is
-        ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of the noise variance.
+        (M, C, C) and (M, C): the cost of a camera c, followed by the shared unknowns, at
+        magnification i is ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of
+        the noise variance.
+    shared_mean, shared_precision
+        (C - 10,) prior of the shared unknowns.
     """
 
     information: Array
     right: Array
+    shared_mean: Array
+    shared_precision: Array
 
     @classmethod
     def of(cls, problem: Problem, result: BundleResult) -> Summary:
@@ -55,7 +60,13 @@ class Summary:
         cameras = problem.designs @ result.state.theta
         right = np.einsum("mpq,mq->mp", result.information, cameras) + result.gradient
         variance = variance_factor(problem, result)
-        return cls(result.information / variance, right / variance)
+        shared = len(problem.prior_mean) - len(problem.shared)
+        return cls(
+            result.information / variance,
+            right / variance,
+            problem.prior_mean[shared:],
+            problem.prior_sigma[shared:] ** -2.0,
+        )
 
 
 class _Candidates:
@@ -106,6 +117,11 @@ class _Candidates:
             designs[:, row, column:stop] = block
             mean[column:stop], precision[column:stop] = self._prior(name, *sizes[name])
             column = stop
+        shared = len(self.summary.shared_mean)
+        if shared:
+            designs = with_shared(designs, shared)
+            mean = np.concatenate([mean, self.summary.shared_mean])
+            precision = np.concatenate([precision, self.summary.shared_precision])
         transposed = np.swapaxes(designs, 1, 2)
         matrices = transposed @ self.summary.information @ designs
         rights = (transposed @ self.summary.right[:, :, None])[:, :, 0]

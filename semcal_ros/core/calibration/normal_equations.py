@@ -1,44 +1,69 @@
 """Reprojection errors of grid views, and their normal equations with the poses eliminated.
 
-The unknowns are one vector ``theta`` of coefficients, from which the camera of each magnification
-follows linearly (``camera = design @ theta``), and six pose unknowns per view. The poses are
-eliminated view by view (Schur complement), so the reduced system has the size of ``theta`` for any
-number of views; a view leaves a 10 x 10 information matrix on the camera of its magnification.
+The unknowns are nested:
+
+- one vector ``theta``, from which the camera of each magnification and what all views share (the
+  shape of the grid, the errors of the stage) follow linearly (``camera = design @ theta``);
+- for each visit of a magnification, how far the scale and the height did not come back;
+- for each view, its pose and the drift within the image.
+
+They are eliminated from the inside out (Schur complements), so the reduced system has the size of
+``theta`` for any number of views; what is left is an information matrix on the camera of each
+magnification and the shared unknowns.
 
 Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Indices, Mask, invert_scaled
+from semcal_ros.core.calibration.stage import (
+    OFFSET_NAMES,
+    Attitudes,
+    attitude_residuals,
+    height_of_tilt,
+)
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.projection import project_points, project_points_with_jacobians
 
 __all__ = [
+    "GRID_NAMES",
+    "MISS_NAMES",
+    "Effects",
+    "Eliminated",
     "NormalEquations",
     "Problem",
     "State",
     "WhitenedRows",
+    "empty_effects",
     "make_problem",
     "normal_equations",
+    "pose_priors",
     "prior_cost",
     "reduced_normal_equations",
     "residuals",
     "retract",
     "schur_complement",
     "select_views",
+    "sum_by",
     "view_costs",
+    "visit_sigmas",
     "whiten",
     "whitened_norm",
     "whitened_rows",
-    "with_height_prior",
 ]
+
+
+GRID_NAMES: tuple[str, ...] = ("grid_stretch", "grid_shear", "grid_curvature_m")
+"""Stretch (x longer and y shorter by half of it), shear (x moves with y), and curvature in 1/m."""
+MISS_NAMES: tuple[str, ...] = ("axis_x_m", "axis_y_m", "axis_z_m")
+"""Where the tilt axis lies, as in :func:`~semcal_ros.core.calibration.stage.height_of_tilt`."""
 
 
 # Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
@@ -46,8 +71,36 @@ _HUBER = 3.0
 
 
 @dataclass(frozen=True)
+class Effects:
+    """What varies from visit to visit and from view to view, besides the poses.
+
+    Attributes
+    ----------
+    visit
+        (V,) index of each view's visit.
+    visit_group
+        (J,) index of each visit's magnification.
+    scale_sigma, height_sigma_m
+        Prior 1-sigma of a visit's relative scale, and of the height that its views share.
+    drift_sigma_px
+        (V,) prior 1-sigma per axis of the drift during one frame.
+    frame_time
+        (N,) when each point was scanned, in frames from the middle of the frame.
+    """
+
+    visit: Indices
+    visit_group: Indices
+    scale_sigma: float
+    height_sigma_m: float
+    drift_sigma_px: Array
+    frame_time: Array
+
+
+@dataclass(frozen=True)
 class Problem:
     """Observations and priors of one adjustment.
+
+    A magnification has C unknowns: the 10 parameters of its camera, then those in ``shared``.
 
     Attributes
     ----------
@@ -61,7 +114,7 @@ class Problem:
     group
         (V,) index of each view's magnification in ``designs``.
     designs
-        (M, 10, K): camera parameters of each magnification per unit of theta.
+        (M, C, K): unknowns of each magnification per unit of theta.
     unit_m
         (V,) metres per pose unit (about one pixel), which keeps the equations well scaled.
     norm_px
@@ -69,7 +122,16 @@ class Problem:
     prior_mean, prior_sigma
         (K,) prior of theta; an infinite sigma stands for no prior.
     height_sigma_m
-        (V,) prior 1-sigma of each view's height t_z about the reference plane.
+        (V,) prior 1-sigma of each view's height about the reference plane.
+    shared
+        Names of the unknowns that all views share: of the grid's shape (``GRID_NAMES`` and
+        ``square_1``...), of the miss of the tilt axis (``MISS_NAMES``), and of the stage.
+    square_class
+        (V,) which size of squares each view shows; 0 is the one without a ``square_`` unknown.
+    effects
+        What varies besides the poses, or None where nothing does.
+    attitudes
+        What is known about the orientations of the views, or None.
     """
 
     board_m: Array
@@ -83,20 +145,58 @@ class Problem:
     prior_mean: Array
     prior_sigma: Array
     height_sigma_m: Array
+    shared: tuple[str, ...] = ()
+    square_class: Indices | None = None
+    effects: Effects | None = None
+    attitudes: Attitudes | None = None
 
     @property
     def view_of_point(self) -> Indices:
         """(N,) view index of every point."""
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
 
+    @property
+    def shared_columns(self) -> int:
+        """Number C of the unknowns of a magnification: camera and shared ones."""
+        return 10 + len(self.shared)
+
+    @property
+    def visit_columns(self) -> int:
+        """Number of unknowns of a visit."""
+        return 0 if self.effects is None else 2
+
+    @property
+    def pose_columns(self) -> int:
+        """Number of unknowns of a view: turn, shift and drift."""
+        return 6 if self.effects is None else 8
+
+    def shared_values(self, theta: Array, names: Sequence[str]) -> Array:
+        """Return the values of shared unknowns, zero for those that the problem does not have."""
+        known = dict(zip(self.shared, theta[len(theta) - len(self.shared) :], strict=True))
+        return np.array([known.get(name, 0.0) for name in names])
+
 
 @dataclass(frozen=True)
 class State:
-    """Values of the unknowns: theta (K,), rotations (V, 3, 3) and translations (V, 3) in m."""
+    """Values of the unknowns.
+
+    Attributes
+    ----------
+    theta
+        (K,) coefficients of the cameras, then the shared unknowns.
+    rotations, translations_m
+        (V, 3, 3) and (V, 3) sem frame from grid.
+    visits
+        (J, 2) relative scale and height in m of each visit; empty without effects.
+    drift_px
+        (V, 2) drift during the frame; empty without effects.
+    """
 
     theta: Array
     rotations: Array
     translations_m: Array
+    visits: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    drift_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def make_problem(
@@ -132,17 +232,53 @@ def make_problem(
     )
 
 
+def _shaped_grid(problem: Problem, theta: Array) -> Array:
+    """Return the (N, 3) grid points with the shape of the grid."""
+    if not problem.shared:
+        return problem.board_m
+    x, y, _ = problem.board_m.T
+    stretch, shear, curvature = problem.shared_values(theta, GRID_NAMES)
+    size = np.zeros(len(x))
+    for k, column in _square_columns(problem):
+        assert problem.square_class is not None
+        size += (problem.square_class == k)[problem.view_of_point] * theta[column - 10 - len(problem.shared)]
+    grid = np.stack(
+        [x * (1.0 + 0.5 * stretch) + shear * y, y * (1.0 - 0.5 * stretch), 0.5 * curvature * (x * x + y * y)],
+        axis=1,
+    )
+    return grid * (1.0 + size[:, None])
+
+
+def _square_columns(problem: Problem) -> list[tuple[int, int]]:
+    """Return the class of each size of squares that has an unknown, and its column."""
+    return [
+        (int(name.removeprefix("square_")), 10 + k)
+        for k, name in enumerate(problem.shared)
+        if name.startswith("square_")
+    ]
+
+
 def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
     view = problem.view_of_point
-    rotated = np.einsum("nij,nj->ni", state.rotations[view], problem.board_m)
-    cameras = (problem.designs @ state.theta)[problem.group]
+    rotated = np.einsum("nij,nj->ni", state.rotations[view], _shaped_grid(problem, state.theta))
+    cameras = (problem.designs[:, :10] @ state.theta)[problem.group]
+    if problem.effects is not None:
+        cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
     return rotated, rotated + state.translations_m[view], cameras[view]
+
+
+def _drift_shift(problem: Problem, state: State) -> Array | float:
+    """Return the (N, 2) shift of every point by the drift within its image."""
+    if problem.effects is None:
+        return 0.0
+    return problem.effects.frame_time[:, None] * state.drift_px[problem.view_of_point]
 
 
 def residuals(problem: Problem, state: State) -> Array:
     """Return (N, 2) observed minus projected pixels; NaN where a point has no projection."""
     _, points, cameras = _points_and_cameras(problem, state)
-    return problem.observed_px - project_points(cameras, points, problem.norm_px)
+    projected = project_points(cameras, points, problem.norm_px)
+    return problem.observed_px - projected - _drift_shift(problem, state)
 
 
 def whitened_norm(problem: Problem, miss: Array) -> Array:
@@ -159,26 +295,39 @@ def _huber(norm: Array) -> tuple[Array, Array]:
 
 
 def view_costs(problem: Problem, state: State) -> Array:
-    """Return (V,) half robust sums of squares, with the priors of the heights.
+    """Return (V,) half robust sums of squares, with the priors of the poses.
 
     The cost of a view is infinite where one of its points has no projection.
     """
     miss = residuals(problem, state)
     norm = whitened_norm(problem, miss)
     loss = np.where(np.isfinite(norm), _huber(norm)[0], np.inf)
-    height = state.translations_m[:, 2] / problem.height_sigma_m
-    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * height * height
+    own = pose_priors(problem, state)[:, :, -1]
+    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * np.sum(own**2, axis=1)
 
 
 def prior_cost(problem: Problem, state: State) -> float:
-    """Return half the sum of squares of theta about its prior."""
+    """Return half the sum of squares of theta and of the visits about their priors."""
     prior = (state.theta - problem.prior_mean) / problem.prior_sigma
-    return float(0.5 * prior @ prior)
+    return float(0.5 * prior @ prior + 0.5 * np.sum(_visit_priors(problem, state) ** 2))
+
+
+def visit_sigmas(problem: Problem) -> Array:
+    """Return the (2,) prior 1-sigma of the unknowns of a visit."""
+    assert problem.effects is not None
+    return np.array([problem.effects.scale_sigma, problem.effects.height_sigma_m])
+
+
+def _visit_priors(problem: Problem, state: State) -> Array:
+    return state.visits if problem.effects is None else state.visits / visit_sigmas(problem)
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of each view, (V, 16, 16) and (V, 16), with camera first and pose last."""
+    """Normal equations of each view, (V, P, P) and (V, P).
+
+    The order is: camera and shared unknowns (C), visit, pose.
+    """
 
     matrix: Array
     right: Array
@@ -192,14 +341,18 @@ class WhitenedRows:
 
     Attributes
     ----------
+    columns
+        (A,) which of the unknowns of a view the observations depend on directly; the right-hand
+        side is the last.
     rows
-        (2, 17, N): derivatives by camera (10), turn (3) and shift (3), and the residual.
+        (2, A, N): derivatives by these unknowns, and the residual.
     residuals_px
         (N, 2) without weights.
     huber_weight
         (N,).
     """
 
+    columns: Indices
     rows: Array
     residuals_px: Array
     huber_weight: Array
@@ -209,19 +362,60 @@ def whitened_rows(problem: Problem, state: State) -> WhitenedRows:
     """Compute the whitened residuals and derivatives of all observations."""
     rotated, points, cameras = _points_and_cameras(problem, state)
     jacobians = project_points_with_jacobians(cameras, points, problem.norm_px)
-    miss = problem.observed_px - jacobians.xy
+    miss = problem.observed_px - jacobians.xy - _drift_shift(problem, state)
     huber = _huber(whitened_norm(problem, miss))[1]
-    rows = np.empty((2, 17, len(points)))
-    rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
     shift = np.moveaxis(jacobians.d_xyz, 0, -1)
+    view = problem.view_of_point
+    first = problem.shared_columns
+    pose = first + problem.visit_columns
+    end = pose + problem.pose_columns
+    grid = _grid_columns(problem)
+    columns = [*range(10), *grid, *range(first, first + problem.visit_columns // 2), *range(pose, end + 1)]
+    rows = np.empty((2, len(columns), len(points)))
+    rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
+    at = 10
+    for direction in _grid_directions(problem, state.theta, grid):
+        moved = np.einsum("nij,nj->in", state.rotations[view], direction)
+        rows[:, at] = np.einsum("kin,in->kn", shift, moved)
+        at += 1
+    if problem.effects is not None:
+        rows[:, at] = rows[:, 0] / problem.unit_m[view]
+        at += 1
+        rows[:, at + 6 : at + 8] = 0.0
+        rows[0, at + 6] = rows[1, at + 7] = problem.effects.frame_time
     x, y, z = rotated.T
-    rows[:, 10] = y * shift[:, 2] - z * shift[:, 1]
-    rows[:, 11] = z * shift[:, 0] - x * shift[:, 2]
-    rows[:, 12] = x * shift[:, 1] - y * shift[:, 0]
-    rows[:, 13:16] = shift * problem.unit_m[problem.view_of_point]
-    rows[:, 16] = miss.T
+    rows[:, at] = y * shift[:, 2] - z * shift[:, 1]
+    rows[:, at + 1] = z * shift[:, 0] - x * shift[:, 2]
+    rows[:, at + 2] = x * shift[:, 1] - y * shift[:, 0]
+    rows[:, at + 3 : at + 6] = shift * problem.unit_m[view]
+    rows[:, -1] = miss.T
     whiten(problem.whitening, rows, huber)
-    return WhitenedRows(rows, miss, huber)
+    return WhitenedRows(np.array(columns, dtype=np.intp), rows, miss, huber)
+
+
+def _grid_columns(problem: Problem) -> list[int]:
+    """Return the columns of the shared unknowns that describe the shape of the grid."""
+    own = [10 + k for k, name in enumerate(problem.shared) if name in GRID_NAMES]
+    return own + [column for _, column in _square_columns(problem)]
+
+
+def _grid_directions(problem: Problem, theta: Array, columns: Sequence[int]) -> Iterator[Array]:
+    """Yield the (N, 3) derivative of the grid points by each of these unknowns."""
+    x, y, _ = problem.board_m.T
+    zero = np.zeros_like(x)
+    squares = {column: k for k, column in _square_columns(problem)}
+    shaped = _shaped_grid(problem, theta) if squares else problem.board_m
+    for column in columns:
+        name = problem.shared[column - 10]
+        if name == "grid_stretch":
+            yield np.stack([0.5 * x, -0.5 * y, zero], axis=1)
+        elif name == "grid_shear":
+            yield np.stack([y, zero, zero], axis=1)
+        elif name == "grid_curvature_m":
+            yield np.stack([zero, zero, 0.5 * (x * x + y * y)], axis=1)
+        else:
+            assert problem.square_class is not None
+            yield shaped * (problem.square_class == squares[column])[problem.view_of_point, None]
 
 
 def whiten(whitening: Array, rows: Array, huber: Array) -> None:
@@ -233,48 +427,156 @@ def whiten(whitening: Array, rows: Array, huber: Array) -> None:
     rows[0] *= xx
 
 
-def with_height_prior(problem: Problem, state: State, matrix: Array, column: int) -> None:
-    """Add the prior of each view's height to augmented normal equations (V, k, k), in place.
+def pose_priors(problem: Problem, state: State) -> Array:
+    """Return the priors of the poses as whitened rows (V, r, P + 1), the residual last.
 
-    ``column`` is that of the height; the right-hand side is the last column.
+    They are those of the height, of the drift within the image and of the orientation.
     """
-    height = problem.unit_m / problem.height_sigma_m
-    matrix[:, column, column] += height**2
-    matrix[:, column, -1] -= height * state.translations_m[:, 2] / problem.height_sigma_m
+    first, width = problem.shared_columns, problem.visit_columns + problem.pose_columns
+    pose = first + problem.visit_columns
+    count = 1 + (0 if problem.effects is None else 2) + (0 if problem.attitudes is None else 3)
+    rows = np.zeros((len(problem.group), count, first + width + 1))
+    scan = np.zeros(len(problem.group))
+    if problem.attitudes is not None:
+        scan = problem.attitudes.scan_rotation_rad
+    miss = problem.shared_values(state.theta, MISS_NAMES)
+    height, by_pose, by_miss = height_of_tilt(scan, state.rotations, state.translations_m, miss)
+    rows[:, 0, pose : pose + 3] = by_pose[:, :3]
+    rows[:, 0, pose + 3 : pose + 6] = by_pose[:, 3:] * problem.unit_m[:, None]
+    _fill(problem, rows[:, 0], MISS_NAMES, by_miss)
+    if problem.effects is not None:
+        height = height - state.visits[problem.effects.visit, 1]
+        rows[:, 0, first + 1] = -1.0
+        sigma = problem.effects.drift_sigma_px
+        rows[:, 1, pose + 6] = rows[:, 2, pose + 7] = 1.0 / sigma
+        rows[:, 1:3, -1] = -state.drift_px / sigma[:, None]
+    rows[:, 0, -1] = -height
+    rows[:, 0] /= problem.height_sigma_m[:, None]
+    if problem.attitudes is not None:
+        offsets = problem.shared_values(state.theta, OFFSET_NAMES)
+        own, by_turn, by_offset = attitude_residuals(problem.attitudes, offsets, state.rotations)
+        rows[:, -3:, -1] = own
+        rows[:, -3:, pose : pose + 3] = by_turn
+        for k in range(3):
+            _fill(problem, rows[:, k - 3], OFFSET_NAMES, by_offset[:, k])
+    return rows
+
+
+def _fill(problem: Problem, rows: Array, names: Sequence[str], values: Array) -> None:
+    """Set the columns of shared unknowns in rows (V, P + 1), in place."""
+    for k, name in enumerate(names):
+        if name in problem.shared:
+            rows[:, 10 + problem.shared.index(name)] = values[:, k]
 
 
 def normal_equations(problem: Problem, state: State) -> NormalEquations:
-    """Compute the Huber-weighted normal equations of every view, with the prior of its height."""
+    """Compute the Huber-weighted normal equations of every view, with the priors of its pose."""
     whitened = whitened_rows(problem, state)
-    n_views = len(problem.group)
-    matrix = np.empty((n_views, 17, 17))
-    for v in range(n_views):
+    priors = pose_priors(problem, state)
+    matrix = np.swapaxes(priors, 1, 2) @ priors
+    own = np.ix_(whitened.columns, whitened.columns)
+    for v in range(len(problem.group)):
         x, y = whitened.rows[:, :, problem.starts[v] : problem.starts[v + 1]]
-        matrix[v] = x @ x.T + y @ y.T
-    with_height_prior(problem, state, matrix, 15)
+        matrix[v][own] += x @ x.T + y @ y.T
     return NormalEquations(
-        matrix[:, :16, :16], matrix[:, :16, 16], whitened.residuals_px, whitened.huber_weight
+        matrix[:, :-1, :-1], matrix[:, :-1, -1], whitened.residuals_px, whitened.huber_weight
     )
 
 
-def schur_complement(
-    problem: Problem, normal: NormalEquations, damping: float
-) -> tuple[Array, Array, Array, Array]:
-    """Eliminate the poses.
+@dataclass(frozen=True)
+class Eliminated:
+    """Normal equations without poses and visits, and the way back to these.
 
-    Returns information (M, 10, 10) and gradient (M, 10), and V^-1 W' and V^-1 b for each view.
+    Attributes
+    ----------
+    information, gradient
+        (M, C, C) and (M, C) of each magnification.
+    pose_by_rest, pose
+        (V, p, C + w) and (V, p): a view's step is ``pose - pose_by_rest @ rest``, where ``rest`` is
+        the step of its magnification and of its visit.
+    visit_by_rest, visit
+        (J, w, C) and (J, w), the same for visits.
+    pose_inverse, visit_inverse
+        (V, p, p) and (J, w, w): inverse of what was eliminated.
     """
-    pose = normal.matrix[:, 10:, 10:].copy()
-    diagonal = np.arange(6)
-    pose[:, diagonal, diagonal] *= 1.0 + damping
-    right = np.concatenate([normal.matrix[:, 10:, :10], normal.right[:, 10:, None]], axis=2)
-    solved = np.linalg.solve(pose, right)
-    cross = normal.matrix[:, :10, 10:]
-    information = np.zeros((len(problem.designs), 10, 10))
-    gradient = np.zeros((len(problem.designs), 10))
-    np.add.at(information, problem.group, normal.matrix[:, :10, :10] - cross @ solved[:, :, :10])
-    np.add.at(gradient, problem.group, normal.right[:, :10] - (cross @ solved[:, :, 10:])[:, :, 0])
-    return information, gradient, solved[:, :, :10], solved[:, :, 10]
+
+    information: Array
+    gradient: Array
+    pose_by_rest: Array
+    pose: Array
+    visit_by_rest: Array
+    visit: Array
+    pose_inverse: Array
+    visit_inverse: Array
+
+    def back(self, problem: Problem, change: Array) -> tuple[Array, Array, Array]:
+        """Return the steps of views' magnifications (V, C), visits (J, w) and poses (V, p)."""
+        by_group = problem.designs @ change
+        rest = by_group[problem.group]
+        visits = self.visit
+        if problem.effects is not None:
+            own = by_group[problem.effects.visit_group]
+            visits = visits - np.einsum("jwc,jc->jw", self.visit_by_rest, own)
+            both = np.concatenate([rest, visits[problem.effects.visit]], axis=1)
+        else:
+            both = rest
+        return rest, visits, self.pose - np.einsum("vpq,vq->vp", self.pose_by_rest, both)
+
+
+def schur_complement(
+    problem: Problem, state: State, normal: NormalEquations, damping: float
+) -> Eliminated:
+    """Eliminate the poses, then the visits."""
+    first = problem.shared_columns
+    outer = first + problem.visit_columns
+    pose_inverse = _damped_inverse(normal.matrix[:, outer:, outer:], damping)
+    right = np.concatenate([normal.matrix[:, outer:, :outer], normal.right[:, outer:, None]], axis=2)
+    solved = pose_inverse @ right
+    cross = normal.matrix[:, :outer, outer:]
+    own = normal.matrix[:, :outer, :outer] - cross @ solved[:, :, :outer]
+    gradient = normal.right[:, :outer] - (cross @ solved[:, :, outer:])[:, :, 0]
+    groups = len(problem.designs)
+    if problem.effects is None:
+        empty = np.zeros((0, 0, first)), np.zeros((0, 0)), np.zeros((0, 0, 0))
+        visit_by_rest, visit, visit_inverse = empty
+        group = problem.group
+    else:
+        group = problem.effects.visit_group
+        own = sum_by(problem.effects.visit, len(group), own)
+        gradient = sum_by(problem.effects.visit, len(group), gradient)
+        sigma = visit_sigmas(problem)
+        own[:, [first, first + 1], [first, first + 1]] += sigma**-2.0
+        gradient[:, first:] -= state.visits / sigma**2
+        visit_inverse = _damped_inverse(own[:, first:, first:], damping)
+        visit_by_rest = visit_inverse @ own[:, first:, :first]
+        visit = (visit_inverse @ gradient[:, first:, None])[:, :, 0]
+        across = own[:, :first, first:]
+        gradient = gradient[:, :first] - (across @ visit[:, :, None])[:, :, 0]
+        own = own[:, :first, :first] - across @ visit_by_rest
+    return Eliminated(
+        information=sum_by(group, groups, own),
+        gradient=sum_by(group, groups, gradient),
+        pose_by_rest=solved[:, :, :outer],
+        pose=solved[:, :, outer],
+        visit_by_rest=visit_by_rest,
+        visit=visit,
+        pose_inverse=pose_inverse,
+        visit_inverse=visit_inverse,
+    )
+
+
+def _damped_inverse(matrix: Array, damping: float) -> Array:
+    diagonal = np.arange(matrix.shape[-1])
+    out = matrix.copy()
+    out[:, diagonal, diagonal] *= 1.0 + damping
+    return invert_scaled(out)
+
+
+def sum_by(index: Indices, count: int, values: Array) -> Array:
+    """Return the sums (count, ...) of values (n, ...) that have the same index."""
+    out = np.zeros((count, *values.shape[1:]))
+    np.add.at(out, index, values)
+    return out
 
 
 def reduced_normal_equations(
@@ -282,7 +584,7 @@ def reduced_normal_equations(
 ) -> tuple[Array, Array]:
     """Assemble the reduced normal equations (K, K) and (K,) of theta, with its prior.
 
-    ``information`` (M, 10, 10) and ``gradient`` (M, 10) are the blocks of each magnification.
+    ``information`` (M, C, C) and ``gradient`` (M, C) are the blocks of each magnification.
     """
     designs = problem.designs
     matrix = np.einsum("mpk,mpq,mql->kl", designs, information, designs, optimize=True)
@@ -292,19 +594,38 @@ def reduced_normal_equations(
     return matrix, right
 
 
-def retract(problem: Problem, state: State, change: Array, pose: Array) -> State:
-    """Return the state after changes of theta (K,) and of the poses (V, 6)."""
+def retract(problem: Problem, state: State, change: Array, pose: Array, visits: Array) -> State:
+    """Return the state after changes of theta (K,), of the poses (V, p) and of the visits (J, w)."""
     return State(
         state.theta + change,
         rotations_from_vectors(pose[:, :3]) @ state.rotations,
-        state.translations_m + pose[:, 3:] * problem.unit_m[:, None],
+        state.translations_m + pose[:, 3:6] * problem.unit_m[:, None],
+        state.visits + visits if len(state.visits) else state.visits,
+        state.drift_px + pose[:, 6:] if len(state.drift_px) else state.drift_px,
     )
+
+
+def empty_effects(problem: Problem, state: State) -> State:
+    """Return the state with effects of zero, as many as the problem has."""
+    effects = problem.effects
+    if effects is None:
+        return replace(state, visits=np.zeros((0, 2)), drift_px=np.zeros((0, 2)))
+    shape = len(effects.visit_group), len(problem.group)
+    return replace(state, visits=np.zeros((shape[0], 2)), drift_px=np.zeros((shape[1], 2)))
 
 
 def select_views(problem: Problem, chosen: Mask) -> Problem:
     """Return the problem with only some of its views."""
     points = chosen[problem.view_of_point]
     counts = np.diff(problem.starts)[chosen]
+    effects = problem.effects
+    if effects is not None:
+        effects = replace(
+            effects,
+            visit=effects.visit[chosen],
+            drift_sigma_px=effects.drift_sigma_px[chosen],
+            frame_time=effects.frame_time[points],
+        )
     return replace(
         problem,
         board_m=problem.board_m[points],
@@ -314,4 +635,7 @@ def select_views(problem: Problem, chosen: Mask) -> Problem:
         group=problem.group[chosen],
         unit_m=problem.unit_m[chosen],
         height_sigma_m=problem.height_sigma_m[chosen],
+        square_class=None if problem.square_class is None else problem.square_class[chosen],
+        attitudes=None if problem.attitudes is None else problem.attitudes.chosen(chosen),
+        effects=effects,
     )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.calibration.normal_equations import MISS_NAMES
+from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 
 __all__ = ["Priors", "Setup"]
@@ -39,6 +42,20 @@ class Priors:
         k squared. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
         what vendors promise of a magnification. A change that the data do not determine is
         uncertain by this much, and not assumed to be zero.
+    height_sigma_m
+        Height of a view: a tenth of a millimetre is what a stage that is not quite eucentric adds.
+    visit_scale_sigma, visit_height_sigma_m, drift_sigma_px
+        Usual spread of the scale and the height from visit to visit, and of the drift within an
+        image: one tenth of a per cent is a good microscope, and twenty micrometres the depth of
+        focus at a low magnification. They count as one observation.
+    axis_miss_sigma_m
+        How far the tilt axis misses the specimen, per direction.
+    grid_stretch_sigma, grid_shear_sigma, grid_curvature_sigma, square_ratio_sigma
+        Shape of the grid: a part in a thousand between its axes, a radius of curvature of 50 mm, and
+        one part in two thousand between the sizes of its squares, as lithography reaches.
+    stage_tilt_sigma, stage_axis_sigma, stage_wedge_sigma, untilted_sigma_rad
+        Constant error of the tilt of a stage (half a degree) and of the direction of its axis (two
+        degrees), the wedge between specimen and stage, and the tilt of an untilted view.
     """
 
     centre_fraction: float = 0.08
@@ -60,18 +77,36 @@ class Priors:
     aspect_jump: float = 0.01
     skew_jump: float = 0.005
     height_sigma_m: float = 1e-4
+    visit_scale_sigma: float = 1e-3
+    visit_height_sigma_m: float = 2e-5
+    drift_sigma_px: float = 0.1
+    axis_miss_sigma_m: float = 3e-4
+    grid_stretch_sigma: float = 1e-3
+    grid_shear_sigma: float = 1e-3
+    grid_curvature_sigma: float = 20.0
+    square_ratio_sigma: float = 5e-4
+    stage_tilt_sigma: float = 0.0087
+    stage_axis_sigma: float = 0.035
+    stage_wedge_sigma: float = 0.0087
+    untilted_sigma_rad: float = 0.0087
+    is_wide: bool = False
 
     def of_wide_views(self, rho: float) -> Priors:
         """Return the priors of a lens with the pivot at ``1 / rho`` and not a few centimetres away.
 
         Only the order of magnitude of the distance and of the heights is presumed.
         """
-        return replace(self, rho_mean=rho, rho_sigma=rho, height_sigma_m=0.3 / rho)
+        return replace(self, rho_mean=rho, rho_sigma=rho, height_sigma_m=0.3 / rho, is_wide=True)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything common to all problems over one set of views, in order of their magnifications."""
+    """Everything common to all problems over one set of views, in order of their magnifications.
+
+    With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.normal_equations.Problem`),
+    the problems also have the effects of visits and of drift within the images.
+    ``stage_rotation_rad`` is where the constant error of the stage's rotation starts.
+    """
 
     views: tuple[GridView, ...]
     magnifications: Array
@@ -79,6 +114,9 @@ class Setup:
     display_width_m: float
     priors: Priors
     breakpoints: tuple[float, ...] = ()
+    shared: tuple[str, ...] = ()
+    axis: StageAxis = StageAxis()
+    stage_rotation_rad: float = 0.0
 
     @property
     def norm_px(self) -> float:
@@ -93,6 +131,44 @@ class Setup:
     def nominal_px_per_m(self, g: Array) -> Array:
         """Return the scales in px per m that the display width alone predicts."""
         return g * self.image_size[0] / self.display_width_m
+
+    @property
+    def visits(self) -> tuple[Indices, Indices]:
+        """(V,) visit of each view, and (J,) index of the magnification of each visit."""
+        keys = [(float(v.magnification), v.visit) for v in self.views]
+        known = sorted(set(keys))
+        visit = np.array([known.index(key) for key in keys], dtype=np.intp)
+        return visit, np.searchsorted(self.magnifications, [g for g, _ in known]).astype(np.intp)
+
+    @property
+    def squares_m(self) -> tuple[float, ...]:
+        """Sizes of squares, the most frequent one first: the others are compared with it."""
+        counts = Counter(v.square_m for v in self.views)
+        return tuple(size for size, _ in counts.most_common())
+
+    def shared_priors(self) -> tuple[Array, Array]:
+        """Return means and sigmas of the shared unknowns."""
+        p = self.priors
+        sigmas = {
+            "grid_stretch": p.grid_stretch_sigma,
+            "grid_shear": p.grid_shear_sigma,
+            "grid_curvature_m": p.grid_curvature_sigma,
+            "stage_tilt": p.stage_tilt_sigma,
+            "stage_axis": p.stage_axis_sigma,
+            # The grid may lie on the stage in any direction.
+            "stage_rotation": np.pi,
+            "stage_wedge_x": p.stage_wedge_sigma,
+            "stage_wedge_y": p.stage_wedge_sigma,
+            **dict.fromkeys(MISS_NAMES, p.axis_miss_sigma_m),
+        }
+        sigma = [sigmas.get(name, p.square_ratio_sigma) for name in self.shared]
+        return np.zeros(len(sigma)), np.array(sigma, dtype=np.float64)
+
+    def shared_start(self) -> Array:
+        """Return the values at which the shared unknowns start."""
+        return np.array(
+            [self.stage_rotation_rad if name == "stage_rotation" else 0.0 for name in self.shared]
+        )
 
     def change_prior_of(self, name: str) -> float:
         """Return the 1-sigma of the change of a camera parameter over the calibrated range."""

@@ -9,8 +9,17 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.normal_equations import Problem, State, make_problem, whitened_norm
+from semcal_ros.core.calibration.normal_equations import (
+    Effects,
+    Problem,
+    State,
+    make_problem,
+    pose_priors,
+    whitened_norm,
+)
 from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.stage import attitudes
+from semcal_ros.core.calibration.variance_components import VarianceComponents
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, design_matrix
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -26,6 +35,8 @@ __all__ = [
     "stack_coefficients",
     "variance_factor",
     "with_coefficients",
+    "with_shared",
+    "with_shared_values",
 ]
 
 Functions = Mapping[str, ContinuousFunction]
@@ -38,9 +49,15 @@ _POSE_ITERATIONS = 12
 
 
 def build_problem(
-    setup: Setup, functions: Functions, views: Sequence[GridView], height_sigma_m: Array | float
+    setup: Setup,
+    functions: Functions,
+    views: Sequence[GridView],
+    spread: VarianceComponents | float,
 ) -> Problem:
-    """Set up the adjustment of ``views`` with functions of the given kinds and sizes."""
+    """Set up the adjustment of ``views`` with functions of the given kinds and sizes.
+
+    Given one number, the 1-sigma of the heights, it has neither shared unknowns nor effects.
+    """
     nominal = setup.nominal_px_per_m(setup.magnifications)
     designs = np.stack(
         [
@@ -49,7 +66,12 @@ def build_problem(
         ]
     )
     mean, sigma = prior_vectors(setup, functions)
-    return make_problem(
+    shared = () if isinstance(spread, float) else setup.shared
+    if shared:
+        designs = with_shared(designs, len(shared))
+        own_mean, own_sigma = setup.shared_priors()
+        mean, sigma = np.concatenate([mean, own_mean]), np.concatenate([sigma, own_sigma])
+    problem = make_problem(
         views,
         setup.magnifications,
         designs,
@@ -57,8 +79,48 @@ def build_problem(
         nominal_px_per_m=nominal,
         prior_mean=mean,
         prior_sigma=sigma,
-        height_sigma_m=height_sigma_m,
+        height_sigma_m=spread if isinstance(spread, float) else spread.height_sigma_m,
     )
+    if not shared or isinstance(spread, float):
+        return problem
+    visit, visit_group = setup.visits
+    height = setup.image_size[1]
+    y = np.concatenate([v.image_xy[:, 1] for v in views])
+    effects = Effects(
+        visit,
+        visit_group,
+        spread.scale.sigma,
+        spread.visit_height.sigma,
+        spread.drift_sigma_px,
+        (y - 0.5 * (height - 1)) / height,
+    )
+    sizes = setup.squares_m
+    return replace(
+        problem,
+        shared=shared,
+        square_class=np.array([sizes.index(v.square_m) for v in views], dtype=np.intp),
+        effects=effects,
+        attitudes=attitudes(
+            [v.stage for v in views],
+            [v.untilted for v in views],
+            setup.axis,
+            setup.priors.untilted_sigma_rad,
+        ),
+    )
+
+
+def with_shared(designs: Array, count: int) -> Array:
+    """Return designs (M, 10, K) with ``count`` more unknowns, the same at every magnification."""
+    groups, rows, columns = designs.shape
+    out = np.zeros((groups, rows + count, columns + count))
+    out[:, :rows, :columns] = designs
+    out[:, np.arange(rows, rows + count), np.arange(columns, columns + count)] = 1.0
+    return out
+
+
+def with_shared_values(functions: Functions, theta: Array, shared: int) -> Array:
+    """Return the coefficients of the functions, followed by the last ``shared`` values of theta."""
+    return np.concatenate([stack_coefficients(functions), theta[len(theta) - shared :]])
 
 
 def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
@@ -120,29 +182,33 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     rotations = mirrored_tilt(state.rotations)
     # Turning about the middle of the visible points keeps the view in place.
     moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)
-    mirrored = State(state.theta, rotations, state.translations_m + moved)
+    mirrored = replace(state, rotations=rotations, translations_m=state.translations_m + moved)
     own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
     other = refine(problem, mirrored, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
     if not np.isfinite(other.cost):
         return own.state, 0
     better = _view_costs(problem, other) < _view_costs(problem, own) * (1.0 - 1e-6)
     pick = better[:, None, None]
-    turned = State(
-        state.theta,
-        np.where(pick, other.state.rotations, own.state.rotations),
-        np.where(pick[:, 0], other.state.translations_m, own.state.translations_m),
+    turned = replace(
+        own.state,
+        rotations=np.where(pick, other.state.rotations, own.state.rotations),
+        translations_m=np.where(pick[:, 0], other.state.translations_m, own.state.translations_m),
+        drift_px=np.where(pick[:, 0], other.state.drift_px, own.state.drift_px)
+        if len(own.state.drift_px)
+        else own.state.drift_px,
     )
     return turned, int(better.sum())
 
 
 def _view_costs(problem: Problem, result: BundleResult) -> Array:
     square = whitened_norm(problem, result.residuals_px) ** 2 * result.huber_weight
-    height = result.state.translations_m[:, 2] / problem.height_sigma_m
-    return np.bincount(problem.view_of_point, weights=square) + height**2
+    own = pose_priors(problem, result.state)[:, :, -1]
+    return np.bincount(problem.view_of_point, weights=square) + np.sum(own**2, axis=1)
 
 
 def variance_factor(problem: Problem, result: BundleResult) -> float:
     """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
     norm2 = whitened_norm(problem, result.residuals_px) ** 2 * result.huber_weight
-    freedom = 2.0 * result.huber_weight.sum() - 6 * len(problem.group) - len(result.state.theta)
+    unknowns = problem.pose_columns * len(problem.group) + len(result.state.theta)
+    freedom = 2.0 * result.huber_weight.sum() - unknowns - result.state.visits.size
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))

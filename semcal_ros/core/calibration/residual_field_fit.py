@@ -13,13 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate
+from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
+    State,
+    pose_priors,
+    sum_by,
+    visit_sigmas,
     whiten,
     whitened_rows,
-    with_height_prior,
 )
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor
@@ -67,12 +70,12 @@ class FieldSystem:
     Attributes
     ----------
     information, right
-        (N, 10 + F, 10 + F) and (N, 10 + F): the cost of camera and slice z of a member is
+        (N, C + F, C + F) and (N, C + F): the cost of camera, shared unknowns and slice z of a member is
         ``0.5 z' information z - right' z`` plus a constant, in units of the noise variance.
     group
         (N,) index of each member's magnification.
     designs
-        (M, 10, K): camera of each magnification per unit of theta.
+        (M, C, K): camera and shared unknowns of each magnification per unit of theta.
     weights
         (M, ng): slice of the field per coefficient in log g.
     theta_mean, theta_precision
@@ -89,26 +92,26 @@ class FieldSystem:
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
         """Assemble the normal equations of theta and the field, which has precision ``prior``."""
-        count, width = len(self.designs), self.right.shape[1]
+        count, own_size, width = len(self.designs), self.designs.shape[1], self.right.shape[1]
         blocks, rights = np.zeros((count, width, width)), np.zeros((count, width))
         for v in np.flatnonzero(keep):
             blocks[self.group[v]] += self.information[v]
             rights[self.group[v]] += self.right[v]
         size = self.designs.shape[2]
         turned = np.swapaxes(self.designs, 1, 2)
-        cross = np.einsum("mka,mg->kga", turned @ blocks[:, :10, 10:], self.weights)
-        ng, slice_size = self.weights.shape[1], width - 10
+        cross = np.einsum("mka,mg->kga", turned @ blocks[:, :own_size, own_size:], self.weights)
+        ng, slice_size = self.weights.shape[1], width - own_size
         pairs = (self.weights[:, :, None] * self.weights[:, None, :]).reshape(count, -1)
-        own = pairs.T @ blocks[:, 10:, 10:].reshape(count, -1)
+        own = pairs.T @ blocks[:, own_size:, own_size:].reshape(count, -1)
         own = own.reshape(ng, ng, slice_size, slice_size).transpose(0, 2, 1, 3)
         matrix = np.empty((size + len(prior), size + len(prior)))
-        matrix[:size, :size] = (turned @ blocks[:, :10, :10] @ self.designs).sum(axis=0)
+        matrix[:size, :size] = (turned @ blocks[:, :own_size, :own_size] @ self.designs).sum(axis=0)
         matrix[np.diag_indices(size)] += self.theta_precision
         matrix[:size, size:] = cross.reshape(size, -1)
         matrix[size:, :size] = matrix[:size, size:].T
         matrix[size:, size:] = own.reshape(len(prior), -1) + prior
-        camera = np.einsum("mpk,mp->k", self.designs, rights[:, :10])
-        field = np.einsum("mg,ma->ga", self.weights, rights[:, 10:]).ravel()
+        camera = np.einsum("mpk,mp->k", self.designs, rights[:, :own_size])
+        field = np.einsum("mg,ma->ga", self.weights, rights[:, own_size:]).ravel()
         return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
 
     def solve(self, keep: Mask, prior: Array) -> Array:
@@ -188,31 +191,45 @@ def field_system(
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
     whitened = whitened_rows(scaled, result.state)
     size = field.slice_size
-    width = 17 + size
-    augmented = np.empty((len(setup.views), width, width))
+    priors = pose_priors(scaled, result.state)
+    inner = priors.shape[2] - 1
+    # The field comes after the unknowns of a view, before the right-hand side.
+    width = inner + size + 1
+    place = np.r_[0:inner, width - 1]
+    augmented = np.zeros((len(setup.views), width, width))
+    augmented[:, place[:, None], place] = np.swapaxes(priors, 1, 2) @ priors
+    observed = np.r_[whitened.columns[:-1], inner : inner + size, width - 1]
     one = field.at(float(setup.magnifications[0]))
     for v, view in enumerate(setup.views):
         part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
         spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px)
-        rows = np.zeros((2, width, len(spline)))
+        rows = np.zeros((2, size, len(spline)))
         # The residual is observed plus field minus projected, so the field has the opposite sign of
         # a projection.
-        rows[0, 16:-1:2] = rows[1, 17:-1:2] = -setup.norm_px * spline.T
+        rows[0, 0::2] = rows[1, 1::2] = -setup.norm_px * spline.T
         whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
-        rows[:, :16] = whitened.rows[:, :16, part]
-        rows[:, -1] = whitened.rows[:, 16, part]
-        augmented[v] = rows[0] @ rows[0].T + rows[1] @ rows[1].T
-    with_height_prior(scaled, result.state, augmented, 15)
-    information, right = _without_poses(augmented)
+        own = whitened.rows[:, :, part]
+        x, y = np.concatenate([own[:, :-1], rows, own[:, -1:]], axis=1)
+        augmented[v][np.ix_(observed, observed)] += x @ x.T + y @ y.T
+    few = len(setup.magnifications) < _ENOUGH_MAGNIFICATIONS
+    if few and scaled.effects is not None:
+        # The members are views: each is taken for a visit of its own.
+        own_visit = np.arange(len(setup.views), dtype=np.intp)
+        state = replace(result.state, visits=result.state.visits[scaled.effects.visit])
+        effects = replace(scaled.effects, visit=own_visit, visit_group=problem.group)
+        scaled = replace(scaled, effects=effects)
+    else:
+        state = result.state
+    information, right = _without_poses_and_visits(scaled, state, augmented)
     weights = np.stack([field.weights(float(g)) for g in setup.magnifications])
     slices = weights @ field.coefficients.reshape(len(field.coefficients), -1)
-    z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[problem.group]
+    group = problem.group if scaled.effects is None else scaled.effects.visit_group
+    z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[group]
     right += np.einsum("vpq,vq->vp", information, z)
-    group = problem.group
-    if len(setup.magnifications) >= _ENOUGH_MAGNIFICATIONS:
-        first = np.searchsorted(group, np.arange(len(setup.magnifications)))
-        information, right = (np.add.reduceat(a, first, axis=0) for a in (information, right))
-        group = np.arange(len(setup.magnifications), dtype=np.intp)
+    if not few:
+        count = len(setup.magnifications)
+        information, right = (sum_by(group, count, a) for a in (information, right))
+        group = np.arange(count, dtype=np.intp)
     return FieldSystem(
         information,
         right,
@@ -224,17 +241,33 @@ def field_system(
     )
 
 
-def _without_poses(augmented: Array) -> tuple[Array, Array]:
-    """Eliminate the pose from augmented normal equations (V, k, k) by the Schur complement.
+def _without_poses_and_visits(
+    problem: Problem, state: State, augmented: Array
+) -> tuple[Array, Array]:
+    """Eliminate poses, then visits, from augmented normal equations (V, k, k).
 
-    The order is camera, pose, field, right-hand side.
+    The order is camera and shared unknowns, visit, pose, field, right-hand side. Returns matrices
+    and right-hand sides of each visit, or of each view where there are no visits.
     """
-    keep = np.r_[0:10, 16 : augmented.shape[1]]
-    pose = augmented[:, 10:16, 10:16]
-    cross = augmented[:, 10:16][:, :, keep]
-    left = augmented[:, keep[:, None], keep]
-    left -= np.swapaxes(cross, 1, 2) @ np.linalg.solve(pose, cross)
+    first, visits, poses = problem.shared_columns, problem.visit_columns, problem.pose_columns
+    left = _eliminate(augmented, first + visits, poses)
+    if problem.effects is not None:
+        left = sum_by(problem.effects.visit, len(problem.effects.visit_group), left)
+        sigma = visit_sigmas(problem)
+        own = np.arange(first, first + visits)
+        left[:, own, own] += sigma**-2.0
+        left[:, own, -1] -= state.visits / sigma**2
+        left = _eliminate(left, first, visits)
     return left[:, :-1, :-1], left[:, :-1, -1]
+
+
+def _eliminate(augmented: Array, first: int, count: int) -> Array:
+    """Eliminate ``count`` unknowns from index ``first`` on by the Schur complement."""
+    keep = np.r_[0:first, first + count : augmented.shape[1]]
+    own = augmented[:, first : first + count, first : first + count]
+    cross = augmented[:, first : first + count][:, :, keep]
+    left = augmented[:, keep[:, None], keep]
+    return left - np.swapaxes(cross, 1, 2) @ invert_scaled(own) @ cross
 
 
 def _second_differences(count: int) -> Array:

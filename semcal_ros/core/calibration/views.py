@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, AnyImage, Array, Mask
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
@@ -52,6 +53,16 @@ class GridView:
         For messages and reports, such as the frame number.
     covariance_px2
         (n, 2, 2) covariance of the observations, or None where only ``sigma_px`` is known.
+    visit
+        Number of the visit of this magnification, in the order of the recording: a stretch without
+        a change of magnification in between. -1 where it is not known, which makes all views at
+        one magnification one visit.
+    square_m
+        Side of the squares in view, m; 0 where it is not known.
+    stage
+        What the stage said about this view, or None.
+    untilted
+        Whether the specimen is known not to be tilted.
     """
 
     magnification: float
@@ -60,6 +71,10 @@ class GridView:
     sigma_px: Array
     name: str = ""
     covariance_px2: Array | None = None
+    visit: int = -1
+    square_m: float = 0.0
+    stage: StageReading | None = None
+    untilted: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.board_xy_m)

@@ -1,0 +1,255 @@
+"""Poses that a specimen stage sets: its readings, and how they constrain the pose of a view.
+
+The stage tilts about one axis that lies in the image plane, and turns the specimen about its own
+normal before the tilt (a rotation on top of the tilt, as in every eucentric SEM stage). With the
+direction ``alpha`` of the axis, the tilt ``t``, the rotation ``r`` and the scan rotation ``s``, the
+specimen's orientation in the sem frame is
+
+    R = Rz(s) Rz(alpha) Rx(t) Rz(-alpha) Rz(r) W
+
+``W`` is a small wedge between the specimen and the stage. The plane of the specimen keeps its
+distance from the axis. With the axis at the lateral distance ``u`` from the beam and ``z0`` below
+the untilted specimen, a plane of slope ``grad z`` crosses the beam at
+
+    h = z0 (1 - 1 / n_z) - u . grad z,    grad z = -(n_x, n_y) / n_z
+
+where ``n`` is the normal of the plane; both terms vanish without a tilt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "OFFSET_NAMES",
+    "Attitudes",
+    "StageAxis",
+    "StageReading",
+    "attitude_residuals",
+    "attitudes",
+    "height_of_tilt",
+    "stage_rotations",
+]
+
+OFFSET_NAMES: tuple[str, ...] = (
+    "stage_tilt",
+    "stage_axis",
+    "stage_rotation",
+    "stage_wedge_x",
+    "stage_wedge_y",
+)
+"""Constant errors of a stage, rad: what is added to its tilt, to the direction of its axis and to
+its rotation, and the two angles of the wedge."""
+
+
+@dataclass(frozen=True)
+class StageReading:
+    """What the stage said about one view; None where it does not say.
+
+    Attributes
+    ----------
+    tilt_rad, rotation_rad, scan_rotation_rad
+        See the module.
+    """
+
+    tilt_rad: float | None = None
+    rotation_rad: float | None = None
+    scan_rotation_rad: float | None = None
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if value is not None and not np.isfinite(value):
+                raise InvalidValueError(f"{item.name} {value}", expected="a finite angle, rad")
+
+
+@dataclass(frozen=True)
+class StageAxis:
+    """The stage of a microscope, and how far its readings are trusted.
+
+    Attributes
+    ----------
+    tilt_axis_rad
+        Direction of the tilt axis in the image without scan rotation, from +x towards +y.
+    tilt_sigma_rad, rotation_sigma_rad
+        1-sigma of the readings, without their constant offsets.
+    """
+
+    tilt_axis_rad: float = 0.0
+    tilt_sigma_rad: float = 0.0035
+    rotation_sigma_rad: float = 0.0087
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Orientations that V views are presumed to have.
+
+    Attributes
+    ----------
+    tilt_rad, rotation_rad, scan_rotation_rad
+        (V,) readings, zero where there is none.
+    axis_rad
+        Direction of the tilt axis.
+    sigma_rad
+        (V, 3) 1-sigma about the tilt axis, across it in the specimen's plane, and about the
+        specimen's normal; infinite where nothing is known.
+    """
+
+    tilt_rad: Array
+    rotation_rad: Array
+    scan_rotation_rad: Array
+    axis_rad: float
+    sigma_rad: Array
+
+    def chosen(self, keep: Mask) -> Attitudes:
+        """Return those of some of the views."""
+        return Attitudes(
+            self.tilt_rad[keep],
+            self.rotation_rad[keep],
+            self.scan_rotation_rad[keep],
+            self.axis_rad,
+            self.sigma_rad[keep],
+        )
+
+
+def attitudes(
+    readings: list[StageReading | None],
+    untilted: list[bool],
+    axis: StageAxis,
+    untilted_sigma_rad: float,
+) -> Attitudes:
+    """Collect what is known about the orientations of views.
+
+    Parameters
+    ----------
+    readings
+        One for each view, or None.
+    untilted
+        Whether each view without a reading of its tilt is known not to be tilted.
+    axis
+        The stage.
+    untilted_sigma_rad
+        1-sigma of the tilt of such a view, in both directions.
+    """
+    count = len(readings)
+    values, sigma = np.zeros((3, count)), np.full((count, 3), np.inf)
+    for v, (reading, flat) in enumerate(zip(readings, untilted, strict=True)):
+        if reading is not None and reading.scan_rotation_rad is not None:
+            values[2, v] = reading.scan_rotation_rad
+        if reading is not None and reading.tilt_rad is not None:
+            values[0, v] = reading.tilt_rad
+            sigma[v, :2] = axis.tilt_sigma_rad
+            if reading.rotation_rad is not None:
+                values[1, v] = reading.rotation_rad
+                sigma[v, 2] = axis.rotation_sigma_rad
+        elif flat:
+            sigma[v, :2] = untilted_sigma_rad
+    return Attitudes(values[0], values[1], values[2], axis.tilt_axis_rad, sigma)
+
+
+def _about_beam(angles_rad: Array) -> Array:
+    """Return the (V, 3, 3) rotations about z, from x towards y."""
+    return rotations_from_vectors(np.outer(angles_rad, [0.0, 0.0, 1.0]))
+
+
+def stage_rotations(known: Attitudes, offsets: Array) -> tuple[Array, Array]:
+    """Return the (V, 3, 3) orientations for ``offsets`` (5,), and their (V, 3, 5) derivative.
+
+    The derivative is that of the rotation vector in the sem frame, by ``OFFSET_NAMES``.
+    """
+    count = len(known.tilt_rad)
+    scan = _about_beam(known.scan_rotation_rad)
+    direction = known.axis_rad + offsets[1]
+    axis = np.array([np.cos(direction), np.sin(direction), 0.0])
+    lean = scan @ rotations_from_vectors((known.tilt_rad + offsets[0])[:, None] * axis)
+    wedge = rotations_from_vectors(np.array([[offsets[3], offsets[4], 0.0]]))[0]
+    turned = lean @ _about_beam(known.rotation_rad + offsets[2])
+    beam = np.array([0.0, 0.0, 1.0])
+    derivative = np.empty((count, 3, 5))
+    derivative[:, :, 0] = scan @ axis
+    derivative[:, :, 1] = beam - lean @ beam
+    derivative[:, :, 2] = lean @ beam
+    derivative[:, :, 3:] = turned[:, :, :2]
+    return turned @ wedge, derivative
+
+
+def _turn_between_normals(expected: Array, rotations: Array) -> Array:
+    """Return the (V, 3) smallest rotation vectors between the normals of orientations."""
+    ours, theirs = rotations[:, :, 2], expected[:, :, 2]
+    across = np.cross(theirs, ours)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.sum(ours * theirs, axis=1))
+    return across * (angle / np.maximum(sine, 1e-300))[:, None]
+
+
+def attitude_residuals(
+    known: Attitudes, offsets: Array, rotations: Array
+) -> tuple[Array, Array, Array]:
+    """Compare orientations (V, 3, 3) with those that are presumed.
+
+    Returns
+    -------
+    residuals
+        (V, 3) rotation that is left, in sigmas; zero where nothing is known.
+    by_turn
+        (V, 3, 3) derivative of minus the residuals by a small turn of the views in the sem frame.
+    by_offset
+        (V, 3, 5) derivative of minus the residuals by the offsets.
+    """
+    expected, derivative = stage_rotations(known, offsets)
+    left = Rotation.from_matrix(rotations @ np.swapaxes(expected, 1, 2)).as_rotvec()
+    direction = known.axis_rad + offsets[1] + known.scan_rotation_rad
+    along = np.stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)], axis=1)
+    normal = expected[:, :, 2]
+    frame = np.stack([along, np.cross(normal, along), normal], axis=1)
+    # Without a rotation there is no telling which way the grid lies: its turn is not compared.
+    blind = ~np.isfinite(known.sigma_rad[:, 2])
+    left[blind] = _turn_between_normals(expected[blind], rotations[blind])
+    weighted = frame / known.sigma_rad[:, :, None]
+    return -np.einsum("vij,vj->vi", weighted, left), weighted, -weighted @ derivative
+
+
+def height_of_tilt(
+    known_scan_rad: Array, rotations: Array, translations_m: Array, miss_m: Array
+) -> tuple[Array, Array, Array]:
+    """Compare the heights of planes on the beam with those that their tilts cause.
+
+    Parameters
+    ----------
+    known_scan_rad
+        (V,) scan rotation of each view.
+    rotations, translations_m
+        (V, 3, 3) and (V, 3) poses.
+    miss_m
+        (3,) where the axis lies: its lateral distance (x, y) from the beam, without scan rotation,
+        and how far below the untilted specimen.
+
+    Returns
+    -------
+    height_m
+        (V,) height of each plane on the beam, without what the tilt causes.
+    by_pose
+        (V, 6) derivative of ``height_m`` by a small turn and by a shift of each view.
+    by_miss
+        (V, 3) derivative by ``miss_m``.
+    """
+    normal = rotations[:, :, 2]
+    nx, ny, nz = normal.T
+    c, s = np.cos(known_scan_rad), np.sin(known_scan_rad)
+    ux, uy = c * miss_m[0] - s * miss_m[1], s * miss_m[0] + c * miss_m[1]
+    tx, ty, tz = translations_m.T
+    lateral = (nx * (tx - ux) + ny * (ty - uy)) / nz
+    height = tz + lateral - miss_m[2] * (1.0 - 1.0 / nz)
+    by_normal = np.stack([(tx - ux) / nz, (ty - uy) / nz, -(lateral + miss_m[2] / nz) / nz], axis=1)
+    by_shift = normal / nz[:, None]
+    by_miss = np.stack(
+        [-(c * nx + s * ny) / nz, -(-s * nx + c * ny) / nz, -(1.0 - 1.0 / nz)], axis=1
+    )
+    return height, np.concatenate([np.cross(normal, by_normal), by_shift], axis=1), by_miss

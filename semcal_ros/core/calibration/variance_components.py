@@ -1,0 +1,150 @@
+"""Spread of what varies between visits and views, estimated together with the calibration.
+
+A magnification does not quite come back, a stage does not keep its height, and a specimen drifts
+while it is scanned. Each is a random effect with a variance of its own. MacKay's fixed point for
+the evidence (1992, doi:10.1162/neco.1992.4.3.415), a quick form of restricted maximum likelihood,
+estimates it from the effects themselves: the sum of their squares over the number of them that the
+data determine. One pseudo-observation of the usual spread stands for what is known beforehand, so
+that a spread which the views do not determine stays at its usual value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.normal_equations import Problem
+from semcal_ros.core.calibration.priors import Priors, Setup
+
+__all__ = ["Spread", "VarianceComponents", "initial_components", "update_components"]
+
+# Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
+# mount, less than tilts that are set on purpose.
+_FLAT_RAD = np.radians(5.0)
+# Fewer views than this do not determine a spread of their own.
+_ENOUGH_HEIGHTS = 4
+# Limits of a spread, relative to its usual value. Below the lower one, no view can show it.
+_LEAST, _MOST = 0.01, 20.0
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A standard deviation, and how well it is known.
+
+    Attributes
+    ----------
+    sigma
+        The standard deviation.
+    determined
+        How many of the effects the data determine; the relative 1-sigma of ``sigma`` is
+        ``1 / sqrt(2 determined)``.
+    """
+
+    sigma: float
+    determined: float
+
+    @property
+    def sigma_of_sigma(self) -> float:
+        """1-sigma of ``sigma``; infinite where the data say nothing."""
+        return self.sigma / np.sqrt(2.0 * self.determined) if self.determined > 0.0 else np.inf
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Spread of all random effects.
+
+    Attributes
+    ----------
+    scale
+        Relative scale of a visit.
+    visit_height
+        Height that the views of a visit share, m.
+    height_sigma_m
+        (V,) height of each view, m.
+    drift_sigma_px
+        (V,) drift within each image, px per axis.
+    """
+
+    scale: Spread
+    visit_height: Spread
+    height_sigma_m: Array
+    drift_sigma_px: Array
+
+
+def initial_components(setup: Setup) -> VarianceComponents:
+    """Return the usual spreads."""
+    count, priors = len(setup.views), setup.priors
+    return VarianceComponents(
+        Spread(priors.visit_scale_sigma, 0.0),
+        Spread(priors.visit_height_sigma_m, 0.0),
+        np.full(count, priors.height_sigma_m),
+        np.full(count, priors.drift_sigma_px),
+    )
+
+
+def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
+    """Update a spread from the residuals of its prior, in sigmas, and their posterior variances."""
+    determined = float(np.sum(np.maximum(1.0 - variance, 0.0)))
+    square = (sigma**2 * float(np.sum(residuals**2)) + usual**2) / (determined + 1.0)
+    return Spread(float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined)
+
+
+def update_components(
+    setup: Setup, problem: Problem, result: BundleResult
+) -> VarianceComponents:
+    """Update all spreads from an adjustment with the ones before.
+
+    Views without tilt have a spread of heights of their own: tilting moves the specimen, while
+    views from above may all share one height.
+    """
+    priors = setup.priors
+    flat: Mask = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
+    if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:
+        flat = np.zeros_like(flat)
+    height = problem.height_sigma_m.copy()
+    for own in (flat, ~flat):
+        if np.any(own):
+            residuals = result.prior_residuals[own, 0] * problem.height_sigma_m[own] / height[own][0]
+            spread = _update(
+                float(height[own][0]), priors.height_sigma_m, residuals, result.prior_variance[own, 0]
+            )
+            height[own] = spread.sigma
+    effects = problem.effects
+    if effects is None:
+        start = initial_components(setup)
+        return VarianceComponents(start.scale, start.visit_height, height, start.drift_sigma_px)
+    sigmas = (effects.scale_sigma, effects.height_sigma_m)
+    usual = (priors.visit_scale_sigma, priors.visit_height_sigma_m)
+    visits = [
+        _update(
+            sigma,
+            own,
+            result.state.visits[:, k] / sigma,
+            result.visit_variance[:, k] / sigma**2,
+        )
+        for k, (sigma, own) in enumerate(zip(sigmas, usual, strict=True))
+    ]
+    return VarianceComponents(visits[0], visits[1], height, _drift_sigma(problem, result, priors))
+
+
+def _drift_sigma(problem: Problem, result: BundleResult, priors: Priors) -> Array:
+    """Fit the squares of the drifts by a constant and a part that grows with the scale.
+
+    A drift of the specimen is one in metres, that of the beam one in pixels. An effect that the
+    data determine to ``1 - variance`` has so much of its variance as expected square.
+    """
+    assert problem.effects is not None
+    usual = priors.drift_sigma_px
+    sigma = problem.effects.drift_sigma_px
+    scale = np.min(problem.unit_m) / problem.unit_m
+    design = np.stack([np.ones_like(scale), scale**2], axis=1)
+    determined = np.sum(np.maximum(1.0 - result.prior_variance[:, 1:3], 0.0), axis=1)
+    square = sigma**2 * np.sum(result.prior_residuals[:, 1:3] ** 2, axis=1)
+    # The weights are those of chi-squares of the spread before; the last row is the usual one.
+    rows = np.vstack([design * (determined / sigma**2)[:, None], [usual**-2.0, 0.0]])
+    found, _ = nnls(rows, np.append(square / sigma**2, 1.0))
+    return np.sqrt(np.clip(design @ found, (_LEAST * usual) ** 2, (_MOST * usual) ** 2))
