@@ -7,6 +7,7 @@ import binascii
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -18,7 +19,7 @@ import yaml
 
 from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel, ScaleSigma
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
@@ -112,6 +113,8 @@ def format_calibration(model: CalibrationModel) -> str:
             "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
         },
     }
+    if model.scale_sigma != ScaleSigma():
+        data["scale_sigma"] = asdict(model.scale_sigma)
     if field is not None:
         data["residual_field"] = _field_to(field, model.covariance[size:])
     body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
@@ -209,6 +212,7 @@ def _fields_from(data: Mapping[str, Any]) -> dict[str, Any]:
         "method": data["method"],
         "statistics": data.get("statistics", {}),
         "residual": field,
+        "scale_sigma": ScaleSigma(**data.get("scale_sigma", {})),
     }
 
 

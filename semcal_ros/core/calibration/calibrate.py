@@ -21,17 +21,25 @@ from semcal_ros.core.calibration.joint import (
     fit_joint,
     without_magnification,
 )
-from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
+from semcal_ros.core.calibration.outliers import (
+    find_change_point,
+    find_outliers,
+    find_wrong_tilts,
+)
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
+from semcal_ros.core.calibration.scale_checks import scale_warnings
+from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.summary import (
     collect_statistics,
     describe_field,
+    describe_stage,
     list_undetermined,
 )
+from semcal_ros.core.calibration.untilted import mark_untilted
 from semcal_ros.core.calibration.views import GridView, RejectedView
-from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -97,6 +105,18 @@ class CalibrationOptions:
     residual
         Whether a residual field adds to the distortion parameters (only
         ``"joint"``): ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
+    untilted
+        Names of views in which the specimen is not tilted, ``"none"``, or ``"auto"`` (see
+        :func:`~semcal_ros.core.calibration.untilted.mark_untilted`). The readings of a stage take
+        precedence over ``"auto"``.
+    squares_sigma
+        Relative 1-sigma of the size of the grid's squares, from its certificate.
+    height_sigma_m
+        1-sigma of the height of what is measured later about the plane of the untilted grid: a
+        focus that is set by eye repeats to the depth of field, which is 10 um for a resolution of
+        0.1 um and an aperture angle of 10 mrad.
+    axis
+        The tilt axis of the stage, and how far its readings are trusted.
 
     Raises
     ------
@@ -108,8 +128,13 @@ class CalibrationOptions:
     method_options: MethodOptions = MethodOptions()
     breakpoints: tuple[float, ...] = ()
     residual: str = "auto"
+    untilted: str | tuple[str, ...] = "auto"
+    squares_sigma: float = 0.0
+    height_sigma_m: float = 1e-5
+    axis: StageAxis = StageAxis()
 
     def __post_init__(self) -> None:
+        ScaleSigma(0.0, self.squares_sigma, self.height_sigma_m)
         if self.method not in METHODS:
             raise InvalidValueError(f"method {self.method!r}", expected=" or ".join(METHODS))
         if self.residual not in RESIDUAL_MODES:
@@ -169,6 +194,7 @@ class _MethodFit:
     details: dict[str, Any]
     warnings: tuple[str, ...]
     residual: ResidualField | None = None
+    repeatability: float = 0.0
 
 
 def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
@@ -239,18 +265,23 @@ def calibrate_views(
     if priors is None:
         setup = adapt_priors(setup)
     if options.method == "joint":
-        setup = add_shared_unknowns(align_lattices(setup))
+        setup = replace(setup, axis=options.axis)
+        setup = add_shared_unknowns(align_lattices(mark_untilted(setup, options.untilted)))
     outliers: tuple[RejectedView, ...] = ()
     if options.method == "joint":
-        joint, setup, outliers = _fit_without_outliers(setup, options.residual, on_stage)
+        joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
         fit = _fit_joint(setup, joint)
+        fit = replace(fit, warnings=(*notes, *fit.warnings))
     else:
         fit = _fit_discrete(setup, options.method, options.method_options)
 
-    model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual)
+    scale = ScaleSigma(fit.repeatability, options.squares_sigma, options.height_sigma_m)
+    model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
     poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
     held_out = _predict_held_out(setup, fit, options.method)
     warnings = (*fit.warnings, *list_undetermined(setup, model))
+    if options.method == "joint":
+        warnings = (*warnings, *scale_warnings(setup, joint, model))
     statistics = collect_statistics(
         setup, fit.details, fit.height_sigma_m, poses, held_out, warnings
     )
@@ -276,6 +307,7 @@ def _make_model(
     covariance: Array,
     method: str,
     residual: ResidualField | None = None,
+    scale_sigma: ScaleSigma | None = None,
 ) -> CalibrationModel:
     return CalibrationModel(
         functions=functions,
@@ -286,19 +318,29 @@ def _make_model(
         magnifications=tuple(float(g) for g in setup.magnifications),
         method=method,
         residual=residual,
+        scale_sigma=scale_sigma or ScaleSigma(),
     )
 
 
 def _fit_without_outliers(
     setup: Setup, residual: str, on_stage: Callable[[str, float], None]
-) -> tuple[JointFit, Setup, tuple[RejectedView, ...]]:
-    """Fit without the views that disagree with the others; also returns those views."""
+) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[str]]:
+    """Fit without the views, and the readings of tilts, that disagree with the others.
+
+    Also returns those views, and a warning for each reading.
+    """
     outliers: list[RejectedView] = []
+    notes: list[str] = []
     while True:
         fit = fit_joint(setup, residual, on_stage)
+        wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
+        if wrong:
+            setup, own = _without_tilts(setup, wrong)
+            notes += own
+            continue
         found = find_outliers(fit.adjustment.problem, fit.adjustment.result)
         if not found:
-            return fit, setup, tuple(outliers)
+            return fit, setup, tuple(outliers), notes
         outliers += [
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
@@ -306,6 +348,20 @@ def _fit_without_outliers(
         # At least two views of every magnification stay, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
+
+
+def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[str]]:
+    """Return the setup without the tilts of some views, and a warning for each of them."""
+    views, notes = list(setup.views), []
+    for index, sigmas in wrong.items():
+        view = views[index]
+        told = "the tilt of the stage" if view.stage is not None else "untilted"
+        notes.append(
+            f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
+            f"{sigmas:.0f} sigma; its tilt is not used"
+        )
+        views[index] = replace(view, stage=None, untilted=False)
+    return add_shared_unknowns(replace(setup, views=tuple(views))), notes
 
 
 def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
@@ -341,16 +397,18 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
         "coefficients": {name: [f.kind, f.smooth_size] for name, f in adjustment.functions.items()},
         "breakpoints": list(setup.breakpoints),
         "residual_field": describe_field(fit.field),
+        **describe_stage(setup, fit),
     }
     return _MethodFit(
         fit.padded,
-        fit.covariance * factor,
+        fit.covariance,
         lambda index: without_magnification(fit, index),
         adjustment.problem.height_sigma_m,
         (result.state.rotations, result.state.translations_m),
         details,
         tuple(warnings),
         None if fit.field is None else fit.field.field,
+        adjustment.spread.scale.sigma if setup.shared else 0.0,
     )
 
 

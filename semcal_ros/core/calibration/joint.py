@@ -15,6 +15,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
+from semcal_ros.core.calibration.line_jitter import LineJitter, estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
 from semcal_ros.core.calibration.normal_equations import (
     GRID_NAMES,
@@ -151,8 +152,9 @@ class JointFit:
         The adjustment with the chosen number of coefficients.
     padded, covariance
         The same functions with a few more coefficients, which are zero, and the covariance of all
-        of them, followed by that of the coefficients of the field, for unit variance of the
-        residuals.
+        of them, followed by that of the coefficients of the field.
+    jitter
+        Errors that corners on neighbouring lines share.
     field
         The residual field, or None.
     excess_px
@@ -162,6 +164,7 @@ class JointFit:
     adjustment: Adjustment
     padded: Functions
     covariance: Array
+    jitter: LineJitter
     field: FittedField | None
     excess_px: float
 
@@ -257,13 +260,18 @@ def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
 
 
 def _pad_covariance(
-    setup: Setup, padded: Functions, adjustment: Adjustment, field: FittedField | None
+    setup: Setup,
+    padded: Functions,
+    adjustment: Adjustment,
+    field: FittedField | None,
+    jitter: LineJitter,
 ) -> Array:
     """Return the covariance of the coefficients of the padded functions and of the field.
 
     A coefficient that was left out is not known to be zero: where the data do not determine it, its
     prior gives its uncertainty. Nor do the data say that it is zero: the estimate may also be wrong
-    by as much as all coefficients would move if the omitted ones were free.
+    by as much as all coefficients would move if the omitted ones were free. Residuals that are
+    smaller than the corners say do not make it smaller; those that lines share make it larger.
     """
     views = setup.views if field is None else undo_field(setup, field.field).views
     problem = build_problem(setup, padded, views, adjustment.spread)
@@ -284,8 +292,11 @@ def _pad_covariance(
         theta, freed = solve_field(system, field.choice.prior, field.field)
         change = freed.coefficients - field.field.coefficients
         moved = np.concatenate([theta - state.theta, change.ravel()])
-    keep = np.r_[0:size, len(state.theta) : len(moved)]
-    return (covariance + np.outer(moved, moved) / factor)[np.ix_(keep, keep)]
+    covariance = (covariance + np.outer(moved, moved) / factor) * max(factor, 1.0)
+    count = len(state.theta)
+    covariance[:count, :count] += jitter_covariance(problem, result, jitter)
+    keep = np.r_[0:size, count : len(moved)]
+    return covariance[np.ix_(keep, keep)]
 
 
 def _select_and_adjust(
@@ -439,8 +450,9 @@ def fit_joint(
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
     padded = _pad_functions(adjustment.functions)
-    covariance = _pad_covariance(setup, padded, adjustment, field)
-    return JointFit(adjustment, padded, covariance, field, excess)
+    jitter = estimate_jitter(adjustment.problem, adjustment.result)
+    covariance = _pad_covariance(setup, padded, adjustment, field, jitter)
+    return JointFit(adjustment, padded, covariance, jitter, field, excess)
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:

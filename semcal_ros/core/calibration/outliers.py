@@ -24,7 +24,7 @@ from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["ChangePoint", "find_change_point", "find_outliers"]
+__all__ = ["ChangePoint", "find_change_point", "find_outliers", "find_wrong_tilts"]
 
 
 # Gain in half chi-squares, 2.7 standard deviations: a recording without a jump is suspected in one
@@ -79,6 +79,27 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
             best_gain = gain
             best = ChangePoint(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
     return best
+
+
+# Deviation of a tilt from what the stage says, in sigmas, beyond which one of them is wrong.
+_TILT_SIGMAS = 5.0
+# A residual that the view itself hardly determines says nothing.
+_LEAST_DETERMINED = 0.02
+
+
+def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, float]:
+    """Find the views whose tilt contradicts the stage; index and contradiction in sigmas of each.
+
+    One wrong reading moves the constant offsets, and with them all the others: only those that are
+    at least half as wrong as the worst are returned.
+    """
+    if problem.attitudes is None:
+        return {}
+    left = result.prior_residuals[:, -3:]
+    free = np.maximum(1.0 - result.prior_variance[:, -3:], _LEAST_DETERMINED)
+    deviation = np.max(np.abs(left) / np.sqrt(free), axis=1)
+    limit = max(_TILT_SIGMAS, 0.5 * float(deviation.max()))
+    return {int(v): float(deviation[v]) for v in np.flatnonzero(deviation > limit)}
 
 
 # Largest deviation of a height in robust standard deviations: heights are a mixture of views with

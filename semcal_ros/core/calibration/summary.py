@@ -10,11 +10,11 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
-from semcal_ros.core.calibration.joint import FittedField
+from semcal_ros.core.calibration.joint import FittedField, JointFit
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = ["collect_statistics", "describe_field", "list_undetermined"]
+__all__ = ["collect_statistics", "describe_field", "describe_stage", "list_undetermined"]
 
 
 def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
@@ -29,6 +29,35 @@ def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
         "worthwhile": choice.worthwhile,
         "converged": fitted.settled,
     }
+
+
+def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
+    """Describe what the views tell about the stage, the grid and the repeatability.
+
+    Each value has its 1-sigma in the key that ends in ``_sigma``.
+    """
+    if not setup.shared:
+        return {}
+    adjustment = fit.adjustment
+    count = len(setup.shared)
+    values = adjustment.result.state.theta[-count:]
+    sigmas = np.sqrt(np.maximum(np.diag(adjustment.result.covariance)[-count:], 0.0))
+    shared: dict[str, float] = {}
+    for name, value, sigma in zip(setup.shared, values, sigmas, strict=True):
+        shared[name], shared[f"{name}_sigma"] = float(value), float(sigma)
+    spread = adjustment.spread
+    return {
+        "grid_and_stage": shared,
+        "repeatability": spread.scale.sigma,
+        "repeatability_sigma": _finite_or_none(spread.scale.sigma_of_sigma),
+        "visit_height_sigma_m": spread.visit_height.sigma,
+        "drift_sigma_px": [float(spread.drift_sigma_px.min()), float(spread.drift_sigma_px.max())],
+        "line_jitter_px": fit.jitter.sigma_px,
+    }
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def list_undetermined(setup: Setup, model: CalibrationModel) -> list[str]:
@@ -78,7 +107,7 @@ def collect_statistics(
             }
             for g in setup.magnifications
         ],
-        "gauge": "the heights of the views about the reference plane have zero prior mean",
+        "gauge": "the reference plane is that of the untilted views: their heights have zero prior mean",
         "priors": {
             **asdict(setup.priors),
             "height_sigma_m": float(np.max(height_sigma_m)),

@@ -15,7 +15,7 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["FUNCTION_NAMES", "CalibrationModel", "checked_magnification", "design_matrix"]
+__all__ = ["FUNCTION_NAMES", "CalibrationModel", "ScaleSigma", "checked_magnification", "design_matrix"]
 
 
 # The scale is kept relative to the nominal one, width g / display width, so that it is a number
@@ -52,6 +52,37 @@ def design_matrix(
 
 
 @dataclass(frozen=True)
+class ScaleSigma:
+    """What adds to the uncertainty of the scale, beyond the covariance of the calibration.
+
+    Each is common to a whole picture, so no number of calibration images makes it smaller.
+
+    Attributes
+    ----------
+    repeatability
+        Relative 1-sigma with which the scale comes back when a magnification is set again.
+    grid
+        Relative 1-sigma of the size of the squares, from the grid's certificate.
+    height_m
+        1-sigma of the height of what is measured, about the plane of the untilted grid, m.
+    """
+
+    repeatability: float = 0.0
+    grid: float = 0.0
+    height_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("repeatability", "grid", "height_m"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InvalidValueError(f"{name} {value}", expected="a number of at least 0")
+
+    def relative(self, rho: float) -> float:
+        """Return the relative 1-sigma of the scale of a camera with the inverse pivot distance."""
+        return float(np.hypot(np.hypot(self.repeatability, self.grid), rho * self.height_m))
+
+
+@dataclass(frozen=True)
 class CalibrationModel:
     """Camera of the microscope at every magnification.
 
@@ -75,6 +106,8 @@ class CalibrationModel:
         priors and gauge, convergence, warnings. Plain numbers, strings, lists and dicts.
     residual
         Distortion that the parameters do not describe, or None.
+    scale_sigma
+        Uncertainty of the scale beyond the covariance.
     """
 
     functions: Mapping[str, ContinuousFunction]
@@ -86,6 +119,7 @@ class CalibrationModel:
     method: str
     statistics: Mapping[str, Any] = field(default_factory=dict)
     residual: ResidualField | None = None
+    scale_sigma: ScaleSigma = ScaleSigma()
 
     def __post_init__(self) -> None:
         missing = [name for name in FUNCTION_NAMES if name not in self.functions]
@@ -127,7 +161,9 @@ class CalibrationModel:
         """Return the camera at a magnification.
 
         Outside of :attr:`magnification_range` the functions continue along their tangents in log g,
-        ``in_range`` is False, and the covariance grows with the distance from the range.
+        ``in_range`` is False, and the covariance grows with the distance from the range. The
+        covariance is that of the next time that this magnification is set: it contains
+        :attr:`scale_sigma`.
 
         Raises
         ------
@@ -148,7 +184,9 @@ class CalibrationModel:
             residual = self.residual.at(g, spread, cross)
         if not in_range:
             covariance = covariance + self._extrapolation_covariance(g)
-        values = dict(zip(PARAMETER_NAMES, (design @ theta).tolist(), strict=True))
+        parameters = design @ theta
+        covariance[0, 0] += (parameters[0] * self.scale_sigma.relative(parameters[5])) ** 2
+        values = dict(zip(PARAMETER_NAMES, parameters.tolist(), strict=True))
         try:
             return ScanCamera(
                 magnification=g,

@@ -1,0 +1,114 @@
+"""What makes nanometres per pixel uncertain, in words: warnings that begin with ``scale:``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.joint import JointFit
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+
+__all__ = ["Hysteresis", "estimate_hysteresis", "scale_warnings"]
+
+# Ratio of the smaller to the larger spread of the tilts: tilts of 30 degrees about one axis, with 3
+# degrees about the other.
+_ONE_DIRECTION = 0.01
+# Part of the prior's 1-sigma of its change above which a parameter is not determined.
+_UNDETERMINED = 0.5
+# Fewer determined visits than this do not tell a spread: its own 1-sigma is half of it.
+_ENOUGH_VISITS = 2.0
+# Difference of the scale between magnifications reached from below and from above, in sigmas.
+_SIGNIFICANT = 3.0
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """Relative difference of the scale when a magnification is reached from below or from above.
+
+    Attributes
+    ----------
+    relative, sigma
+        Scale from below minus scale from above, and its 1-sigma.
+    pairs
+        Number of magnifications that were reached from both.
+    """
+
+    relative: float
+    sigma: float
+    pairs: int
+
+
+def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
+    """Compare the visits of magnifications that were reached from below and from above.
+
+    Returns None where no magnification was.
+    """
+    visit, groups = setup.visits
+    number = np.zeros(len(groups), dtype=int)
+    number[visit] = [v.visit for v in setup.views]
+    order = np.argsort(number)
+    if len(order) < 2 or number.min() < 0:
+        return None
+    effects = fit.adjustment.result.state.visits[:, 0]
+    upward: dict[int, list[float]] = {}
+    downward: dict[int, list[float]] = {}
+    for before, own in zip(order[:-1], order[1:], strict=True):
+        if groups[before] != groups[own]:
+            kind = upward if groups[own] > groups[before] else downward
+            kind.setdefault(int(groups[own]), []).append(float(effects[own]))
+    both = sorted(set(upward) & set(downward))
+    if not both:
+        return None
+    difference = np.array([np.mean(upward[k]) - np.mean(downward[k]) for k in both])
+    counts = np.array([1.0 / len(upward[k]) + 1.0 / len(downward[k]) for k in both])
+    sigma = fit.adjustment.spread.scale.sigma * np.sqrt(np.sum(counts)) / len(both)
+    return Hysteresis(float(np.mean(difference)), float(sigma), len(both))
+
+
+def _tilts_span_one_direction(rotations: Array) -> bool:
+    lean = rotations[:, :2, 2]
+    values = np.linalg.eigvalsh(lean.T @ lean)
+    return bool(values[0] < _ONE_DIRECTION * values[1])
+
+
+def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
+    """List what makes the scale less certain than the residuals suggest, with the remedy."""
+    out: list[str] = []
+    rotations = fit.adjustment.result.state.rotations
+    known = any(v.stage is not None and v.stage.tilt_rad is not None for v in setup.views)
+    if not known and _tilts_span_one_direction(rotations):
+        out.append(
+            "scale: all tilts are about one axis, so the images alone do not tell the aspect ratio "
+            "from the tilt; record the stage's tilt, or some views with the scan rotated by 90 degrees"
+        )
+    weak: dict[str, list[float]] = {}
+    for g in setup.magnifications:
+        camera = model.at(float(g))
+        assert camera.covariance is not None
+        sigma = np.sqrt(np.diag(camera.covariance))
+        for index, name, label in ((1, "aspect", "aspect ratio"), (2, "skew", "skew")):
+            if sigma[index] > _UNDETERMINED * setup.change_prior_of(name):
+                weak.setdefault(label, []).append(float(g))
+    for label, where in weak.items():
+        out.append(
+            f"scale: the views do not determine the {label} at magnification "
+            f"{', '.join(f'{g:g}' for g in where)}, where it is held by its prior; record also with "
+            "the scan rotated by 90 degrees, or give the stage's tilt"
+        )
+    spread = fit.adjustment.spread
+    if setup.shared and spread.scale.determined < _ENOUGH_VISITS:
+        out.append(
+            "scale: the views do not tell how well the magnification comes back; "
+            f"{100.0 * spread.scale.sigma:.2g} % is presumed. Visit some magnifications twice"
+        )
+    hysteresis = estimate_hysteresis(setup, fit)
+    if hysteresis and abs(hysteresis.relative) > _SIGNIFICANT * hysteresis.sigma:
+        out.append(
+            f"scale: magnifications reached from below show {100.0 * hysteresis.relative:+.2g} +- "
+            f"{100.0 * hysteresis.sigma:.1g} % of the scale of those reached from above (hysteresis); "
+            "always approach a magnification from the same side"
+        )
+    return out

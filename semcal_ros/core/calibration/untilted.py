@@ -1,0 +1,72 @@
+"""Which views show the specimen untilted, where no stage says so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from semcal_ros.core.calibration.initial_values import initial_values
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["UNTILTED_MODES", "mark_untilted"]
+
+UNTILTED_MODES = ("auto", "none")
+
+# Apparent tilt below which a view may be untilted: an aspect ratio that is 1 % off looks like 8
+# degrees. Views up to twice as much could be either.
+_FLAT_RAD, _CLEARLY_TILTED_RAD = np.radians(8.0), np.radians(16.0)
+
+
+def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
+    """Return the setup with views that are known not to be tilted.
+
+    Parameters
+    ----------
+    untilted
+        Names of such views, ``"none"``, or ``"auto"``: the view with the least apparent tilt of
+        each visit, if it looks untilted and every other view of the visit is clearly tilted.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no view of that name, or a mode is not known.
+    """
+    if isinstance(untilted, str):
+        if untilted not in UNTILTED_MODES:
+            raise InvalidValueError(
+                f"untilted {untilted!r}",
+                expected=f"{' or '.join(UNTILTED_MODES)}, or a list of names of views",
+            )
+        if untilted == "none" or any(v.stage is not None for v in setup.views):
+            return setup
+        chosen = _apparently_untilted(setup)
+    else:
+        names = {view.name for view in setup.views}
+        unknown = [name for name in untilted if name not in names]
+        if unknown:
+            raise InvalidValueError(
+                f"untilted {', '.join(map(repr, unknown[:3]))}",
+                expected="names of views that were used, such as " + ", ".join(sorted(names)[:3]),
+            )
+        chosen = {i for i, view in enumerate(setup.views) if view.name in set(untilted)}
+    views = tuple(
+        replace(view, untilted=True) if i in chosen else view for i, view in enumerate(setup.views)
+    )
+    return replace(setup, views=views)
+
+
+def _apparently_untilted(setup: Setup) -> set[int]:
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    tilt = np.arccos(np.clip(start.rotations[:, 2, 2], -1.0, 1.0))
+    visit, groups = setup.visits
+    chosen = set()
+    for own in (np.flatnonzero(visit == j) for j in range(len(groups))):
+        least = own[np.argmin(tilt[own])]
+        others = own[own != least]
+        if len(others) and tilt[least] < _FLAT_RAD and np.all(tilt[others] > _CLEARLY_TILTED_RAD):
+            chosen.add(int(least))
+    return chosen
