@@ -42,6 +42,7 @@ from semcal_ros.core.calibration.residual_field_fit import (
     blank_field,
     choose_field,
     field_system,
+    held_prior,
     solve_field,
     undo_field,
 )
@@ -117,6 +118,22 @@ class FittedField:
 
 
 @dataclass(frozen=True)
+class GridPattern:
+    """Displacements of the corners that turn with the grid: it is not regular.
+
+    Attributes
+    ----------
+    system
+        The reduced system with the pattern as unknowns.
+    choice
+        Its strength, and the result of cross-validation.
+    """
+
+    system: FieldSystem
+    choice: FieldChoice
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """Continuous functions with a chosen number of coefficients, adjusted to the views.
 
@@ -157,6 +174,8 @@ class JointFit:
         Errors that corners on neighbouring lines share.
     field
         The residual field, or None.
+    pattern
+        What is irregular about the grid, or None.
     excess_px
         1-sigma per axis, px, by which all corners scatter beyond their own.
     """
@@ -166,6 +185,7 @@ class JointFit:
     covariance: Array
     jitter: LineJitter
     field: FittedField | None
+    pattern: GridPattern | None
     excess_px: float
 
 
@@ -299,6 +319,25 @@ def _pad_covariance(
     return covariance[np.ix_(keep, keep)]
 
 
+def _pattern_covariance(
+    setup: Setup, padded: Functions, adjustment: Adjustment, pattern: GridPattern
+) -> Array:
+    """Return what an irregular grid adds to the covariance of the coefficients.
+
+    It is the difference between the covariances with the pattern unknown and with none.
+    """
+    problem = build_problem(setup, padded, setup.views, adjustment.spread)
+    state = adjustment.result.state
+    result = refine(
+        problem, replace(state, theta=_theta(setup, padded, state)), max_iterations=0
+    )
+    system = field_system(setup, problem, result, blank_field(setup), of_grid=True)
+    size = len(result.state.theta) - len(setup.shared)
+    free = system.covariance(pattern.choice.prior)[:size, :size]
+    none = system.covariance(held_prior(blank_field(setup), setup.norm_px))[:size, :size]
+    return free - none
+
+
 def _select_and_adjust(
     setup: Setup,
     functions: Functions,
@@ -366,8 +405,11 @@ def _largest_change(before: VarianceComponents, after: VarianceComponents) -> fl
 
 def _add_field(
     setup: Setup, adjustment: Adjustment, always: bool
-) -> tuple[Adjustment, FittedField | None]:
+) -> tuple[Adjustment, FittedField | None, GridPattern | None]:
     """Add a residual field, or return the adjustment unchanged where it is not worthwhile.
+
+    What stays with the image is the microscope's; what turns with the grid is the grid's, and no
+    field is added for it. The one that predicts views that were left out better decides.
 
     Each turn solves for camera and field together, and then adjusts poses and camera to
     observations that the field has corrected. In the first turns the strength of the field and the
@@ -380,7 +422,14 @@ def _add_field(
         if turn < _CHOOSING_TURNS:
             choice = choose_field(setup, system, blank)
             if not (choice.worthwhile or always):
-                return start, None
+                return start, None, None
+            if turn == 0 and setup.shared and not always:
+                of_grid = field_system(
+                    setup, adjustment.problem, adjustment.result, field, of_grid=True
+                )
+                pattern = choose_field(setup, of_grid, blank)
+                if pattern.worthwhile and pattern.gain > choice.gain:
+                    return start, None, GridPattern(of_grid, pattern)
         theta, field = solve_field(system, choice.prior, blank)
         after = undo_field(setup, field)
         adjustment = _readjust(after, adjustment, theta, choosing=turn < _CHOOSING_TURNS)
@@ -388,8 +437,8 @@ def _add_field(
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
         before = after
         if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
-            return adjustment, FittedField(field, choice, system, True)
-    return adjustment, FittedField(field, choice, system, False)
+            return adjustment, FittedField(field, choice, system, True), None
+    return adjustment, FittedField(field, choice, system, False), None
 
 
 def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
@@ -429,10 +478,10 @@ def fit_joint(
     on_stage("start values", 0.0)
     start = _fit_start(thin)
     on_stage("number of coefficients", 0.3)
-    adjustment, field = _select_and_adjust(setup, *start), None
+    adjustment, field, pattern = _select_and_adjust(setup, *start), None, None
     if residual != "off":
         on_stage("residual field", 0.5)
-        adjustment, field = _add_field(setup, adjustment, residual == "on")
+        adjustment, field, pattern = _add_field(setup, adjustment, residual == "on")
     excess = estimate_excess_sigma_px(
         setup.views, adjustment.result.residuals_px, 6 * len(setup.views)
     )
@@ -452,7 +501,9 @@ def fit_joint(
     padded = _pad_functions(adjustment.functions)
     jitter = estimate_jitter(adjustment.problem, adjustment.result)
     covariance = _pad_covariance(setup, padded, adjustment, field, jitter)
-    return JointFit(adjustment, padded, covariance, jitter, field, excess)
+    if pattern is not None:
+        covariance = covariance + _pattern_covariance(setup, padded, adjustment, pattern)
+    return JointFit(adjustment, padded, covariance, jitter, field, pattern, excess)
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:

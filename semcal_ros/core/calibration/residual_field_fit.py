@@ -34,6 +34,7 @@ __all__ = [
     "blank_field",
     "choose_field",
     "field_system",
+    "held_prior",
     "solve_field",
     "undo_field",
 ]
@@ -180,12 +181,19 @@ def undo_field(setup: Setup, field: ResidualField) -> Setup:
 
 
 def field_system(
-    setup: Setup, problem: Problem, result: BundleResult, field: ResidualField
+    setup: Setup,
+    problem: Problem,
+    result: BundleResult,
+    field: ResidualField,
+    *,
+    of_grid: bool = False,
 ) -> FieldSystem:
     """Compute the reduced system about an adjustment.
 
     ``setup`` holds the raw views; ``problem`` and ``result`` are the adjustment of the views
-    corrected by ``field``. Weights are scaled to the variance that the residuals show.
+    corrected by ``field``. Weights are scaled to the variance that the residuals show. With
+    ``of_grid`` the field is one of displacements on the grid, which turns with it, and not one of
+    the image.
     """
     variance = variance_factor(problem, result)
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
@@ -202,11 +210,17 @@ def field_system(
     one = field.at(float(setup.magnifications[0]))
     for v, view in enumerate(setup.views):
         part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
-        spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px)
-        rows = np.zeros((2, size, len(spline)))
-        # The residual is observed plus field minus projected, so the field has the opposite sign of
-        # a projection.
-        rows[0, 0::2] = rows[1, 1::2] = -setup.norm_px * spline.T
+        rows = np.zeros((2, size, len(view.image_xy)))
+        if of_grid:
+            spline = one.basis(view.board_xy_m / (problem.unit_m[v] * setup.norm_px)).T
+            turned = setup.norm_px * result.state.rotations[v, :2, :2]
+            rows[:, 0::2] = turned[:, 0, None, None] * spline
+            rows[:, 1::2] = turned[:, 1, None, None] * spline
+        else:
+            spline = one.basis((view.image_xy - setup.centre_px) / setup.norm_px).T
+            # The residual is observed plus field minus projected, so the field has the opposite
+            # sign of a projection.
+            rows[0, 0::2] = rows[1, 1::2] = -setup.norm_px * spline
         whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
         own = whitened.rows[:, :, part]
         x, y = np.concatenate([own[:, :-1], rows, own[:, -1:]], axis=1)
@@ -289,6 +303,11 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
     whole = np.kron(steady, np.kron(smooth, np.eye(2)))
     whole += np.kron(np.eye(ng), overlaps.T @ overlaps)
     return whole
+
+
+def held_prior(field: ResidualField, norm_px: float) -> Array:
+    """Return the prior precision that holds a field at zero."""
+    return _prior(field, _NO_STRENGTH_PX, norm_px)
 
 
 def _folds(system: FieldSystem) -> list[Mask]:

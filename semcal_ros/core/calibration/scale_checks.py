@@ -104,6 +104,11 @@ def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list
             "scale: the views do not tell how well the magnification comes back; "
             f"{100.0 * spread.scale.sigma:.2g} % is presumed. Visit some magnifications twice"
         )
+    if fit.pattern is not None:
+        out.append(
+            "scale: the corners are displaced in a pattern that turns with the grid: the grid is not "
+            "regular. No residual field is added for it; use another part of the grid, or another one"
+        )
     hysteresis = estimate_hysteresis(setup, fit)
     if hysteresis and abs(hysteresis.relative) > _SIGNIFICANT * hysteresis.sigma:
         out.append(

@@ -9,6 +9,7 @@ import pytest
 
 from semcal_ros.core.calibration.bundle_adjustment import BundleStatus, refine
 from semcal_ros.core.calibration.normal_equations import State, make_problem, residuals
+from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.synthetic import preset
@@ -104,7 +105,10 @@ def test_covariance_equals_that_of_the_full_system(poses):
         )
         rows = np.einsum("nij,nj->ni", inverse_roots, residuals(problem, moved))
         rows *= np.sqrt(result.huber_weight)[:, None]
-        height = moved.translations_m[:, 2] / problem.height_sigma_m
+        height, _, _ = height_of_tilt(
+            np.zeros(n_views), moved.rotations, moved.translations_m, np.zeros(3)
+        )
+        height = height / problem.height_sigma_m
         prior = (moved.theta - problem.prior_mean) / problem.prior_sigma
         return np.concatenate([rows.ravel(), height, prior])
 
@@ -119,8 +123,10 @@ def test_covariance_equals_that_of_the_full_system(poses):
     dense = np.linalg.inv(jacobian.T @ jacobian)
     expected = np.sqrt(np.diag(dense)[:20])
     np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), expected, rtol=2e-3)
-    height = np.diag(dense)[20:].reshape(n_views, 6)[:, 5] * problem.unit_m**2
-    np.testing.assert_allclose(result.height_variance_m2, height, rtol=5e-3)
+    rows = jacobian[2 * len(problem.board_m) :][:n_views]
+    np.testing.assert_allclose(
+        result.prior_variance[:, 0], np.diag(rows @ dense @ rows.T), rtol=5e-3
+    )
 
 
 def test_outliers_lose_their_weight(poses):

@@ -35,14 +35,14 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
 ) -> None:
     adjustment = fit.adjustment
     start = stack_coefficients(fit.padded)
-    heights = adjustment.problem.height_sigma_m
-    problem = build_problem(setup, fit.padded, setup.views, heights)
+    problem = build_problem(setup, fit.padded, setup.views, adjustment.spread)
     freed = refine(problem, replace(adjustment.result.state, theta=start))
-    factor = variance_factor(adjustment.problem, adjustment.result)
+    factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
     change = np.abs(freed.state.theta - start)
-    sigma = np.sqrt(np.diag(fit.covariance) * factor)
-    added = np.sqrt(np.maximum(np.diag(fit.covariance - freed.covariance) * factor, 0.0))
+    sigma = np.sqrt(np.diag(fit.covariance))
+    added = np.sqrt(np.maximum(np.diag(fit.covariance) - np.diag(freed.covariance) * factor, 0.0))
     clear = change > 0.6 * sigma
     assert clear.sum() >= 8
-    # The covariance takes one Gauss-Newton step, the adjustment here goes to its end.
-    np.testing.assert_allclose(added[clear], change[clear], rtol=0.35)
+    # The covariance takes one Gauss-Newton step, the adjustment here goes to its end: they differ
+    # by less than half a sigma.
+    assert np.all(np.abs(added - change)[clear] < 0.5 * sigma[clear])

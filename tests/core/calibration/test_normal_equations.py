@@ -1,0 +1,192 @@
+"""Every unknown of the adjustment against numerical derivatives of the whole system.
+
+The system has visits that do not come back, drift within the images, a grid that is no perfect
+grid, a tilt axis that misses the specimen, and a stage with constant errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.bundle_adjustment import refine
+from semcal_ros.core.calibration.grid_orientation import align_lattices
+from semcal_ros.core.calibration.joint import add_shared_unknowns
+from semcal_ros.core.calibration.normal_equations import (
+    State,
+    empty_effects,
+    normal_equations,
+    pose_priors,
+    residuals,
+    retract,
+    schur_complement,
+    visit_sigmas,
+)
+from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.problem import (
+    build_problem,
+    constant_functions,
+    stack_coefficients,
+)
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.variance_components import Spread, VarianceComponents
+from semcal_ros.synthetic import preset
+from tests.helpers.stage_views import StageOfTests, stage_views
+
+MICROSCOPE = preset("strong_perspective")
+
+
+@pytest.fixture(scope="module")
+def system():
+    """The problem, and a state near its optimum, with every effect there is."""
+    stage = StageOfTests(miss_m=(1e-4, -6e-5), stretch=1e-3, shear=-5e-4, curvature=10.0)
+    views = stage_views(
+        MICROSCOPE.camera_at, (200.0, 600.0, 200.0), stage, noise_px=0.05, seed=3, readings=True
+    )
+    views = [replace(v, square_m=1e-5 if v.magnification < 300 else 2e-5) for v in views]
+    ordered = tuple(sorted(views, key=lambda v: v.magnification))
+    setup = Setup(
+        ordered,
+        np.array([200.0, 600.0]),
+        MICROSCOPE.image_size,
+        MICROSCOPE.display_width_m,
+        Priors(),
+        axis=StageAxis(0.2),
+    )
+    setup = add_shared_unknowns(align_lattices(setup))
+    functions = constant_functions(setup, {})
+    count = len(setup.views)
+    spread = VarianceComponents(
+        Spread(2e-3, 0.0), Spread(3e-5, 0.0), np.full(count, 4e-5), np.full(count, 0.2)
+    )
+    problem = build_problem(setup, functions, setup.views, spread)
+    rng = np.random.default_rng(0)
+    start = _start(setup, functions)
+    state = empty_effects(problem, refine(problem, start).state)
+    # Away from the optimum and from zero, where no derivative vanishes by chance.
+    state = replace(
+        state,
+        theta=state.theta + 0.3 * rng.normal(size=len(state.theta)) * _theta_scale(setup),
+        visits=rng.normal(size=state.visits.shape) * [1e-3, 2e-5],
+        drift_px=rng.normal(size=state.drift_px.shape) * 0.2,
+    )
+    return problem, state
+
+
+def _start(setup, functions):
+    from semcal_ros.core.calibration.initial_values import initial_values
+
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    theta = np.concatenate([stack_coefficients(functions), setup.shared_start()])
+    return State(theta, start.rotations, start.translations_m)
+
+
+def _theta_scale(setup):
+    # The derivatives by angles of the stage are those of small differences from it.
+    shared = np.minimum(setup.shared_priors()[1], 0.01) * 0.2
+    return np.concatenate([[1e-3, 1e-3, 1e-3, 3.0, 3.0, 2.0, 1e-3, 1e-3, 3.0, 3.0], shared])
+
+
+def _moved(problem, state, x):
+    """The state after a step in all unknowns: theta, visits, poses."""
+    size, visits = len(state.theta), state.visits.size
+    return retract(
+        problem,
+        state,
+        x[:size],
+        x[size + visits :].reshape(len(problem.group), -1),
+        x[size : size + visits].reshape(-1, 2),
+    )
+
+
+def _whole(problem, state, x, huber):
+    """All whitened residuals, of observations and of priors, as one vector."""
+    moved = _moved(problem, state, x)
+    miss = residuals(problem, moved)
+    xx, yx, yy = problem.whitening.T * np.sqrt(huber)
+    return np.concatenate(
+        [
+            xx * miss[:, 0],
+            yx * miss[:, 0] + yy * miss[:, 1],
+            pose_priors(problem, moved)[:, :, -1].ravel(),
+            (-moved.visits / visit_sigmas(problem)).ravel(),
+            (problem.prior_mean - moved.theta) / problem.prior_sigma,
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def dense(system):
+    """Numerical normal equations of the whole system."""
+    problem, state = system
+    huber = normal_equations(problem, state).huber_weight
+    size = len(state.theta) + state.visits.size + problem.pose_columns * len(problem.group)
+    # Steps small enough for the curvature and large enough for rounding, in units of the priors.
+    own = np.minimum(problem.prior_sigma, 1.0)
+    steps = np.concatenate(
+        [
+            1e-4 * own,
+            np.tile(visit_sigmas(problem) * 1e-2, len(state.visits)),
+            np.tile([1e-5] * 3 + [1e-3] * 3 + [1e-3] * 2, len(problem.group)),
+        ]
+    )
+    columns = []
+    for k in range(size):
+        delta = np.zeros(size)
+        delta[k] = steps[k]
+        change = _whole(problem, state, delta, huber) - _whole(problem, state, -delta, huber)
+        columns.append(change / (2.0 * steps[k]))
+    jacobian = np.stack(columns, axis=1)
+    right = -jacobian.T @ _whole(problem, state, np.zeros(size), huber)
+    return jacobian.T @ jacobian, right
+
+
+def test_the_step_is_that_of_the_whole_system(system, dense):
+    """Eliminating poses and visits gives the Gauss-Newton step of all unknowns at once."""
+    problem, state = system
+    matrix, right = dense
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    step = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
+    reduced = schur_complement(problem, state, normal_equations(problem, state), 0.0)
+    from semcal_ros.core.calibration.normal_equations import reduced_normal_equations
+
+    own, pull = reduced_normal_equations(
+        problem, state.theta, reduced.information, reduced.gradient
+    )
+    change = np.linalg.solve(own, pull)
+    _, visits, poses = reduced.back(problem, change)
+    found = np.concatenate([change, visits.ravel(), poses.ravel()])
+    sigma = np.sqrt(np.diag(np.linalg.inv(matrix * np.outer(scale, scale)))) * scale
+    # Numerical derivatives are good to about 1e-5 of a step; in units of the sigmas.
+    np.testing.assert_allclose(found / sigma, step / sigma, rtol=2e-3, atol=2e-3)
+
+
+def test_covariances_are_those_of_the_whole_system(system, dense):
+    problem, state = system
+    matrix, _ = dense
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+    result = refine(problem, state, max_iterations=0)
+    size = len(state.theta)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(inverse)[:size]), rtol=2e-3
+    )
+    visits = np.diag(inverse)[size : size + state.visits.size].reshape(-1, 2)
+    np.testing.assert_allclose(np.sqrt(result.visit_variance), np.sqrt(visits), rtol=2e-3)
+    rows = pose_priors(problem, state)[:, :, :-1]
+    first, outer = problem.shared_columns, problem.shared_columns + problem.visit_columns
+    for v in (0, len(problem.group) - 1):
+        # The unknowns of a view from those of the whole system.
+        take = np.zeros((rows.shape[2], len(inverse)))
+        take[:first, :size] = problem.designs[problem.group[v]]
+        visit = size + 2 * problem.effects.visit[v]
+        take[[first, first + 1], [visit, visit + 1]] = 1.0
+        pose = size + state.visits.size + problem.pose_columns * v
+        own = np.arange(problem.pose_columns)
+        take[outer + own, pose + own] = 1.0
+        spread = take @ inverse @ take.T
+        expected = np.diag(rows[v] @ spread @ rows[v].T)
+        np.testing.assert_allclose(result.prior_variance[v], expected, rtol=5e-3, atol=1e-6)
