@@ -8,12 +8,12 @@ with those at its own magnification, and its misfit with all.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from semcal_ros.core.arrays import solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
     reduced_normal_equations,
@@ -56,6 +56,11 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has
     are left out.
     """
+    if problem.effects is not None and problem.effects.scale_sigma > setup.priors.visit_scale_sigma:
+        # A jump that is not in the model makes the visits look as if they did not come back.
+        effects = replace(problem.effects, scale_sigma=setup.priors.visit_scale_sigma)
+        problem = replace(problem, effects=effects)
+        result = refine(problem, result.state, max_iterations=0)
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
     )

@@ -17,7 +17,7 @@ __all__ = ["Hysteresis", "estimate_hysteresis", "scale_warnings"]
 # degrees about the other.
 _ONE_DIRECTION = 0.01
 # Part of the prior's 1-sigma of its change above which a parameter is not determined.
-_UNDETERMINED = 0.5
+_UNDETERMINED = 0.8
 # Fewer determined visits than this do not tell a spread: its own 1-sigma is half of it.
 _ENOUGH_VISITS = 2.0
 # Difference of the scale between magnifications reached from below and from above, in sigmas.

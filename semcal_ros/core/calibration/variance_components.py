@@ -4,8 +4,8 @@ A magnification does not quite come back, a stage does not keep its height, and 
 while it is scanned. Each is a random effect with a variance of its own. MacKay's fixed point for
 the evidence (1992, doi:10.1162/neco.1992.4.3.415), a quick form of restricted maximum likelihood,
 estimates it from the effects themselves: the sum of their squares over the number of them that the
-data determine. One pseudo-observation of the usual spread stands for what is known beforehand, so
-that a spread which the views do not determine stays at its usual value.
+data determine. A part of an observation of the usual spread stands for what is known beforehand,
+so that a spread which the views do not determine stays at its usual value.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ __all__ = ["Spread", "VarianceComponents", "initial_components", "update_compone
 _FLAT_RAD = np.radians(5.0)
 # Fewer views than this do not determine a spread of their own.
 _ENOUGH_HEIGHTS = 4
+# Weight of the usual spread against one observed effect: enough to decide where nothing is observed.
+_WEIGHT_OF_USUAL = 0.05
 # Limits of a spread, relative to its usual value. Below the lower one, no view can show it.
 _LEAST, _MOST = 0.01, 20.0
 
@@ -89,7 +91,8 @@ def initial_components(setup: Setup) -> VarianceComponents:
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
     """Update a spread from the residuals of its prior, in sigmas, and their posterior variances."""
     determined = float(np.sum(np.maximum(1.0 - variance, 0.0)))
-    square = (sigma**2 * float(np.sum(residuals**2)) + usual**2) / (determined + 1.0)
+    known = _WEIGHT_OF_USUAL
+    square = (sigma**2 * float(np.sum(residuals**2)) + known * usual**2) / (determined + known)
     return Spread(float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined)
 
 
@@ -145,6 +148,7 @@ def _drift_sigma(problem: Problem, result: BundleResult, priors: Priors) -> Arra
     determined = np.sum(np.maximum(1.0 - result.prior_variance[:, 1:3], 0.0), axis=1)
     square = sigma**2 * np.sum(result.prior_residuals[:, 1:3] ** 2, axis=1)
     # The weights are those of chi-squares of the spread before; the last row is the usual one.
-    rows = np.vstack([design * (determined / sigma**2)[:, None], [usual**-2.0, 0.0]])
-    found, _ = nnls(rows, np.append(square / sigma**2, 1.0))
+    known = np.sqrt(_WEIGHT_OF_USUAL)
+    rows = np.vstack([design * (determined / sigma**2)[:, None], [known * usual**-2.0, 0.0]])
+    found, _ = nnls(rows, np.append(square / sigma**2, known))
     return np.sqrt(np.clip(design @ found, (_LEAST * usual) ** 2, (_MOST * usual) ** 2))

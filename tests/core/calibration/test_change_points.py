@@ -17,7 +17,8 @@ from semcal_ros.synthetic.grid_views import grid_views
 pytestmark = pytest.mark.slow
 
 CALIBRATED = [100.0, 300.0, 700.0, 1500.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0]
-JUMP = 0.01
+# Visits come back to 0.1 %, and the heights of 40 um add as much: 1 % would be 2.5 sigma only.
+JUMP = 0.015
 MICROSCOPE = preset("jsm820")
 
 

@@ -33,7 +33,7 @@ from semcal_ros.core.calibration.problem import (
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.variance_components import Spread, VarianceComponents
 from semcal_ros.synthetic import preset
-from tests.helpers.stage_views import StageOfTests, stage_views
+from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
 
 MICROSCOPE = preset("strong_perspective")
 
@@ -41,10 +41,8 @@ MICROSCOPE = preset("strong_perspective")
 @pytest.fixture(scope="module")
 def system():
     """The problem, and a state near its optimum, with every effect there is."""
-    stage = StageOfTests(miss_m=(1e-4, -6e-5), stretch=1e-3, shear=-5e-4, curvature=10.0)
-    views = stage_views(
-        MICROSCOPE.camera_at, (200.0, 600.0, 200.0), stage, noise_px=0.05, seed=3, readings=True
-    )
+    stage, grid = SimulatedStage(miss_m=(1e-4, -6e-5)), GridFaults(1e-3, -5e-4, 10.0)
+    views = stage_views(MICROSCOPE.camera_at, (200.0, 600.0, 200.0), stage, grid, seed=3, readings=True)
     views = [replace(v, square_m=1e-5 if v.magnification < 300 else 2e-5) for v in views]
     ordered = tuple(sorted(views, key=lambda v: v.magnification))
     setup = Setup(
