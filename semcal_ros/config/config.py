@@ -437,7 +437,7 @@ def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
         return
     for parent in ("", *_MAPPINGS):
         above = tuple(parent.split(".")) if parent else ()
-        mapping = values
+        mapping: Any = values
         for key in above:
             mapping = mapping.get(key) if isinstance(mapping, dict) else None
         if not isinstance(mapping, dict):
