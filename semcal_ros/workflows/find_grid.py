@@ -150,9 +150,9 @@ def find_views(
 
     def pictures() -> Iterator[tuple[str, NDArray[Any], float]]:
         for frame in frames:
-            name, image, magnification, *origin = frame
-            origins.append(NamedFrame(name, _NO_IMAGE, magnification, *origin))
-            yield name, image, magnification
+            origin = frame if isinstance(frame, NamedFrame) else NamedFrame(*frame)
+            origins.append(origin._replace(image=_NO_IMAGE))
+            yield origin.name, origin.image, origin.magnification
 
     iterator = pictures()
     first = list(islice(iterator, _TOO_FEW_TO_SHARE))
