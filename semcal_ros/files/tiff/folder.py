@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import timezone
 from pathlib import Path
 
+from semcal_ros.bridge.stage import doubt_unit
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError, TiffError
 from semcal_ros.files.plain_images import PLAIN_IMAGES
@@ -151,6 +153,7 @@ def _stages(found: list[_Found]) -> tuple[list[StageReading | None], list[str]]:
     known = [turn for turn in turns if turn is not None]
     turned = bool(known) and max(known) - min(known) > _TURNED_RAD
     readings: list[StageReading | None] = []
+    notes: list[str] = []
     scan_rotated = 0
     for item, turn in zip(found, turns, strict=True):
         settings = item.settings
@@ -158,8 +161,10 @@ def _stages(found: list[_Found]) -> tuple[list[StageReading | None], list[str]]:
         scan_rotated += rotated and settings.stage_tilt_rad is not None
         usable = settings.stage_tilt_rad is not None and not rotated
         own = StageReading(settings.stage_tilt_rad, None if turned else turn) if usable else None
+        if own is not None and (doubt := doubt_unit(own, StageConfig())):
+            notes.append(f"the stage of {item.path.name} is not used: {doubt}")
+            own = None
         readings.append(own)
-    notes = []
     if turned and any(readings):
         notes.append(
             "the rotation of the stage is not used: the files do not say in which sense it counts"

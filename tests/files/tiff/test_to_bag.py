@@ -154,8 +154,10 @@ def test_rotations_of_unknown_sense_are_left_out(tmp_path: Path) -> None:
         "StageTilt=10.0\nStageRotation=20.0\n",
         "StageTilt=10.0\nStageRotation=50.0\n",
         "StageTilt=10.0\nStageRotation=50.0\nScanRotation=90.0\n",
+        "StageTilt=100.0\n",
     )
-    assert stages == [StageReading(np.radians(10.0)), StageReading(np.radians(10.0)), None]
+    assert stages == [StageReading(np.radians(10.0)), StageReading(np.radians(10.0)), None, None]
+    assert "the stage of 3.tif is not used: tilt 1.74533 rad" in notes
     assert "the rotation of the stage is not used" in notes
     assert "the stage is not used for 1 files with a rotated scan" in notes
 
