@@ -12,6 +12,7 @@ from semcal_ros.cli.options import (
     config_option,
     magnification_option,
     output_option,
+    parse_length,
     recording_argument,
 )
 from semcal_ros.cli.output import echo_notes, echo_table, show_progress
@@ -21,6 +22,7 @@ from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
     MethodOptions,
 )
+from semcal_ros.core.calibration.untilted import UNTILTED_MODES
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
 
 __all__ = ["command"]
@@ -33,6 +35,14 @@ def _parse_magnifications(
         return tuple(float(part) for part in text.split(",")) if text else ()
     except ValueError:
         raise click.BadParameter(f"{text!r} is not a list such as 1000,5000") from None
+
+
+def _parse_untilted(
+    _context: click.Context, _parameter: click.Parameter, text: str
+) -> str | tuple[str, ...]:
+    if text in UNTILTED_MODES:
+        return text
+    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 @click.command("calibrate")
@@ -58,6 +68,27 @@ def _parse_magnifications(
     show_default=True,
     help="joint: a field for what the distortion parameters cannot describe.",
 )
+@click.option(
+    "--untilted",
+    callback=_parse_untilted,
+    default="auto",
+    show_default=True,
+    metavar="auto|none|N,N,...",
+    help="joint: frames without tilt, by number or by file name, if no stage says the tilts.",
+)
+@click.option(
+    "--squares-sigma",
+    type=click.FloatRange(0.0, 0.1),
+    help="Relative 1-sigma of the grid's squares, such as 0.001, instead of that of the configuration.",
+)
+@click.option(
+    "--height-sigma",
+    callback=parse_length,
+    default=f"{CalibrationOptions.height_sigma_m * 1e6:g}um",
+    show_default=True,
+    metavar="LENGTH",
+    help="1-sigma of the height of what is measured later above or below the untilted grid.",
+)
 @click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
 @click.option("--report", type=PATH, help="Also write an HTML report.")
 def command(
@@ -70,6 +101,9 @@ def command(
     legendre: int | None,
     breakpoints: tuple[float, ...],
     residual: str,
+    untilted: str | tuple[str, ...],
+    squares_sigma: float | None,
+    height_sigma: float,
     tau: float | None,
     report: Path | None,
 ) -> None:
@@ -78,15 +112,22 @@ def command(
     \b
     Example:
       semcal calibrate recordings/grid -o cal.yaml --report report.html
+      semcal calibrate recordings/grid -o cal.yaml --untilted 0,5,10 --height-sigma 20um
     """
     check_outputs([("-o", output, ()), ("--report", report, ())])
     with show_progress() as on_progress:
         done = calibrate_recording(
             recording,
             config=config,
+            squares_sigma=squares_sigma,
             magnification=magnification,
             options=CalibrationOptions(
-                method, MethodOptions(pda_order, legendre, tau), breakpoints, residual
+                method,
+                MethodOptions(pda_order, legendre, tau),
+                breakpoints,
+                residual,
+                untilted,
+                height_sigma_m=height_sigma,
             ),
             on_progress=on_progress,
         )
@@ -129,6 +170,9 @@ def _echo_result(done: RecordingCalibration) -> None:
     )
     if done.calibration.residual is not None:
         click.echo("with a residual field for what the distortion parameters do not describe")
+    told = sum(view.stage is not None for view in done.result.views)
+    if told:
+        click.echo(f"the stage is known for {told} of {statistics['views']} views")
     for view in rejected[:10]:
         click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
     if len(rejected) > 10:

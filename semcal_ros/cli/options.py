@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.tiff.values import quantity
 
 __all__ = [
     "FIGURE_SUFFIXES",
@@ -22,6 +23,7 @@ __all__ = [
     "no_drift_option",
     "output_option",
     "overwrite_option",
+    "parse_length",
     "recording_argument",
     "recording_options",
     "require_folder",
@@ -29,6 +31,7 @@ __all__ = [
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
+
 
 PATH = click.Path(path_type=Path)
 #: Formats of matplotlib by the suffix of a file name.
@@ -91,6 +94,15 @@ def interpolation_option(default: str) -> Callable[[Command], Command]:
         default=default,
         show_default=True,
     )
+
+
+def parse_length(_context: click.Context, _parameter: click.Parameter, text: str) -> float:
+    """Callback of an option for a length with its unit, such as ``10um``; a bare number is in m."""
+    length_m = quantity(text, "m", default_unit="m")
+    if length_m is None or length_m < 0.0:
+        raise click.BadParameter(f"{text!r} is not a length such as 10um or 1e-5 (m)")
+    # Without the rounding error of the unit.
+    return float(f"{length_m:.12g}")
 
 
 def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -> None:

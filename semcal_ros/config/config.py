@@ -32,9 +32,12 @@ __all__ = [
     "COMPRESSED_IMAGE_TYPE",
     "IMAGE_TYPE",
     "IMAGE_TYPES",
+    "STAGE_TYPE",
     "ImageConfig",
     "MagnificationConfig",
     "MicroscopeConfig",
+    "StageConfig",
+    "StageSigmas",
     "config_names",
     "config_schema",
     "load_config",
@@ -45,6 +48,9 @@ IMAGE_TYPE: Final = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE_TYPE: Final = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 """Message types in which frames are accepted."""
+
+STAGE_TYPE: Final = "sensor_msgs/msg/JointState"
+"""Message type in which the positions of the stage are accepted."""
 
 Quantity = Literal["magnification", "pixel_size", "field_width"]
 StampMoment = Literal["start", "centre", "end"]
@@ -84,9 +90,13 @@ _Frame = Annotated[_Name, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_/-]*$")]
 # Upper limits of lengths and times only catch a wrong unit: nothing real comes near them.
 _DisplayWidth = Annotated[_Number, Field(gt=0.0, le=100.0)]
 _SquareSize = Annotated[_Number, Field(gt=0.0, le=1.0)]
+# A stage that is known to no better than half a radian or ten millimetres is not known at all.
+_AngleSigma = Annotated[_Number, Field(gt=0.0, le=0.5)]
+_LengthSigma = Annotated[_Number, Field(gt=0.0, le=0.01)]
 
 _FILE = ConfigDict(extra="forbid")
 _TOPIC = "a ROS topic name such as image_raw"
+_JOINT = "the name of a joint such as tilt"
 
 
 Declared = TypeVar("Declared")
@@ -183,6 +193,60 @@ class MagnificationConfig:
         return _METRES.get(self.unit, 1.0)
 
 
+@_refuse_in_one_line
+@dataclass(frozen=True, config=_FILE)
+class StageSigmas:
+    """How far the readings of the stage are trusted, 1-sigma, without their constant errors.
+
+    Parameters
+    ----------
+    tilt, rotation
+        Angles, rad: 0.2 and 0.5 degrees by default.
+    z
+        Height, m.
+    """
+
+    tilt: _AngleSigma = Field(default=0.0035, description="an angle in rad, above 0, at most 0.5")
+    rotation: _AngleSigma = Field(
+        default=0.0087, description="an angle in rad, above 0, at most 0.5"
+    )
+    z: _LengthSigma = Field(default=1.0e-4, description="a length in m, above 0, at most 0.01")
+
+
+@_refuse_in_one_line
+@dataclass(frozen=True, config=_FILE)
+class StageConfig:
+    """The topic that says where the stage is (SI units), and its tilt axis.
+
+    Parameters
+    ----------
+    topic, type
+        Where it is: ``sensor_msgs/msg/JointState``, one message before each change.
+    tilt, rotation, x, y, z, scan_rotation
+        Names of the joints. Messages may lack any of them.
+    tilt_axis_deg
+        Direction of the tilt axis in the image without scan rotation, from +x towards +y, in
+        degrees. A positive tilt moves what lies at +90 degrees from it away from the pole piece.
+    sigma
+        How far the readings are trusted.
+    """
+
+    topic: _Topic = Field(default="stage", description="a ROS topic name such as stage")
+    type: Literal["sensor_msgs/msg/JointState"] = Field(default=STAGE_TYPE, description=STAGE_TYPE)
+    tilt: _Name = Field(default="tilt", description=_JOINT)
+    rotation: _Name = Field(default="rotation", description=_JOINT)
+    x: _Name = Field(default="x", description=_JOINT)
+    y: _Name = Field(default="y", description=_JOINT)
+    z: _Name = Field(default="z", description=_JOINT)
+    scan_rotation: _Name = Field(default="scan_rotation", description=_JOINT)
+    tilt_axis_deg: Annotated[_Number, Field(ge=-360.0, le=360.0)] = Field(
+        default=0.0, description="an angle in degrees from -360 to 360"
+    )
+    sigma: StageSigmas = Field(
+        default=StageSigmas(), description="a mapping of the sigmas of tilt, rotation and z"
+    )
+
+
 @dataclass(frozen=True, config=_FILE)
 class _ScanKeys:
     """The keys of :class:`~semcal_ros.core.camera.scan_timing.ScanTiming` in a file."""
@@ -223,6 +287,15 @@ class MicroscopeConfig:
         Raster timing, or None where it is not known: then a frame counts as taken at one instant.
     squares_m
         Square sizes of the chess grid specimen, m, largest first.
+    squares_sigma
+        Relative 1-sigma of the sizes of the squares that is common to all, from the certificate of
+        the grid.
+    grid_certificate
+        What the sizes of the squares rest on, such as the number of a certificate. It is copied to
+        the calibration.
+    stage
+        What the stage publishes; a recording without its topic is one without a stage. None leaves
+        the stage out.
     frame_id
         Frame for images that the suite itself makes (virtual microscope, imported files).
     """
@@ -246,6 +319,15 @@ class MicroscopeConfig:
         default=(25e-6, 10e-6, 5e-6, 2e-6, 1e-6),
         description="a list of square sizes in m, each above 0 and at most 1, such as [10.0e-6]",
     )
+    squares_sigma: Annotated[_Number, Field(ge=0.0, le=0.1)] = Field(
+        default=0.0, description="a relative 1-sigma from 0 to 0.1, such as 0.001"
+    )
+    grid_certificate: Annotated[str, Field(strict=True, max_length=200)] = Field(
+        default="", description="a text of at most 200 characters"
+    )
+    stage: StageConfig | None = Field(
+        default=StageConfig(), description="a mapping of stage settings"
+    )
     frame_id: _Frame = Field(default="sem_optical", description="a frame name such as sem_optical")
 
     @property
@@ -265,7 +347,13 @@ class MicroscopeConfig:
         return self.start_offset_s + (self.scan.centre_offset_s if self.scan else 0.0)
 
 
-_MAPPINGS = {"image": ImageConfig, "magnification": MagnificationConfig, "scan": _ScanKeys}
+_MAPPINGS: dict[str, Any] = {
+    "image": ImageConfig,
+    "magnification": MagnificationConfig,
+    "scan": _ScanKeys,
+    "stage": StageConfig,
+    "stage.sigma": StageSigmas,
+}
 # A file has to say these although the classes have defaults: a number of another quantity looks
 # much like a magnification.
 _REQUIRED = {"": "magnification", "magnification": "quantity"}
@@ -347,11 +435,13 @@ def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
     """Keys that only a file must have, and keys without a value."""
     if not isinstance(values, dict):
         return
-    mappings = {"": values, **{key: values[key] for key in _MAPPINGS if key in values}}
-    for parent, mapping in mappings.items():
+    for parent in ("", *_MAPPINGS):
+        above = tuple(parent.split(".")) if parent else ()
+        mapping: Any = values
+        for key in above:
+            mapping = mapping.get(key) if isinstance(mapping, dict) else None
         if not isinstance(mapping, dict):
             continue
-        above = (parent,) if parent else ()
         if _REQUIRED.get(parent, parent) not in {parent, *mapping}:
             yield (*above, _REQUIRED[parent]), "missing"
         yield from (((*above, key), "none") for key, value in mapping.items() if value is None)
@@ -362,20 +452,29 @@ def _refusal(source: str, found: Problems, declared: type[Any], do: str = "") ->
     # A misspelt key causes a missing one as well: name the misspelt one.
     location = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _path(at)))
     kind, value = found[location]
-    nested = len(location) > 1 and location[0] in _MAPPINGS
-    mapping: Any = _MAPPINGS[str(location[0])] if nested else declared
+    depth, mapping = _innermost(location, declared)
     fields = mapping.__pydantic_fields__
     path = _path(location)
     if kind in _UNKNOWN:
         return ConfigError(
             f"{source}: unknown key {_cut(path)}", expected="one of " + ", ".join(fields), do=do
         )
-    key = location[1 if nested else 0] if location else ""
+    key = location[depth] if location else ""
     expected = fields[key].description if location else "a mapping of settings"
     if kind == "missing":
         return ConfigError(f"{source}: key {path} is missing", expected=expected, do=do)
     where = f"key {path}" if path else "the whole file"
     return ConfigError(f"{source}: {where} is {_shown(value)}", expected=expected, do=do)
+
+
+def _innermost(location: Location, declared: type[Any]) -> tuple[int, Any]:
+    """The innermost mapping around a key: how many keys lead to it, and its declaration."""
+    above = [path for path, kind in _MAPPINGS.items() if kind is declared]
+    for depth in range(len(location) - 1, 0, -1):
+        path = ".".join([*above, *map(str, location[:depth])])
+        if path in _MAPPINGS:
+            return depth, _MAPPINGS[path]
+    return 0, declared
 
 
 def _path(location: Location) -> str:

@@ -16,11 +16,13 @@ from semcal_ros.bridge.fields import require_fields
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.files.bags.errors import reading
 from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
+from semcal_ros.files.bags.stage import find_stage
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
 from semcal_ros.files.plain_images import plain_image_paths, read_plain_image
 from semcal_ros.files.tiff.folder import TiffFolder, scan_tiff_folder
@@ -51,6 +53,10 @@ class RecordedFrame:
         Coordinate frame that the header names.
     encoding
         ROS name of the pixel format, such as ``mono8``.
+    stage
+        What the stage said last before the frame, or None where it is not known.
+    file_name
+        Name of the file that the frame comes from, for a folder of images; else empty.
     """
 
     image: NDArray[Any]
@@ -59,6 +65,8 @@ class RecordedFrame:
     magnification: float
     frame_id: str
     encoding: str
+    stage: StageReading | None = None
+    file_name: str = ""
 
 
 @dataclass(frozen=True)
@@ -166,6 +174,9 @@ class _BagRecording(Recording):
             self._reader.close()
             raise
         self._note_bad_magnifications(magnification_topic)
+        self._stage, notes = find_stage(self._reader, config, self._image_topic.name)
+        self._notes.extend(notes)
+        self._moved = 0
 
     def _find_magnification(self, source: MagnificationConfig) -> BagTopic:
         topic, note = find_topic(
@@ -208,6 +219,7 @@ class _BagRecording(Recording):
 
     def _frames(self) -> Iterator[RecordedFrame]:
         without, unstamped, images = 0, 0, 0
+        self._moved = 0
         for raw in self._reader.raw_messages([self._image_topic.name]):
             if raw.type != self._image_topic.type:
                 continue
@@ -228,6 +240,10 @@ class _BagRecording(Recording):
             self._pass_notes.append(
                 f"{unstamped} images have no header stamp: the recorder's time is used"
             )
+        if self._moved:
+            self._pass_notes.append(
+                f"the stage moved during {self._moved} images: its readings are not used for them"
+            )
         if images < self.frame_count:
             self._pass_notes.append(
                 f"the recording declares {self.frame_count} images and holds {images}"
@@ -243,6 +259,10 @@ class _BagRecording(Recording):
         magnification = self._track.at(stamp_ns or raw.log_time_ns, raw.log_time_ns, image.shape[1])
         if magnification is None:
             return None, stamp_ns != 0
+        stage, moved = None, False
+        if self._stage is not None:
+            stage, moved = self._stage.at(stamp_ns or raw.log_time_ns, raw.log_time_ns)
+        self._moved += moved
         return (
             RecordedFrame(
                 image=image,
@@ -251,6 +271,7 @@ class _BagRecording(Recording):
                 magnification=magnification,
                 frame_id=str(message.header.frame_id),
                 encoding=encoding,
+                stage=stage,
             ),
             stamp_ns != 0,
         )
@@ -283,6 +304,8 @@ class _TiffRecording(Recording):
                 magnification=entry.magnification,
                 frame_id=self.config.frame_id,
                 encoding="mono8" if loaded.image.dtype.itemsize == 1 else "mono16",
+                stage=entry.stage,
+                file_name=entry.path.name,
             )
 
 
@@ -314,6 +337,7 @@ class _PlainRecording(Recording):
                 magnification=self._magnification,
                 frame_id=self.config.frame_id,
                 encoding="mono8" if image.dtype.itemsize == 1 else "mono16",
+                file_name=path.name,
             )
 
 
@@ -352,6 +376,7 @@ def open_recording(
             path,
             display_width_m=used.display_width_m,
             databar_rows=used.image.databar_rows or None,
+            stage=used.stage is not None,
         )
         return _TiffRecording(path, used, folder)
     return _BagRecording(path, used)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -18,6 +18,7 @@ from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fi
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
@@ -25,6 +26,7 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import calibration_digest
 from semcal_ros.nodes.frames.overlay import corner_overlay
+from semcal_ros.nodes.frames.stage import StageInput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,
@@ -32,6 +34,7 @@ from semcal_ros.nodes.workers.calibration_worker import (
     Stage,
     without_images,
 )
+from semcal_ros.workflows.calibrate import options_for
 
 __all__ = ["CalibrationServer", "main"]
 
@@ -50,6 +53,15 @@ _PARAMETERS = (
 _THREADS = 6
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """A frame that may become a view, with what was known when it arrived."""
+
+    frame: StreamFrame
+    visit: int
+    stage: StageReading | None
+
+
 class CalibrationServer(StreamNode):
     """Services ~/add_view, ~/calibrate, ~/cancel, ~/save, ~/clear; topics ``calibration``, ~/progress, ~/overlay.
 
@@ -59,7 +71,7 @@ class CalibrationServer(StreamNode):
     def __init__(self) -> None:
         super().__init__("calibration_server", _PARAMETERS)
         self._lock = threading.Lock()
-        self._newest: StreamFrame | None = None
+        self._newest: _Candidate | None = None
         self._added: StreamFrame | None = None
         self._views: list[FoundView] = []
         self._calibration: Calibration | None = None
@@ -68,7 +80,10 @@ class CalibrationServer(StreamNode):
         self._text = self.endpoints.latched_publisher(String, "calibration")
         self._progress = self.endpoints.latched_publisher(DiagnosticStatus, "~/progress")
         self._overlay = self.endpoints.stream_publisher(Image, "~/overlay")
-        self.receive_frames(self._on_frame, group=MutuallyExclusiveCallbackGroup())
+        stream = MutuallyExclusiveCallbackGroup()
+        # Before the images, as the magnification.
+        self._position = StageInput(self.config.stage, self.endpoints, self.reporter, stream)
+        self.receive_frames(self._on_frame, group=stream)
         quick = MutuallyExclusiveCallbackGroup()
         handlers = (
             ("add_view", self._add_view, quick),
@@ -112,16 +127,22 @@ class CalibrationServer(StreamNode):
     # -- stream ------------------------------------------------------------------------------------
 
     def _on_frame(self, frame: StreamFrame) -> None:
-        if self.known_magnification(frame) is not None and not frame.mixed:
-            with self._lock:
-                self._newest = frame
+        magnification = self.known_magnification(frame)
+        if magnification is None or frame.mixed:
+            return
+        with self._lock:
+            before = self._newest
+            visit = 0 if before is None else before.visit
+            visit += before is not None and before.frame.magnification != magnification
+            self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns))
 
     # -- services ----------------------------------------------------------------------------------
 
     def _add_view(self) -> str:
         with self._lock:
-            frame, name = self._newest, f"view {len(self._views)}"
-        if frame is None or frame.magnification is None:
+            newest, name = self._newest, f"view {len(self._views)}"
+        frame = None if newest is None else newest.frame
+        if newest is None or frame is None or frame.magnification is None:
             raise InvalidValueError(
                 "no frame with a known magnification yet", do="check that the microscope publishes"
             )
@@ -141,13 +162,17 @@ class CalibrationServer(StreamNode):
                 f"no grid found at {frame.magnification:g}x: {detection.reason}",
                 expected="an image filled by the chess grid",
             )
-        view = without_images([FoundView(name, frame.magnification, grey, detection)])[0]
+        found = FoundView(name, frame.magnification, grey, detection, newest.stage, newest.visit)
+        view = without_images([found])[0]
         with self._lock:
             self._views.append(view)
             self._added = frame
             count = len(self._views)
         self.reporter.count_published(frame.stamp_ns)
-        return f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners"
+        tilt = None if newest.stage is None else newest.stage.tilt_rad
+        return f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners" + (
+            "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
+        )
 
     def _clear(self) -> str:
         with self._lock:
@@ -191,7 +216,11 @@ class CalibrationServer(StreamNode):
                 views,
                 config.display_width_m,
                 config.squares_m,
-                CalibrationOptions(method=values["method"], residual=values["residual"]),
+                options_for(
+                    config,
+                    CalibrationOptions(method=values["method"], residual=values["residual"]),
+                ),
+                config.grid_certificate,
             )
             self._running = CalibrationProcess(job)
             return self._running

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
@@ -15,8 +16,9 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
     calibrate_views,
 )
+from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import FoundView, RejectedView
-from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
     collect_views,
@@ -34,7 +36,13 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["RecordingCalibration", "calibrate", "calibrate_found", "calibrate_recording"]
+__all__ = [
+    "RecordingCalibration",
+    "calibrate",
+    "calibrate_found",
+    "calibrate_recording",
+    "options_for",
+]
 
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
@@ -88,6 +96,42 @@ def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> C
     )
 
 
+def options_for(
+    config: MicroscopeConfig, options: CalibrationOptions | None = None
+) -> CalibrationOptions:
+    """Return options with what the configuration knows: the tilt axis, and the grid's certificate.
+
+    What the options say themselves stays.
+    """
+    chosen = options or CalibrationOptions()
+    if chosen.squares_sigma == 0.0:
+        chosen = replace(chosen, squares_sigma=config.squares_sigma)
+    if config.stage is not None and chosen.axis == StageAxis():
+        sigma = config.stage.sigma
+        axis = StageAxis(float(np.radians(config.stage.tilt_axis_deg)), sigma.tilt, sigma.rotation)
+        chosen = replace(chosen, axis=axis)
+    return chosen
+
+
+def _name_untilted(
+    untilted: str | Sequence[str], found: Sequence[FoundView]
+) -> str | tuple[str, ...]:
+    """Return names of views for what a user may call them: by number or by file."""
+    if isinstance(untilted, str):
+        return untilted
+    names = {view.file_name: view.name for view in found}
+    names |= {view.name.removeprefix("frame "): view.name for view in found}
+    names |= {view.name: view.name for view in found}
+    unknown = [name for name in untilted if name not in names]
+    if unknown:
+        raise InvalidValueError(
+            f"untilted {', '.join(map(repr, unknown[:3]))}",
+            expected="numbers or file names of frames in which the grid was found, such as "
+            + ", ".join(view.file_name or view.name.removeprefix("frame ") for view in found[:3]),
+        )
+    return tuple(names[name] for name in untilted)
+
+
 def calibrate_found(
     found: Sequence[FoundView],
     rejected: Sequence[RejectedView],
@@ -95,12 +139,18 @@ def calibrate_found(
     display_width_m: float,
     squares_m: Sequence[float],
     options: CalibrationOptions | None = None,
+    grid_certificate: str = "",
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> RecordingCalibration:
     """Calibrate from found corners.
 
-    ``on_stage`` is called with what begins and the fraction of the work that is done.
+    Views that ``options.untilted`` lists may be named by their number or file, too.
+    ``grid_certificate`` is kept in the statistics. ``on_stage`` is called with what begins and the
+    fraction of the work that is done.
     """
+    options = options or CalibrationOptions()
+    if found:
+        options = replace(options, untilted=_name_untilted(options.untilted, found))
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
     factor = collected.assignment.scale_factor
     _check_factor(factor, display_width_m)
@@ -124,6 +174,7 @@ def calibrate_found(
         "rejected_views": len(collected.rejected),
         "squares_m": sorted({float(s) for s in collected.assignment.square_m}),
         "scale_over_nominal": factor,
+        **({"grid_certificate": grid_certificate} if grid_certificate else {}),
         "warnings": warnings,
     }
     model = replace(result.model, statistics=statistics)
@@ -137,6 +188,7 @@ def calibrate_recording(
     config: ConfigSource | None = None,
     display_width_m: float | None = None,
     squares_m: Sequence[float] | None = None,
+    squares_sigma: float | None = None,
     magnification: float | None = None,
     options: CalibrationOptions | None = None,
     on_progress: OnProgress = ignore_progress,
@@ -150,6 +202,8 @@ def calibrate_recording(
         chosen = replace(chosen, display_width_m=check_positive(display_width_m, "display_width_m"))
     if squares_m is not None:
         chosen = replace(chosen, squares_m=check_positives(squares_m, "squares_m"))
+    if squares_sigma is not None:
+        chosen = replace(chosen, squares_sigma=squares_sigma)
     with open_source(source, chosen, magnification=magnification) as recording:
         advance = count_frames(on_progress, "finding corners", recording.frame_count)
         found, rejected = find_views(named_frames(recording), on_progress=advance)
@@ -160,7 +214,8 @@ def calibrate_recording(
         rejected,
         display_width_m=chosen.display_width_m,
         squares_m=chosen.squares_m,
-        options=options,
+        options=options_for(chosen, options),
+        grid_certificate=chosen.grid_certificate,
     )
     return replace(done, notes=notes)
 
@@ -171,11 +226,14 @@ def calibrate(
     config: ConfigSource | None = None,
     display_width_m: float | None = None,
     squares_m: Sequence[float] | None = None,
+    squares_sigma: float | None = None,
     magnification: float | None = None,
     method: str = "joint",
     options: MethodOptions | None = None,
     breakpoints: Sequence[float] = (),
     residual: str = "auto",
+    untilted: str | Sequence[str | int] = "auto",
+    height_sigma_m: float = CalibrationOptions.height_sigma_m,
     on_progress: OnProgress = ignore_progress,
 ) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
@@ -187,11 +245,15 @@ def calibrate(
         tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3).
     config
         A ``msg_configs`` name or file; the default is ``generic``.
-    display_width_m, squares_m
+    display_width_m, squares_m, squares_sigma
         Replace the values of ``config``.
     magnification
         Magnification of a folder of ordinary images, which do not contain it.
-    method, options, breakpoints, residual
+    untilted
+        Frames in which the specimen is not tilted, by number or by file name; ``"none"``; or
+        ``"auto"``, which finds them where they can be told. With readings of a stage,
+        ``"auto"`` leaves it to them.
+    method, options, breakpoints, residual, height_sigma_m
         As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
         is ``method_options``.
     on_progress
@@ -217,12 +279,15 @@ def calibrate(
         config=config,
         display_width_m=display_width_m,
         squares_m=squares_m,
+        squares_sigma=squares_sigma,
         magnification=magnification,
         options=CalibrationOptions(
             method,
             options or MethodOptions(),
             check_positives(breakpoints, "breakpoints"),
             residual,
+            untilted if isinstance(untilted, str) else tuple(str(name) for name in untilted),
+            height_sigma_m=height_sigma_m,
         ),
         on_progress=on_progress,
     ).calibration

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
+import numpy as np
 from joblib import Parallel, cpu_count, delayed
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import (
     FoundView,
     GridView,
@@ -27,8 +29,10 @@ from semcal_ros.files.recordings import Recording
 
 __all__ = [
     "CollectedViews",
+    "NamedFrame",
     "Progress",
     "collect_views",
+    "count_visits",
     "find_views",
     "named_frames",
 ]
@@ -36,8 +40,13 @@ __all__ = [
 #: Called with the number of frames that were done since the last call.
 Progress = Callable[[int], object]
 
+# A pause in which a magnification can have been left and set again: over the usual one within a visit,
+# and over that at a change. Half an operator's pause is still the same work; three times is another.
+_MUCH_LONGER, _AS_LONG = 3.0, 0.5
 # Fewer images are processed before other processes have started.
 _TOO_FEW_TO_SHARE = 12
+# In place of an image that is on its way.
+_NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -54,6 +63,29 @@ class CollectedViews:
     image_size: tuple[int, int]
 
 
+class NamedFrame(NamedTuple):
+    """A frame in which a grid is to be found.
+
+    Attributes
+    ----------
+    name, image, magnification
+        Its name, grey image and magnification.
+    stage
+        What the stage said about it, or None.
+    stamp_ns
+        When it was taken, or None.
+    file_name
+        The file that it comes from, or empty.
+    """
+
+    name: str
+    image: NDArray[Any]
+    magnification: float
+    stage: StageReading | None = None
+    stamp_ns: int | None = None
+    file_name: str = ""
+
+
 def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView | RejectedView:
     # The images are the parallel work; threads inside OpenCV would only compete.
     cv2.setNumThreads(1)
@@ -63,48 +95,85 @@ def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView |
     return FoundView(name, magnification, image, detection)
 
 
-def named_frames(recording: Recording) -> Iterator[tuple[str, NDArray[Any], float]]:
-    """(name, grey image, magnification) of each usable frame of an open recording."""
+def count_visits(magnifications: Sequence[float], stamps_ns: Sequence[int | None]) -> list[int]:
+    """Number the visits of magnifications: stretches of a recording in which nothing was changed.
+
+    A visit ends where the magnification changes. A magnification may also be left and set again
+    between two images. That takes as long as the changes of the magnification that the recording shows,
+    so a visit also ends at a pause that is as long as these and much longer than the usual ones.
+    Without stamps there are no pauses.
+    """
+    count = len(magnifications)
+    changed = np.array([magnifications[i] != magnifications[i + 1] for i in range(count - 1)], bool)
+    times = np.array([stamp for stamp in stamps_ns if stamp is not None], dtype=np.float64)
+    if len(times) == count and np.any(changed) and not np.all(changed):
+        pauses = np.diff(times)
+        usual, at_change = np.median(pauses[~changed]), np.median(pauses[changed])
+        changed |= (pauses >= _MUCH_LONGER * usual) & (pauses >= _AS_LONG * at_change)
+    return [0, *(int(number) for number in np.cumsum(changed))][:count]
+
+
+def named_frames(recording: Recording) -> Iterator[NamedFrame]:
+    """Each usable frame of an open recording, with the name ``frame N``."""
     for index, frame in enumerate(recording.frames()):
-        yield f"frame {index}", to_gray(frame.image, frame.encoding), frame.magnification
+        grey = to_gray(frame.image, frame.encoding)
+        yield NamedFrame(
+            f"frame {index}",
+            grey,
+            frame.magnification,
+            frame.stage,
+            frame.stamp_ns,
+            frame.file_name,
+        )
 
 
 def find_views(
-    frames: Iterable[tuple[str, NDArray[Any], float]],
+    frames: Iterable[NamedFrame | tuple[str, NDArray[Any], float]],
     *,
     on_progress: Progress | None = None,
     processes: int | None = None,
 ) -> tuple[list[FoundView], list[RejectedView]]:
-    """Find the grid in (name, grey image, magnification) frames, on all cores.
+    """Find the grid in frames, on all cores.
 
     Parameters
     ----------
     frames
-        Taken a few at a time. Their images stay in the results, which a report shows.
+        In the order of the recording, with or without a grid: they determine the visits. They are
+        taken a few at a time. Their images stay in the results, which a report shows.
     on_progress
         Called with 1 after each frame.
     processes
         Number of processes; one per core without. 1 works in this process.
     """
-    found: list[FoundView] = []
-    rejected: list[RejectedView] = []
-    iterator = iter(frames)
+    views: list[FoundView | RejectedView] = []
+    origins: list[NamedFrame] = []
+
+    def pictures() -> Iterator[tuple[str, NDArray[Any], float]]:
+        for frame in frames:
+            origin = frame if isinstance(frame, NamedFrame) else NamedFrame(*frame)
+            origins.append(origin._replace(image=_NO_IMAGE))
+            yield origin.name, origin.image, origin.magnification
+
+    iterator = pictures()
     first = list(islice(iterator, _TOO_FEW_TO_SHARE))
     if len(first) < _TOO_FEW_TO_SHARE:
         processes = 1
     work = Parallel(n_jobs=processes or cpu_count(), return_as="generator")
     threads = cv2.getNumThreads()
     try:
-        for view in work(delayed(_detect)(*frame) for frame in chain(first, iterator)):
-            if isinstance(view, FoundView):
-                found.append(view)
-            else:
-                rejected.append(view)
+        for view in work(delayed(_detect)(*picture) for picture in chain(first, iterator)):
+            views.append(view)
             if on_progress is not None:
                 on_progress(1)
     finally:
         cv2.setNumThreads(threads)
-    return found, rejected
+    visits = count_visits([o.magnification for o in origins], [o.stamp_ns for o in origins])
+    found = [
+        replace(view, stage=origin.stage, visit=visit, file_name=origin.file_name)
+        for view, origin, visit in zip(views, origins, visits, strict=True)
+        if isinstance(view, FoundView)
+    ]
+    return found, [view for view in views if isinstance(view, RejectedView)]
 
 
 def collect_views(
@@ -175,6 +244,8 @@ def _assign_squares(
         display_width_m=display_width_m,
         squares_m=squares_m,
         names=[v.name for v in found],
+        stages=[v.stage for v in found],
+        visits=[v.visit for v in found],
     )
 
 

@@ -257,3 +257,27 @@ def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
     assert {"calibration.png", "drift.csv", "gold_rect", "gold.tif"} <= {
         path.name for path in tmp_path.iterdir()
     }
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--height-sigma", "10 furlongs"), "is not a length such as 10um"),
+        (("--height-sigma", "-1um"), "is not a length such as 10um"),
+        (("--squares-sigma", "0.5"), "0.5 is not in the range"),
+        (("--untilted", "99"), "untilted '99'; expected numbers or file names of frames"),
+    ],
+)
+def test_what_a_calibration_knows_beforehand_is_checked(folder, tmp_path, capsys, options, reason):
+    command = ("calibrate", folder / "grid", "-o", tmp_path / "cal.yaml", *options)
+    assert reason in refused(capsys, *command)
+    assert not (tmp_path / "cal.yaml").exists()
+
+
+@pytest.mark.slow
+def test_what_is_known_beforehand_reaches_the_file(folder, tmp_path):
+    known = ("--height-sigma", "25um", "--squares-sigma", "0.002", "--untilted", "none")
+    assert run("calibrate", folder / "grid", "-o", tmp_path / "cal.yaml", *known) == 0
+    saved = yaml.safe_load((tmp_path / "cal.yaml").read_text())
+    assert saved["scale_sigma"]["height_m"] == 25e-6
+    assert saved["scale_sigma"]["grid"] == 0.002

@@ -18,6 +18,8 @@ from semcal_ros.config.config import (
     ImageConfig,
     MagnificationConfig,
     MicroscopeConfig,
+    StageConfig,
+    StageSigmas,
     config_names,
     config_schema,
     load_config,
@@ -38,6 +40,9 @@ magnification:
    unit: nm, image_width_px: 1024}
 scan: {frame_time_s: 0.5, averages: 4, flyback_fraction: 0.25}
 squares_m: [1e-6, 25e-6]
+squares_sigma: 1e-3
+grid_certificate: PTB 4711
+stage: {topic: /sem/axes, tilt: T, tilt_axis_deg: 90, sigma: {tilt: 0.01}}
 frame_id: sem
 """
 
@@ -86,7 +91,7 @@ def _declared_keys() -> dict[str, dict[str, Any]]:
             yield above + name, {**key, "required": name in mapping.get("required", [])}
             inner = [key, *key.get("anyOf", [])]
             for reference in (part["$ref"] for part in inner if "$ref" in part):
-                yield from walk(schema["$defs"][reference.rpartition("/")[2]], f"{name}.")
+                yield from walk(schema["$defs"][reference.rpartition("/")[2]], f"{above}{name}.")
 
     return dict(walk(schema, ""))
 
@@ -104,19 +109,22 @@ def test_the_manual_lists_the_declared_keys_with_their_defaults_and_units() -> N
         row[1].strip(" `"): (row[2].strip(" `"), row[3].strip()) for row in rows if len(row) == 6
     }
     declared = _declared_keys()
-    mappings = {key.partition(".")[0] for key in declared if "." in key}
+    mappings = {key.rpartition(".")[0] for key in declared if "." in key}
     assert set(table) == set(declared) - {"image", "magnification"}
-    units = {"m": "m", "s": "s", "px": "px", "rows": "px"}
+    units = {"m": "m", "s": "s", "px": "px", "rows": "px", "deg": "deg"}
+    units |= {"stage.sigma.tilt": "rad", "stage.sigma.rotation": "rad", "stage.sigma.z": "m"}
     for key, (default, unit) in table.items():
         said = declared[key]
         if key not in mappings:
-            assert unit == units.get(key.rpartition("_")[2], ""), key
+            assert unit == units.get(key, units.get(key.rpartition("_")[2], "")), key
         if said["required"] or key == "magnification.quantity":
             assert default.startswith("required"), key
+        elif key in mappings:
+            assert default.startswith("none"), key
         elif said.get("default") is None:
             assert default.startswith(("none", "width of the frames")), key
         else:
-            assert load_yaml(default, key) == load_yaml(str(said["default"]), key), key
+            assert load_yaml(default, key) == load_yaml(str(said["default"]) or '""', key), key
 
 
 def test_generic_states_the_defaults() -> None:
@@ -128,6 +136,8 @@ def test_generic_states_the_defaults() -> None:
     assert bare.image == ImageConfig()
     assert bare.magnification == MagnificationConfig()
     assert bare.scan is None
+    assert bare.stage == StageConfig()
+    assert (bare.squares_sigma, bare.grid_certificate) == (0.0, "")
 
 
 def test_all_keys_are_read() -> None:
@@ -145,6 +155,11 @@ def test_all_keys_are_read() -> None:
     )
     assert config.scan == ScanTiming(0.5, 4, 0.25)
     assert config.squares_m == (25e-6, 1e-6)
+    assert (config.squares_sigma, config.grid_certificate) == (1e-3, "PTB 4711")
+    assert config.stage == StageConfig(
+        topic="/sem/axes", tilt="T", tilt_axis_deg=90.0, sigma=StageSigmas(tilt=0.01)
+    )
+    assert config.stage is not None and config.stage.rotation == "rotation"
     assert config.frame_id == "sem"
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.name = "other"  # type: ignore[misc]
@@ -216,6 +231,23 @@ def test_without_scan_a_frame_is_an_instant() -> None:
         ("nmae", "typo"),
         ("image.databar", 3),
         ("magnification.filed", "data"),
+        ("squares_sigma", -1e-3),
+        ("squares_sigma", 0.5),
+        ("squares_sigma", "0.1 %"),
+        ("grid_certificate", 4711),
+        ("stage", "stage"),
+        ("stage.topic", "a stage"),
+        ("stage.type", "geometry_msgs/msg/Twist"),
+        ("stage.tilt", ""),
+        ("stage.tilt", 1),
+        ("stage.tilts", "tilt"),
+        ("stage.tilt_axis_deg", 400.0),
+        ("stage.tilt_axis_deg", float("nan")),
+        ("stage.sigma", 0.01),
+        ("stage.sigma.tilt", 0.0),
+        ("stage.sigma.rotation", 5.0),
+        ("stage.sigma.z", float("inf")),
+        ("stage.sigma.x", 1e-6),
     ],
 )
 def test_a_wrong_key_is_named(path: str, value: object) -> None:
@@ -231,7 +263,18 @@ def test_a_wrong_key_is_named(path: str, value: object) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["name", "image", "magnification.unit", "magnification.image_width_px", "scan", "squares_m"],
+    [
+        "name",
+        "image",
+        "magnification.unit",
+        "magnification.image_width_px",
+        "scan",
+        "squares_m",
+        "stage",
+        "stage.tilt",
+        "stage.sigma",
+        "stage.sigma.z",
+    ],
 )
 def test_a_key_without_a_value_is_named(path: str) -> None:
     with pytest.raises(ConfigError, match=rf"key {path} is None"):
@@ -352,6 +395,7 @@ def test_ament_prefix_and_working_directory(
         ({"scan": {"frame_time_s": 0.0}}, "scan.frame_time_s is 0.0"),
         ({"image": {"topic": ""}}, "image.topic is ''"),
         ({"widht": 1}, "unknown key widht"),
+        ({"stage": {"sigma": {"z": -1.0}}}, "stage.sigma.z is -1.0; expected a length in m"),
     ],
 )
 def test_constructors_refuse_like_files(arguments, reason):

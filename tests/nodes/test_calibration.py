@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sensor_msgs.msg import JointState
 
 from semcal_ros.calibration import Calibration
 from tests.helpers.calibration_session import (
@@ -21,7 +22,7 @@ from tests.helpers.calibration_session import (
     text_value,
 )
 from tests.helpers.node_scenes import make_calibration
-from tests.helpers.ros_process import running
+from tests.helpers.ros_process import LATCHED, running
 
 PARAMETERS = "/sem/parameter_server"
 
@@ -52,6 +53,31 @@ def test_an_image_without_a_grid_is_refused_with_a_reason_and_shown(session: Ses
     assert not answer.success
     assert answer.message.startswith("no grid found at 1000x: ")
     session.peer.wait_for(lambda: len(session.overlays) > count, "the overlay")
+
+
+def test_a_view_keeps_what_the_stage_said(session: Session) -> None:
+    publisher = session.peer.node.create_publisher(JointState, "stage", LATCHED)
+    session.peer.wait_for(lambda: publisher.get_subscription_count() == 1, "the subscription")
+    publisher.publish(JointState(name=["tilt"], position=[0.3]))
+
+    def known() -> bool:
+        session.show(PLAN.render(0), PLAN.frames[0].magnification)
+        return session.peer.state(SERVER).get("stage_tilt_rad") == "0.3"
+
+    session.peer.wait_for(known, "the stage")
+    answer = session.call("add_view")
+    assert answer.success
+    assert answer.message.endswith(", tilted by 17.2 degrees")
+    # A wrong one makes it unknown again.
+    publisher.publish(JointState(name=["tilt"], position=[17.2]))
+
+    def rejected() -> bool:
+        return "looks like degrees" in session.peer.state(SERVER).get("last_rejection", "")
+
+    session.peer.wait_for(rejected, "the rejection")
+    session.show(PLAN.render(1), PLAN.frames[1].magnification)
+    assert "tilted" not in session.call("add_view").message
+    session.peer.node.destroy_publisher(publisher)
 
 
 def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path: Path) -> None:

@@ -5,14 +5,23 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from semcal_ros import Calibration, calibrate
-from semcal_ros.core.errors import CalibrationError
+from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.images import fill_image
+from semcal_ros.config.config import StageConfig, StageSigmas, load_config
+from semcal_ros.core.calibration.calibrate import CalibrationOptions
+from semcal_ros.core.calibration.stage import StageAxis, StageReading
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.synthetic import Detector, calibration_plan, preset
-from semcal_ros.workflows.calibrate import calibrate_found
-from semcal_ros.workflows.find_grid import find_views
+from semcal_ros.workflows import calibrate as workflow
+from semcal_ros.workflows.calibrate import calibrate_found, calibrate_recording, options_for
+from semcal_ros.workflows.find_grid import collect_views, count_visits, find_views
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 PLAN = calibration_plan(
@@ -140,3 +149,147 @@ def test_periods_in_place_of_sides_are_refused(found, factor):
 def test_squares_of_no_known_size_are_refused(found):
     with pytest.raises(CalibrationError, match="none of the known sizes"):
         _collected(found, squares_m=[5e-6])
+
+
+# -- visits, squares and the stage -----------------------------------------------------------------
+
+
+def test_a_visit_ends_where_the_magnification_changes(frames):
+    """Twice to the first magnification, with only a frame without a grid at another in between."""
+    first = [frame for frame in frames if frame[2] == 400.0]
+    blank = ("between", np.full((256, 256), 120, dtype=np.uint8), 1000.0)
+    second = [frame for frame in frames if frame[2] == 2500.0]
+    order = [*first[:2], blank, *first[2:4], *second[:1]]
+    found, rejected = find_views(order, processes=1)
+    assert [r.name for r in rejected] == ["between"]
+    assert [v.visit for v in found] == [0, 0, 2, 2, 3]
+    collected = collect_views(found, rejected, display_width_m=0.12, squares_m=SQUARES)
+    assert [v.visit for v in collected.views] == [0, 0, 2, 2, 3]
+    of_frame = {f"{i}": f.square_m for i, f in enumerate(PLAN.frames)}
+    expected = [of_frame[view.name] for view in collected.views]
+    assert [view.square_m for view in collected.views] == pytest.approx(expected, rel=1e-12, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("magnifications", "times_s", "visits"),
+    [
+        ([1.0, 1.0, 2.0, 2.0, 1.0], [0, 20, 100, 120, 200], [0, 0, 1, 1, 2]),
+        # Turned back at the highest: a pause as at the other changes.
+        ([1.0, 1.0, 2.0, 2.0, 2.0, 2.0], [0, 20, 100, 120, 200, 220], [0, 0, 1, 1, 2, 2]),
+        # Evenly spaced frames have no pauses, nor does a recording of one magnification.
+        ([1.0, 1.0, 2.0, 2.0, 2.0], [0, 20, 40, 60, 80], [0, 0, 1, 1, 1]),
+        ([1.0, 1.0, 1.0, 1.0], [0, 20, 1000, 1020], [0, 0, 0, 0]),
+        # Longer than usual, but shorter than a change.
+        ([1.0, 1.0, 2.0, 2.0, 2.0, 2.0], [0, 2, 100, 102, 112, 114], [0, 0, 1, 1, 1, 1]),
+        ([1.0, 2.0], [None, None], [0, 1]),
+        ([], [], []),
+    ],
+)
+def test_visits(magnifications, times_s, visits):
+    stamps_ns = [None if t is None else round(1e9 * t) for t in times_s]
+    assert count_visits(magnifications, stamps_ns) == visits
+
+
+def _recorded(path, stage=lambda _index: None):
+    """The frames of the plan in a bag, with a message of the stage before each."""
+    with BagWriter(path) as writer:
+        for index, frame in enumerate(PLAN.frames):
+            stamp_ns = (20 * index + 10) * 10**9
+            number = blank_message("std_msgs/msg/Float64")
+            number.data = frame.magnification
+            writer.write("/sem/magnification", stamp_ns - 10**9, number)
+            angles = stage(index)
+            if angles is not None:
+                message = blank_message("sensor_msgs/msg/JointState")
+                fill_header(message.header, stamp_ns - 10**9, "sem")
+                message.name, message.position = list(angles), list(angles.values())
+                writer.write("/sem/stage", stamp_ns - 10**9, message)
+            picture = blank_message("sensor_msgs/msg/Image")
+            fill_image(picture, PLAN.render(index), "mono8", picture.header)
+            fill_header(picture.header, stamp_ns, "sem")
+            writer.write("/sem/image_raw", stamp_ns, picture)
+    return path
+
+
+def test_readings_of_a_bag_reach_the_views(tmp_path, monkeypatch):
+    seen = {}
+
+    def stop(views, **given):
+        seen.update(views=views, **given)
+        raise CalibrationError("far enough")
+
+    monkeypatch.setattr(workflow, "calibrate_views", stop)
+    path = _recorded(tmp_path / "bag", lambda i: {"tilt": 0.1 * i, "rotation": -0.2 * i})
+    config = replace(
+        load_config("generic"),
+        stage=StageConfig(tilt_axis_deg=90.0, sigma=StageSigmas(tilt=0.01)),
+        squares_sigma=2e-3,
+    )
+    with pytest.raises(CalibrationError, match="far enough"):
+        calibrate(path, config=config, untilted=[0, "frame 4"], height_sigma_m=3e-5)
+    for view in seen["views"]:
+        index = int(view.name.removeprefix("frame "))
+        assert view.stage == StageReading(0.1 * index, -0.2 * index)
+        assert view.visit == index // 4
+    options = seen["options"]
+    assert options.axis == StageAxis(np.pi / 2, 0.01, 0.0087)
+    assert (options.squares_sigma, options.height_sigma_m) == (2e-3, 3e-5)
+    assert options.untilted == ("frame 0", "frame 4")
+    with pytest.raises(CalibrationError, match="far enough"):
+        calibrate(path, config=config, squares_sigma=0.0)
+    assert seen["options"].squares_sigma == 0.0
+    with pytest.raises(InvalidValueError, match="untilted '99'; expected numbers or file names"):
+        calibrate(path, config=config, untilted=["99"])
+
+
+def test_options_win_over_the_configuration():
+    config = replace(load_config("generic"), squares_sigma=1e-3)
+    own = CalibrationOptions(squares_sigma=5e-3, axis=StageAxis(1.0))
+    assert options_for(config, own) == own
+    assert options_for(config).squares_sigma == 1e-3
+    assert options_for(replace(config, stage=None)).axis == StageAxis()
+
+
+@pytest.mark.slow
+def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
+    plain = calibrate_recording(_recorded(tmp_path / "plain"))
+    wrong = _recorded(tmp_path / "wrong", lambda i: {"tilt": 10.0 * i})
+    done = calibrate_recording(wrong)
+    assert done.calibration.dumps() == plain.calibration.dumps()
+    assert any("looks like degrees" in note for note in done.notes)
+
+
+@pytest.mark.slow
+def test_files_are_untilted_by_name_and_the_certificate_is_kept(tmp_path, monkeypatch):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for index, frame in enumerate(PLAN.frames):
+        if frame.magnification == 1000.0:
+            cv2.imwrite(str(folder / f"view_{index}.png"), PLAN.render(index))
+    name = sorted(path.name for path in folder.iterdir())[1]
+    chosen = []
+    real = workflow.calibrate_views
+
+    def look(*views, options, **given):
+        chosen.append(options.untilted)
+        return real(*views, options=options, **given)
+
+    monkeypatch.setattr(workflow, "calibrate_views", look)
+    done = calibrate_recording(
+        folder,
+        config=replace(load_config("generic"), grid_certificate="PTB 4711"),
+        magnification=1000.0,
+        options=CalibrationOptions(untilted=(name,)),
+    )
+    assert chosen == [("frame 1",)]
+    assert done.calibration.statistics["grid_certificate"] == "PTB 4711"
+
+
+@pytest.mark.slow
+def test_the_reference_recording_with_a_stage(reference_data):
+    done = calibrate_recording(reference_data / "grid_real_stage")
+    views = done.result.views
+    assert len(views) == 80
+    assert all(v.stage is not None and v.stage.tilt_rad is not None for v in views)
+    assert sorted({v.visit for v in views}) == list(range(20))
+    assert done.notes == ()

@@ -148,12 +148,19 @@ class FoundView:
         (h, w) grey values.
     detection
         The corners.
+    stage, visit
+        As in :class:`GridView`.
+    file_name
+        Name of the file of the image; empty for a recording.
     """
 
     name: str
     magnification: float
     image: AnyImage
     detection: LatticeDetection
+    stage: StageReading | None = None
+    visit: int = -1
+    file_name: str = ""
 
 
 class ViewStatus(Enum):
@@ -280,6 +287,8 @@ def views_from_detections(
     display_width_m: float,
     squares_m: Sequence[float],
     names: Sequence[str] | None = None,
+    stages: Sequence[StageReading | None] | None = None,
+    visits: Sequence[int] | None = None,
 ) -> tuple[tuple[GridView, ...], SquareAssignment]:
     """Make views in metres from accepted lattice detections.
 
@@ -293,6 +302,8 @@ def views_from_detections(
         Display width to which the magnifications refer, m.
     squares_m
         The square sizes that the grid has, m.
+    names, stages, visits
+        Name, reading of the stage and number of the visit of each image, where they are known.
 
     Raises
     ------
@@ -318,9 +329,18 @@ def views_from_detections(
             d.sigma_px,
             label,
             d.covariance_px2 if len(d.covariance_px2) else None,
+            visit,
+            float(square),
+            stage,
         )
-        for d, g, square, label in zip(
-            detections, magnifications, assignment.square_m, labels, strict=True
+        for d, g, square, label, stage, visit in zip(
+            detections,
+            magnifications,
+            assignment.square_m,
+            labels,
+            stages if stages is not None else [None] * len(detections),
+            visits if visits is not None else [-1] * len(detections),
+            strict=True,
         )
     )
     return views, assignment

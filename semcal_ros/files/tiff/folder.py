@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from datetime import timezone
 from pathlib import Path
 
+from semcal_ros.bridge.stage import doubt_unit
+from semcal_ros.config.config import StageConfig
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError, TiffError
 from semcal_ros.files.plain_images import PLAIN_IMAGES
 from semcal_ros.files.tiff.read import is_tiff, read_sem_settings, read_sem_tiff
@@ -46,12 +49,17 @@ class TiffEntry:
         Time of the image in ns since 1970: the file's local time taken as UTC, or 1 s apart.
     magnification
         On the folder's common display width: field width = display width / magnification exactly.
+    databar_rows
+        Rows to cut off at the bottom, instead of those that the metadata give.
+    stage
+        Where the stage was, or None where the file does not say it.
     """
 
     path: Path
     stamp_ns: int
     magnification: float
     databar_rows: int | None
+    stage: StageReading | None = None
 
     def load(self) -> SemImage:
         """Load the image and its settings; raises :class:`TiffError` if the pixel data are damaged."""
@@ -130,8 +138,53 @@ def _stamps(found: list[_Found]) -> tuple[list[tuple[_Found, int]], str]:
     return spread, "stamps are the files' local times taken as UTC"
 
 
+# A stage that turns back comes back to a fraction of this, rad.
+_TURNED_RAD = 1e-3
+
+
+def _stages(found: list[_Found]) -> tuple[list[StageReading | None], list[str]]:
+    """Return what the files say about the stage, as far as its meaning is known, and notes.
+
+    Makers do not say in which sense they count a rotation. One that is the same in all files only adds
+    to the unknown direction of the grid; one that changes is left out. With a scan rotation, the
+    direction of the tilt axis in the image is not known, so the whole reading is left out.
+    """
+    turns = [i.settings.stage_rotation_rad for i in found]
+    known = [turn for turn in turns if turn is not None]
+    turned = bool(known) and max(known) - min(known) > _TURNED_RAD
+    readings: list[StageReading | None] = []
+    notes: list[str] = []
+    scan_rotated = 0
+    for item, turn in zip(found, turns, strict=True):
+        settings = item.settings
+        rotated = abs(settings.scan_rotation_rad or 0.0) > _TURNED_RAD
+        scan_rotated += rotated and settings.stage_tilt_rad is not None
+        usable = settings.stage_tilt_rad is not None and not rotated
+        own = StageReading(settings.stage_tilt_rad, None if turned else turn) if usable else None
+        if own is not None and (doubt := doubt_unit(own, StageConfig())):
+            notes.append(f"the stage of {item.path.name} is not used: {doubt}")
+            own = None
+        readings.append(own)
+    if turned and any(readings):
+        notes.append(
+            "the rotation of the stage is not used: the files do not say in which sense it counts"
+        )
+    if scan_rotated:
+        notes.append(
+            f"the stage is not used for {scan_rotated} files with a rotated scan: they do not say in which "
+            "sense it counts"
+        )
+    tilted = any(r is not None and abs(r.tilt_rad or 0.0) > _TURNED_RAD for r in readings)
+    if tilted:
+        notes.append(
+            "the tilts of the stage are as the files state them; stage.tilt_axis_deg of the configuration "
+            "says about which axis and in which sense"
+        )
+    return readings, notes
+
+
 def scan_tiff_folder(
-    path: Path, *, display_width_m: float, databar_rows: int | None = None
+    path: Path, *, display_width_m: float, databar_rows: int | None = None, stage: bool = True
 ) -> TiffFolder:
     """Collect the images of a folder, or a single one; only metadata are read.
 
@@ -143,6 +196,8 @@ def scan_tiff_folder(
         Display width that all magnifications are to refer to.
     databar_rows
         Rows to cut off at the bottom of every image, instead of those that the metadata give.
+    stage
+        Whether to read where the stage was.
 
     Raises
     ------
@@ -163,11 +218,18 @@ def scan_tiff_folder(
         )
     width_note = f"magnifications refer to a display width of {display_width_m:g} m"
     stamped, stamp_note = _stamps(found)
+    readings, stage_notes = _stages([item for item, _ in stamped])
+    if not stage:
+        readings, stage_notes = [None] * len(stamped), []
     entries = tuple(
-        TiffEntry(item.path, stamp_ns, display_width_m / item.field_width_m, databar_rows)
-        for item, stamp_ns in stamped
+        TiffEntry(item.path, stamp_ns, display_width_m / item.field_width_m, databar_rows, reading)
+        for (item, stamp_ns), reading in zip(stamped, readings, strict=True)
     )
     own = dict.fromkeys(f"{i.path.name}: {note}" for i in found for note in i.settings.notes)
     return TiffFolder(
-        path, entries, display_width_m, tuple(skipped), (width_note, stamp_note, *own)
+        path,
+        entries,
+        display_width_m,
+        tuple(skipped),
+        (width_note, stamp_note, *stage_notes, *own),
     )

@@ -1,4 +1,9 @@
-"""JEOL: a text file beside the image with lines such as ``$CM_MAG 50``."""
+"""JEOL: a text file beside the image with lines such as ``$CM_MAG 50``.
+
+``$CM_STAGE_POSITION`` of newer programs names its axes (``X=37.1, Y=44.9, R=355.0, Z=16.9, T=0.0``; mm and
+degrees). ``$CM_STAGE_POS`` of older ones has six bare numbers, of which the first three are x, y and z; no
+source known to us says which of the others is the tilt, so they are left out.
+"""
 
 from __future__ import annotations
 
@@ -101,6 +106,24 @@ def _pixel_size(
     return check_pixel_size(path, assumed, "$CM_MAG", shown), True, (note,)
 
 
+def _stage_angles(pairs: dict[str, str]) -> tuple[float | None, float | None, tuple[str, ...]]:
+    """Return tilt and rotation of the stage, and a note where the file does not name them."""
+    named = {}
+    for part in pairs.get("CM_STAGE_POSITION", "").split(","):
+        axis, _, value = part.partition("=")
+        named[axis.strip().upper()] = plain_number(value)
+    tilt, turn = (
+        None if angle is None else math.radians(angle) for angle in (named.get("T"), named.get("R"))
+    )
+    if tilt is None and "CM_STAGE_POS" in pairs:
+        return (
+            None,
+            None,
+            ("$CM_STAGE_POS does not name its axes: the tilt of the stage is left out",),
+        )
+    return tilt, turn, ()
+
+
 def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> VendorSettings:
     """Read the settings from the text file.
 
@@ -114,6 +137,7 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
     pixel_m, assumed, notes = _pixel_size(path, pairs, columns)
     distance_mm = plain_number(pairs.get("SM_WD", ""))
     rotation = plain_number(pairs.get("SM_SCAN_ROTATION", ""))
+    tilt, turn, left_out = _stage_angles(pairs)
     stamp = f"{pairs.get('CM_DATE', '')} {pairs.get('CM_TIME', '')}"
     return VendorSettings(
         vendor="jeol",
@@ -123,9 +147,11 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
         databar_rows=size_px[1] - rows,
         working_distance_m=None if distance_mm is None else distance_mm * 1e-3,
         scan_rotation_rad=None if rotation is None else math.radians(rotation),
+        stage_tilt_rad=tilt,
+        stage_rotation_rad=turn,
         detector=pairs.get("CM_DETECTOR_NAME") or pairs.get("CM_DETECTOR", ""),
         instrument=pairs.get("CM_INSTRUMENT", ""),
         time=first_date([(stamp, "%Y/%m/%d %H:%M:%S"), (stamp, "%Y/%m/%d %I:%M:%S %p")]),
         display_width_assumed=assumed,
-        notes=notes,
+        notes=(*notes, *left_out),
     )

@@ -30,6 +30,8 @@ class VendorSettings:
         The magnification that the microscope showed, which depends on its display width.
     databar_rows
         Rows at the bottom of the file that are not part of the scan.
+    scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
+        Angles in the maker's sense of rotation.
     display_width_assumed
         Whether the pixel size rests on the maker's usual display width, not on a value in the
         file.
@@ -44,6 +46,8 @@ class VendorSettings:
     databar_rows: int = 0
     working_distance_m: float | None = None
     scan_rotation_rad: float | None = None
+    stage_tilt_rad: float | None = None
+    stage_rotation_rad: float | None = None
     dwell_s: float | None = None
     frame_time_s: float | None = None
     detector: str = ""
@@ -120,6 +124,16 @@ class SemImage:
         return self.settings.scan_rotation_rad
 
     @property
+    def stage_tilt_rad(self) -> float | None:
+        """Tilt of the stage, in the maker's sense."""
+        return self.settings.stage_tilt_rad
+
+    @property
+    def stage_rotation_rad(self) -> float | None:
+        """Rotation of the stage, in the maker's sense of rotation."""
+        return self.settings.stage_rotation_rad
+
+    @property
     def dwell_s(self) -> float | None:
         """Time on each pixel."""
         return self.settings.dwell_s
@@ -164,6 +178,8 @@ class SemImage:
             "display_width_assumed": s.display_width_assumed,
             "working_distance_m": s.working_distance_m,
             "scan_rotation_rad": s.scan_rotation_rad,
+            "stage_tilt_rad": s.stage_tilt_rad,
+            "stage_rotation_rad": s.stage_rotation_rad,
             "dwell_s": s.dwell_s,
             "frame_time_s": s.frame_time_s,
             "detector": s.detector,

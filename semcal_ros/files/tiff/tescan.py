@@ -1,4 +1,8 @@
-"""TESCAN: tag 50431 with a thumbnail and ``key=value`` lines, or a ``.hdr`` file."""
+"""TESCAN: tag 50431 with a thumbnail and ``key=value`` lines, or a ``.hdr`` file.
+
+Lengths are in metres; the angles ``ScanRotation``, ``StageTilt`` and ``StageRotation`` are in degrees, as in
+TESCAN's remote interface (SharkSEM).
+"""
 
 from __future__ import annotations
 
@@ -80,7 +84,11 @@ def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> Vendor
             expected="fewer rows of databar than of the image",
             do="use the original file, not a cropped copy",
         )
-    rotation = number("ScanRotation")
+
+    def angle(key: str) -> float | None:
+        value = number(key)
+        return None if value is None else math.radians(value)
+
     stamp = f"{pairs.get('Date', '')} {pairs.get('Time', '')}"
     return VendorSettings(
         vendor="tescan",
@@ -89,7 +97,9 @@ def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> Vendor
         displayed_magnification=positive(number("Magnification")),
         databar_rows=int(strip),
         working_distance_m=number("WD"),
-        scan_rotation_rad=None if rotation is None else math.radians(rotation),
+        scan_rotation_rad=angle("ScanRotation"),
+        stage_tilt_rad=angle("StageTilt"),
+        stage_rotation_rad=angle("StageRotation"),
         dwell_s=positive(number("DwellTime")),
         detector=pairs.get("Detector", ""),
         instrument=pairs.get("Device", ""),

@@ -1,4 +1,8 @@
-"""Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections."""
+"""Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections.
+
+The tags are in SI units throughout: ``StageT`` and ``StageR`` of ``[Stage]`` and ``ScanRotation`` of the
+beam are in rad.
+"""
 
 from __future__ import annotations
 
@@ -67,6 +71,7 @@ def thermo_fisher_settings(
     TiffError
         The pixel size is missing or unusable, or the size of the file contradicts the tag.
     """
+    stage = _section(tag, "Stage")
     beam, scan = _active(tag, "Beam", "EBeam"), _active(tag, "Scan", "EScan")
     common = _section(tag, "Scan")
     seen = scan.get("PixelWidth", common.get("PixelWidth"))
@@ -87,6 +92,8 @@ def thermo_fisher_settings(
         databar_rows=_databar_rows(path, _section(tag, "Image"), size_px),
         working_distance_m=plain_number(beam.get("WD")),
         scan_rotation_rad=plain_number(beam.get("ScanRotation")),
+        stage_tilt_rad=plain_number(stage.get("StageT")),
+        stage_rotation_rad=plain_number(stage.get("StageR")),
         dwell_s=positive(plain_number(scan.get("Dwell", common.get("Dwelltime")))),
         frame_time_s=positive(plain_number(scan.get("FrameTime", common.get("FrameTime")))),
         detector=str(_section(tag, "Detectors").get("Name", "")),

@@ -11,7 +11,14 @@ from typing import Any
 
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, load_config
+from semcal_ros.config.config import (
+    IMAGE_TYPE,
+    STAGE_TYPE,
+    MicroscopeConfig,
+    StageConfig,
+    load_config,
+)
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
@@ -108,14 +115,36 @@ def _text_message(text: str) -> Any:
     return message
 
 
+def _stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: int) -> Any:
+    """Joints of the stage; none where the file does not tell them, which ends the reading before."""
+    own = reading or StageReading()
+    angles = {
+        source.tilt: own.tilt_rad,
+        source.rotation: own.rotation_rad,
+        source.scan_rotation: own.scan_rotation_rad,
+    }
+    known = {joint: angle for joint, angle in angles.items() if angle is not None}
+    message = blank_message(STAGE_TYPE)
+    fill_header(message.header, stamp_ns, "")
+    message.name, message.position = list(known), list(known.values())
+    return message
+
+
 def _write_image(
-    writer: BagWriter, config: MicroscopeConfig, entry: TiffEntry, image: SemImage
+    writer: BagWriter,
+    config: MicroscopeConfig,
+    entry: TiffEntry,
+    image: SemImage,
+    stage: StageConfig | None,
 ) -> dict[str, Any]:
     number = blank_message(config.magnification.type)
     number.data = _published_number(config, image)
     # A player that keeps the recording's order then announces the magnification before its image.
     before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
     writer.write(_topic(config.magnification.topic), before_ns, number)
+    if stage is not None:
+        joints = _stage_message(stage, entry.stage, before_ns)
+        writer.write(_topic(stage.topic), before_ns, joints)
     message = blank_message(IMAGE_TYPE)
     header = blank_message("std_msgs/msg/Header")
     fill_header(header, entry.stamp_ns, config.frame_id)
@@ -134,6 +163,7 @@ def _write_all(
     on_progress: Callable[[int], object] | None,
 ) -> tuple[list[dict[str, Any]], list[Skipped]]:
     written, skipped = [], []
+    stage = config.stage if any(entry.stage is not None for entry in folder.entries) else None
     for entry in folder.entries:
         if on_progress is not None:
             on_progress(1)
@@ -142,7 +172,7 @@ def _write_all(
         except SemcalError as error:
             skipped.append(Skipped(entry.path.name, str(error)))
             continue
-        written.append(_write_image(writer, config, entry, image))
+        written.append(_write_image(writer, config, entry, image, stage))
     if not written:
         raise TiffError(
             f"none of {len(folder.entries)} images in {folder.path} can be decoded, "
@@ -195,6 +225,7 @@ def import_folder(
         Path(folder),
         display_width_m=used.display_width_m,
         databar_rows=databar_rows if databar_rows is not None else used.image.databar_rows or None,
+        stage=used.stage is not None,
     )
     with BagWriter(out_bag, overwrite=overwrite) as writer:
         written, damaged = _write_all(writer, used, source, on_progress)

@@ -11,6 +11,7 @@ from semcal_ros.core.errors import TiffError
 
 __all__ = [
     "PIXEL_SIZE_RANGE_M",
+    "angle_in_degrees",
     "check_pixel_size",
     "first_date",
     "plain_number",
@@ -73,6 +74,18 @@ def plain_number(text: object) -> float | None:
     """Parse a bare finite number; return ``None`` for any other text."""
     parts = _split(text)
     return parts[0] if parts is not None and not parts[1] else None
+
+
+def angle_in_degrees(text: object) -> float | None:
+    """Angle in rad of a text such as ``2.0 deg``, or with the sign for degrees; else None.
+
+    The sign may have lost its encoding.
+    """
+    parts = _split(text)
+    if parts is None:
+        return None
+    unit = parts[1].replace("\u00c2", "").strip().lower()
+    return math.radians(parts[0]) if unit in ("\u00b0", "\u00ba", "\ufffd", "deg") else None
 
 
 def positive(value: float | None) -> float | None:

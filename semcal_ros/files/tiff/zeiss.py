@@ -1,4 +1,9 @@
-"""Zeiss SmartSEM: tag 34118 (CZ_SEM)."""
+"""Zeiss SmartSEM: tag 34118 (CZ_SEM).
+
+The names are those of the parameters of SmartSEM's programming interface (CZEMApi): ``AP_STAGE_AT_T``
+and ``AP_STAGE_AT_R`` are where the stage is, ``AP_SCANROTATION`` acts only while ``DP_SCAN_ROT`` is on.
+Their units stand in the tag, which has degrees for all of them.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from typing import Any
 
 from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.tiff.values import (
+    angle_in_degrees,
     check_pixel_size,
     first_date,
     plain_number,
@@ -68,8 +74,16 @@ def _pixel_size(path: Path, tag: Mapping[str, Any]) -> float:
 def _rotation(tag: Mapping[str, Any]) -> float | None:
     if tag.get("dp_scan_rot", (None, None))[1] is False:
         return 0.0
-    degrees = plain_number(str(_text(tag, "ap_scanrotation")).rstrip("\u00b0\u00c2 "))
-    return None if degrees is None else math.radians(degrees)
+    number = plain_number(str(_text(tag, "ap_scanrotation")).rstrip("\u00b0\u00c2 "))
+    return None if number is None else math.radians(number)
+
+
+def _stage_angle(tag: Mapping[str, Any], key: str, notes: list[str]) -> float | None:
+    text = _text(tag, key)
+    angle = angle_in_degrees(text)
+    if text is not None and angle is None:
+        notes.append(f"{key.upper()} is {text[:40]!r}, not an angle in degrees: it is left out")
+    return angle
 
 
 def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
@@ -82,6 +96,7 @@ def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
     """
     pixel_m = _pixel_size(path, tag)
     distance = quantity(_text(tag, "ap_wd"), "m")
+    notes = [_BAR_NOTE]
     date, clock = _text(tag, "ap_date") or "", _text(tag, "ap_time") or ""
     return VendorSettings(
         vendor="zeiss",
@@ -90,6 +105,8 @@ def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
         displayed_magnification=_magnification(tag),
         working_distance_m=_refine(distance, _head(tag, _WORKING_DISTANCE), 6e-5),
         scan_rotation_rad=_rotation(tag),
+        stage_tilt_rad=_stage_angle(tag, "ap_stage_at_t", notes),
+        stage_rotation_rad=_stage_angle(tag, "ap_stage_at_r", notes),
         dwell_s=positive(quantity(_text(tag, "dp_dwell_time"), "s")),
         frame_time_s=positive(quantity(_text(tag, "ap_frame_time"), "s")),
         detector=str(_text(tag, "dp_detector_channel") or ""),
@@ -97,5 +114,5 @@ def zeiss_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
         time=first_date(
             [(f"{date} {clock}", "%d %b %Y %H:%M:%S"), (f"{date} {clock}", "%d %B %Y %H:%M:%S")]
         ),
-        notes=(_BAR_NOTE,),
+        notes=tuple(notes),
     )

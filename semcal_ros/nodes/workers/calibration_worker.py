@@ -48,6 +48,7 @@ class CalibrationJob:
     display_width_m: float
     squares_m: tuple[float, ...]
     options: CalibrationOptions
+    grid_certificate: str = ""
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
             display_width_m=job.display_width_m,
             squares_m=job.squares_m,
             options=job.options,
+            grid_certificate=job.grid_certificate,
             on_stage=on_stage,
         )
     except SemcalError as error:
@@ -114,7 +116,7 @@ def serve(channel: Channel) -> None:
 def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:
     """Return the views without their pixels, which a calibration does not need."""
     nothing = np.zeros((1, 1), dtype=np.uint8)
-    return tuple(FoundView(v.name, v.magnification, nothing, v.detection) for v in views)
+    return tuple(replace(view, image=nothing) for view in views)
 
 
 class CalibrationProcess:

@@ -21,7 +21,10 @@ PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 
 
 def zeiss_text(
-    pixel: str = "593.3 nm", mag: str = "188 X", head: tuple[str, str] = ("5.932882e-07", "188.19")
+    pixel: str = "593.3 nm",
+    mag: str = "188 X",
+    head: tuple[str, str] = ("5.932882e-07", "188.19"),
+    tilt: str = "2.0 \u00b0",
 ) -> bytes:
     """CZ_SEM tag: unnamed numbers, then keys in capitals, each followed by name = value unit."""
     lines = ["0", "0", "0", *head, "6", "5.0e+03", "2.27", "2.0e-10", "5.243416e-03", "829"]
@@ -32,6 +35,8 @@ def zeiss_text(
         "AP_WD": "WD = 5.2 mm",
         "AP_SCANROTATION": "Scan Rotation = 30.0 \u00b0",
         "DP_SCAN_ROT": "Scan Rot = On",
+        "AP_STAGE_AT_T": f"Stage at T = {tilt}",
+        "AP_STAGE_AT_R": "Stage at R = 233.5 \u00b0",
         "DP_DWELL_TIME": "Dwell Time = 50 ns",
         "AP_FRAME_TIME": "Cycle Time = 752.76 ms",
         "DP_DETECTOR_CHANNEL": "Signal A = InLens",
@@ -55,6 +60,7 @@ def fei_text(pixel: str = "2.69792e-07", rows: int = 16, columns: int = 32) -> b
             "FrameTime=1.75685",
             "[Image]", f"ResolutionX={columns}", f"ResolutionY={rows}", "MagCanvasRealWidth=0.138",
             "[Detectors]", "Name=ETD",
+            "[Stage]", "StageX=1e-3", "StageR=-0.0123283", "StageT=0.25", "SpecTilt=0",
             "[PrivateFei]", "TimeOfCreation=10.11.2023 14:09:15", "DatabarHeight=0",
         ]
     ).encode("ascii") + b"\x00"  # fmt: skip
@@ -70,7 +76,8 @@ def tescan_bytes(pixel: str = "2.5012e-6", strip: str = "4") -> bytes:
         f"Date=2016-05-16\r\nImageStripSize={strip}\r\nMagnification=108.08\r\nPixelSizeX={pixel}"
     )
     main += f"\r\nPixelSizeY={pixel}\r\nTime=16:03:27\r\n"
-    sem = "Detector=SE\r\nDwellTime=3.2000e-6\r\nScanRotation=90.0\r\nWD=13.250e-3\r\n"
+    sem = "Detector=SE\r\nDwellTime=3.2000e-6\r\nScanRotation=90.0\r\n"
+    sem += "StageTilt=-5.0\r\nStageRotation=180.0\r\nWD=13.250e-3\r\n"
     return b"".join(
         [
             record(1, b"\x00\x00\xff\xd8\nPixelSizeX=1\n\xff\xd9"),
@@ -117,6 +124,9 @@ def test_zeiss(tmp_path: Path) -> None:
     assert sem.display_width_m == pytest.approx(5.932882e-07 * 32 * 188.19, rel=1e-12, abs=0)
     assert sem.working_distance_m == pytest.approx(5.243416e-3, rel=1e-12, abs=0)
     assert sem.scan_rotation_rad == pytest.approx(math.radians(30.0))
+    assert sem.stage_tilt_rad == pytest.approx(math.radians(2.0))
+    assert sem.stage_rotation_rad == pytest.approx(math.radians(233.5))
+    assert sem.metadata()["stage_tilt_rad"] == sem.stage_tilt_rad
     assert sem.dwell_s == pytest.approx(50e-9, rel=1e-12, abs=0)
     assert sem.frame_time_s == pytest.approx(0.75276)
     assert sem.detector == "InLens"
@@ -142,6 +152,15 @@ def test_zeiss_units(tmp_path: Path, text: str, expected_m: float) -> None:
     assert sem.pixel_size_m == pytest.approx(expected_m, rel=1e-12, abs=0)
 
 
+@pytest.mark.parametrize("tilt", ["35 mrad", "2.0", "none"])
+def test_zeiss_angles_of_unknown_unit_are_left_out(tmp_path: Path, tilt: str) -> None:
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(tilt=tilt)))
+    assert sem.stage_tilt_rad is None
+    assert sem.stage_rotation_rad == pytest.approx(math.radians(233.5))
+    (note,) = [note for note in sem.notes if "AP_STAGE_AT_T" in note]
+    assert "not an angle in degrees: it is left out" in note
+
+
 def test_zeiss_magnification_in_thousands(tmp_path: Path) -> None:
     data = zeiss_text(mag="5.00 K X", head=("5.932882e-07", "5.0012e+03"))
     assert read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data)).displayed_magnification == (
@@ -158,6 +177,7 @@ def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path
     assert sem.full_size_px == (32, 20)
     assert sem.working_distance_m == 0.00681643
     assert sem.scan_rotation_rad == 0.5
+    assert (sem.stage_tilt_rad, sem.stage_rotation_rad) == (0.25, -0.0123283)
     assert sem.display_width_m == pytest.approx(0.138, rel=1e-12, abs=0)
     assert sem.frame_time_s == 1.75685
     assert sem.time == datetime(2023, 11, 10, 14, 9, 15)
@@ -183,6 +203,8 @@ def test_tescan_in_sixteen_bits(tmp_path: Path) -> None:
     assert sem.displayed_magnification == 108.08
     assert sem.dwell_s == 3.2e-6
     assert sem.scan_rotation_rad == pytest.approx(math.pi / 2)
+    assert sem.stage_tilt_rad == pytest.approx(math.radians(-5.0))
+    assert sem.stage_rotation_rad == pytest.approx(math.pi)
     assert sem.working_distance_m == 0.01325
 
 
@@ -192,6 +214,17 @@ def test_tescan_header_file(tmp_path: Path) -> None:
     text = "[MAIN]\nPixelSizeX=1e-9\nPixelSizeY=1e-9\nImageStripSize=0\n[SEM]\nWD=0.01\n"
     (tmp_path / "t-tif.hdr").write_text(text)
     assert read_sem_tiff(path).pixel_size_m == 1e-9
+
+
+def test_jeol_stage_by_name_only(tmp_path: Path) -> None:
+    named = jeol_text(CM_STAGE_POSITION="X=37.1761, Y=44.9344, R=354.9968, Z=16.90, T=12.50")
+    sem = read_sem_tiff(write_jeol(tmp_path / "j.tif", named))
+    assert sem.stage_tilt_rad == pytest.approx(math.radians(12.5))
+    assert sem.stage_rotation_rad == pytest.approx(math.radians(354.9968))
+    bare = jeol_text(CM_STAGE_POS="5.483 0.831 8.5 -0.0 0.0 0.000")
+    sem = read_sem_tiff(write_jeol(tmp_path / "k.tif", bare))
+    assert (sem.stage_tilt_rad, sem.stage_rotation_rad) == (None, None)
+    assert any("$CM_STAGE_POS does not name its axes" in note for note in sem.notes)
 
 
 def test_jeol_with_assumed_display_width(tmp_path: Path) -> None:
@@ -380,3 +413,24 @@ def test_real_files_agree_with_the_truth_table(reference_data: Path, name: str, 
         if truth[key]:
             scale = 1e-6 if key == "dwell_us" else 1.0
             assert value == pytest.approx(float(truth[key]) * scale, rel=1e-3, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "tilt_deg", "rotation_deg"),
+    [
+        ("zeiss_example_sem.tif", 2.0, 233.5),
+        ("tfs_example.tif", 0.0, math.degrees(-0.0123283)),
+        ("tescan_example_sem1.tif", 0.0, 0.0),
+        # Its text file has no names for the numbers.
+        ("jeol_example_sem.tif", None, None),
+    ],
+)
+def test_real_files_say_where_their_stage_was(
+    reference_data: Path, name: str, tilt_deg: float | None, rotation_deg: float | None
+) -> None:
+    settings, _ = read_sem_settings(reference_data / "real_sem" / name)
+    for angle, expected in (
+        (settings.stage_tilt_rad, tilt_deg),
+        (settings.stage_rotation_rad, rotation_deg),
+    ):
+        assert angle == (None if expected is None else pytest.approx(math.radians(expected)))

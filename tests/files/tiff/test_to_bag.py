@@ -6,12 +6,14 @@ import dataclasses
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
 
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, TiffError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording
@@ -19,10 +21,17 @@ from semcal_ros.files.tiff.to_bag import SIDECAR, import_folder
 
 
 def write_tescan(
-    path: Path, pixel_m: float, size: tuple[int, int], time: str = "", bits: int = 8, bar: int = 0
+    path: Path,
+    pixel_m: float,
+    size: tuple[int, int],
+    time: str = "",
+    bits: int = 8,
+    bar: int = 0,
+    angles: str = "",
 ) -> None:
     date = f"Date=2020-01-02\nTime={time}\n" if time else ""
-    text = f"{date}ImageStripSize={bar}\nPixelSizeX={pixel_m!r}\nPixelSizeY={pixel_m!r}\n".encode()
+    text: Any = f"{date}ImageStripSize={bar}\nPixelSizeX={pixel_m!r}\nPixelSizeY={pixel_m!r}\n"
+    text = (text + angles).encode()
     data = struct.pack("<IH", len(text) + 2, 2) + text
     pixels = (np.arange(size[0] * size[1]) % 250).reshape(size).astype(f"uint{bits}")
     tifffile.imwrite(path, pixels, extratags=[(50431, 7, len(data), data, True)])
@@ -103,6 +112,54 @@ def test_folder_is_read_directly_as_it_would_be_imported(tmp_path: Path) -> None
         assert one.stamp_ns == two.stamp_ns
         assert one.magnification == pytest.approx(two.magnification, rel=1e-14, abs=0)
         assert np.array_equal(one.image, two.image)
+
+
+def _stages(folder: Path, bag: Path, *angles: str) -> tuple[list[StageReading | None], str]:
+    """Readings and notes of a folder of files with these angles, which an import repeats."""
+    folder.mkdir()
+    for index, text in enumerate(angles):
+        write_tescan(folder / f"{index}.tif", 1e-8, (8, 8), f"10:00:{index:02}", angles=text)
+    with open_recording(folder) as recording:
+        stages = [frame.stage for frame in recording.frames()]
+        notes = " | ".join(recording.notes)
+    import_folder(folder, bag)
+    nothing = (None, StageReading())
+    with open_recording(bag) as imported:
+        for stage, frame in zip(stages, imported.frames(), strict=True):
+            assert frame.stage == stage or (frame.stage in nothing and stage in nothing)
+    return stages, notes
+
+
+def test_files_say_where_the_stage_was(tmp_path: Path) -> None:
+    turned = "StageRotation=20.0\nScanRotation=0.0\n"
+    stages, notes = _stages(
+        tmp_path / "tiffs",
+        tmp_path / "bag",
+        f"StageTilt=0.0\n{turned}",
+        f"StageTilt=30.0\n{turned}",
+        "",
+    )
+    assert stages == [
+        StageReading(0.0, np.radians(20.0)),
+        StageReading(np.radians(30.0), np.radians(20.0)),
+        None,
+    ]
+    assert "stage.tilt_axis_deg" in notes
+
+
+def test_rotations_of_unknown_sense_are_left_out(tmp_path: Path) -> None:
+    stages, notes = _stages(
+        tmp_path / "tiffs",
+        tmp_path / "bag",
+        "StageTilt=10.0\nStageRotation=20.0\n",
+        "StageTilt=10.0\nStageRotation=50.0\n",
+        "StageTilt=10.0\nStageRotation=50.0\nScanRotation=90.0\n",
+        "StageTilt=100.0\n",
+    )
+    assert stages == [StageReading(np.radians(10.0)), StageReading(np.radians(10.0)), None, None]
+    assert "the stage of 3.tif is not used: tilt 1.74533 rad" in notes
+    assert "the rotation of the stage is not used" in notes
+    assert "the stage is not used for 1 files with a rotated scan" in notes
 
 
 def test_files_without_time_are_one_second_apart(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""Where the stage is, from messages that name its joints (sensor_msgs/msg/JointState)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from semcal_ros.bridge.fields import require_fields
+from semcal_ros.config.config import StageConfig
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.errors import MessageError
+
+__all__ = ["doubt_unit", "read_stage"]
+
+# A specimen that is tilted by a right angle is seen edge-on; some stages reach a degree or so more.
+_MAX_TILT_RAD = 1.6
+# No stage turns further than twice round, and angles of a scan end at half a turn or a turn.
+_MAX_TURN_RAD = 4.0 * math.pi
+
+
+def read_stage(message: Any, source: StageConfig) -> StageReading:
+    """Read the angles of the joints that the configuration names; None for a joint that is missing.
+
+    Raises
+    ------
+    MessageError
+        It is no JointState, names and positions do not match, or an angle is not finite.
+    """
+    require_fields(message, ("name", "position"), source.type)
+    try:
+        names = [str(name) for name in message.name]
+        positions = [float(position) for position in message.position]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MessageError(
+            f"a message of type {type(message).__name__} whose joints cannot be read: {error}",
+            expected=source.type,
+        ) from error
+    if len(names) != len(positions) or len(names) != len(set(names)):
+        raise MessageError(
+            f"{len(positions)} positions of the joints {', '.join(names[:8]) or 'without names'}",
+            expected="one position for each joint, and each joint once",
+            do="check the node that publishes the stage",
+        )
+    known = dict(zip(names, positions, strict=True))
+    wrong = [
+        f"{joint} {known[joint]}"
+        for joint in (source.tilt, source.rotation, source.scan_rotation)
+        if not math.isfinite(known.get(joint, 0.0))
+    ]
+    if wrong:
+        raise MessageError(
+            f"a stage with {', '.join(wrong)}",
+            expected="finite angles in rad",
+            do="check the node that publishes the stage",
+        )
+    return StageReading(
+        known.get(source.tilt), known.get(source.rotation), known.get(source.scan_rotation)
+    )
+
+
+def doubt_unit(reading: StageReading, source: StageConfig) -> str:
+    """Return which angle no stage has in rad, such as ``"tilt 30 rad"``, or an empty text."""
+    limits = (
+        (source.tilt, reading.tilt_rad, _MAX_TILT_RAD),
+        (source.rotation, reading.rotation_rad, _MAX_TURN_RAD),
+        (source.scan_rotation, reading.scan_rotation_rad, _MAX_TURN_RAD),
+    )
+    for joint, angle, limit in limits:
+        if angle is not None and abs(angle) > limit:
+            return f"{joint} {angle:g} rad"
+    return ""

@@ -1,0 +1,100 @@
+"""What the stage said last before a frame, live."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from sensor_msgs.msg import JointState
+
+from semcal_ros.config.config import StageConfig
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.nodes.frames.stage import StageInput
+from tests.helpers.node_fakes import FakeEndpoints, fake_reporter, notes
+
+S = 1_000_000_000
+
+
+def joints(stamp_s: int, **positions: float) -> JointState:
+    message = JointState(name=list(positions), position=list(positions.values()))
+    message.header.stamp.sec = stamp_s
+    return message
+
+
+class Bench:
+    """A stage input, and messages for it that are published at a given time."""
+
+    def __init__(self, source: StageConfig | None = None) -> None:
+        self.endpoints: Any = FakeEndpoints()
+        self.reporter, self.log = fake_reporter()
+        self.input = StageInput(source or StageConfig(), self.endpoints, self.reporter)
+
+    def publish(self, message: JointState, sent_s: int = 100) -> None:
+        info = {"source_timestamp": sent_s * S, "received_timestamp": sent_s * S}
+        self.endpoints.subscriptions["stage"].callback(message, info)
+
+    def tilt_at(self, second: float) -> float | None:
+        reading = self.input.at(round(second * S))
+        return None if reading is None else reading.tilt_rad
+
+
+def test_a_reading_is_valid_from_its_stamp_on() -> None:
+    bench = Bench()
+    assert bench.tilt_at(1.0) is None
+    assert notes(bench.reporter)["stage_tilt_rad"] == "unknown"
+    bench.publish(joints(1, tilt=0.1, rotation=2.0))
+    bench.publish(joints(5, tilt=0.2))
+    assert [bench.tilt_at(t) for t in (0.9, 1.0, 4.9, 5.0)] == [None, 0.1, 0.1, 0.2]
+    assert bench.input.at(S) == StageReading(0.1, 2.0)
+    assert notes(bench.reporter)["stage_tilt_rad"] == "0.1"
+
+
+def test_messages_that_wait_are_taken_first() -> None:
+    bench = Bench()
+    info = {"source_timestamp": S, "received_timestamp": S}
+    bench.endpoints.subscriptions["stage"].waiting.append((joints(1, tilt=0.3), info))
+    assert bench.tilt_at(2.0) == 0.3
+
+
+def test_without_stamps_the_newest_counts() -> None:
+    bench = Bench()
+    bench.publish(joints(0, tilt=0.1), sent_s=100)
+    bench.publish(joints(0, tilt=0.2), sent_s=101)
+    assert bench.tilt_at(5.0) == 0.2
+
+
+def test_a_clock_that_goes_back_forgets() -> None:
+    bench = Bench()
+    bench.publish(joints(50, tilt=0.1))
+    bench.publish(joints(10, tilt=0.2))
+    assert bench.tilt_at(60.0) == 0.2
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (joints(5, tilt=30.0), "tilt 30 rad; expected radians"),
+        (joints(5, tilt=math.nan), "a stage with tilt nan; expected finite angles"),
+        (JointState(name=["tilt"]), "0 positions of the joints tilt"),
+    ],
+)
+def test_a_bad_message_makes_the_stage_unknown_and_is_counted(
+    message: JointState, reason: str
+) -> None:
+    bench = Bench()
+    message.header.stamp.sec = 5
+    bench.publish(joints(1, tilt=0.1))
+    bench.publish(message)
+    assert bench.tilt_at(6.0) is None
+    assert bench.tilt_at(4.0) == 0.1
+    assert reason in notes(bench.reporter)["last_rejection"]
+    bench.publish(joints(8, tilt=0.2))
+    assert bench.tilt_at(9.0) == 0.2
+
+
+def test_without_a_section_nothing_is_subscribed() -> None:
+    endpoints: Any = FakeEndpoints()
+    stage = StageInput(None, endpoints, fake_reporter()[0])
+    assert stage.at(S) is None
+    assert endpoints.subscriptions == {}
