@@ -17,6 +17,7 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
     reduced_normal_equations,
+    visit_sigmas,
     whitened_norm,
 )
 from semcal_ros.core.calibration.priors import Setup
@@ -56,11 +57,18 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has
     are left out.
     """
-    if problem.effects is not None and problem.effects.scale_sigma > setup.priors.visit_scale_sigma:
+    if problem.effects is not None:
         # A jump that is not in the model makes the visits look as if they did not come back.
-        effects = replace(problem.effects, scale_sigma=setup.priors.visit_scale_sigma)
+        effects = replace(
+            problem.effects,
+            scale_sigma=min(problem.effects.scale_sigma, setup.priors.visit_scale_sigma),
+            height_sigma_m=min(problem.effects.height_sigma_m, setup.priors.visit_height_sigma_m),
+        )
         problem = replace(problem, effects=effects)
-        result = refine(problem, result.state, max_iterations=0)
+        result = refine(problem, result.state, tolerance=1e-4)
+    scatter = 0.0
+    if problem.effects is not None:
+        scatter = float(np.sum((result.state.visits / visit_sigmas(problem)) ** 2))
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
     )
@@ -78,7 +86,10 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         information = float(pull[:, 0] @ column) - cross @ solved[:, 0]
         information += setup.priors.scale_jump**-2.0
         gradient = float(result.gradient[:, 0] @ column) - cross @ solved[:, 1]
-        gain = 0.5 * gradient**2 / information / variance
+        gain = 0.5 * gradient**2 / information
+        # Where the jump leaves much of the scatter between visits, they do not come back anyway.
+        left = (scatter - 2.0 * gain) / max(len(result.state.visits) - 1, 1)
+        gain /= max(variance, left)
         if gain > best_gain:
             sigma = float(np.sqrt(variance / information))
             best_gain = gain

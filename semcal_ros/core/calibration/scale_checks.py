@@ -20,6 +20,8 @@ _ONE_DIRECTION = 0.01
 _UNDETERMINED = 0.8
 # Fewer determined visits than this do not tell a spread: its own 1-sigma is half of it.
 _ENOUGH_VISITS = 2.0
+# Constant error of a stage, in 1-sigmas of its prior, that says that the configuration is wrong.
+_SURPRISING = 4.0
 # Difference of the scale between magnifications reached from below and from above, in sigmas.
 _SIGNIFICANT = 3.0
 
@@ -74,6 +76,30 @@ def _tilts_span_one_direction(rotations: Array) -> bool:
     return bool(values[0] < _ONE_DIRECTION * values[1])
 
 
+def _stage_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
+    """List what the readings of the stage and the images do not agree on."""
+    out: list[str] = []
+    means, sigmas = setup.shared_priors()
+    values = fit.adjustment.result.state.theta[len(fit.adjustment.result.state.theta) - len(means) :]
+    for name, label in (("stage_tilt", "tilt"), ("stage_axis", "direction of the tilt axis")):
+        if name not in setup.shared:
+            return out
+        k = setup.shared.index(name)
+        if abs(values[k] - means[k]) > _SURPRISING * sigmas[k]:
+            out.append(
+                f"scale: the {label} of the stage is {np.degrees(values[k]):+.1f} degrees off from what "
+                "the configuration says: check stage.tilt_axis_deg and the unit of the readings"
+            )
+    camera = model.at(float(setup.magnifications[0]))
+    assert camera.covariance is not None
+    if camera.rho < -_SURPRISING * np.sqrt(camera.covariance[5, 5]):
+        out.append(
+            "scale: the images look as if the beam diverged upwards, so the tilts of the stage have "
+            "the wrong sign: add 180 to stage.tilt_axis_deg"
+        )
+    return out
+
+
 def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
     """List what makes the scale less certain than the residuals suggest, with the remedy."""
     out: list[str] = []
@@ -84,6 +110,7 @@ def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list
             "scale: all tilts are about one axis, so the images alone do not tell the aspect ratio "
             "from the tilt; record the stage's tilt, or some views with the scan rotated by 90 degrees"
         )
+    out += _stage_warnings(setup, fit, model)
     weak: dict[str, list[float]] = {}
     for g in setup.magnifications:
         camera = model.at(float(g))

@@ -108,7 +108,9 @@ def _adjusted(group, residual_sigmas, *, heights_m=0.0, pull=0.0, weight=1.0):
         information,
         gradient,
         np.eye(1),
-        np.zeros(count),
+        np.zeros((count, 1)),
+        np.ones((count, 1)),
+        np.zeros((0, 2)),
         1,
         BundleStatus.SMALL_DECREASE,
     )
