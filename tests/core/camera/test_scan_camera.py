@@ -170,7 +170,7 @@ def test_sigma_is_the_covariance_through_the_projection():
     # Twice the pixels, twice the error.
     doubled = camera.resized(1024, 1024).project_sigma([[25e-6, 0.0, 0.0]])
     np.testing.assert_allclose(doubled, 2 * sigma[1:], atol=1e-12)
-    assert camera.pixel_size_sigma_m[0] == pytest.approx(0.01 * camera.pixel_size_m[0])
+    assert camera.pixel_size_sigma_m[0] == pytest.approx(0.01 * camera.pixel_size_m[0], abs=0.0)
 
 
 def test_sigma_without_covariance_is_refused():
