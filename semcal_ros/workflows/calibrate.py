@@ -184,7 +184,8 @@ def calibrate(
     ----------
     source
         A bag, a folder of images of the chess grid, or an iterable of (image, magnification)
-        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3).
+        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3). Grey levels are
+        processed as float32, float64 too: 24 bits, more than any detector has.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     display_width_m, squares_m

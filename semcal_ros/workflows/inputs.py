@@ -166,9 +166,10 @@ def open_source(
     Parameters
     ----------
     source
-        See :data:`Source`. Images are (h, w) grey levels without a databar, of which uint8, uint16
-        and float32 are kept as they are, or (h, w, 3) of uint8 in the channel order of OpenCV.
-        Where they have no times, they are taken to be a second apart.
+        See :data:`Source`. Images are (h, w) grey levels without a databar, or (h, w, 3) of uint8
+        in the channel order of OpenCV. Grey levels of other types than uint8, uint16 and float32
+        become float32, in which all images are processed: 24 bits, more than any detector has.
+        Where images have no times, they are taken to be a second apart.
     config
         How to read it.
     magnification
