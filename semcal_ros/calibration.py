@@ -94,7 +94,7 @@ class Calibration(CalibrationModel):
     def at(self, magnification: float | Iterable[float]) -> ScanCamera | tuple[ScanCamera, ...]:
         """The camera at a magnification, or the cameras at several.
 
-        Outside of :attr:`magnification_range` the functions go on along their tangents in log g,
+        Outside :attr:`magnification_range` the functions go on along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range.
 
         Parameters

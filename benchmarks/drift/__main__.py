@@ -8,7 +8,7 @@ The bound is that of a shift between two pictures which both have noise, compute
 alone: the inverse of sum(gradient gradient^T) / (2 sigma^2) over the pixels that overlap, sigma
 containing the rounding.
 
-Then the tracker: what a live stream costs, and what it leaves of a drift inside of the frames.
+Then the tracker: what a live stream costs, and what it leaves of a drift inside the frames.
 """
 
 from __future__ import annotations
@@ -150,13 +150,13 @@ def tracking(sizes: tuple[int, ...], frames: int) -> None:
 
 
 def raster(timings: tuple[ScanTiming, ...], frames: int) -> None:
-    """What the correction leaves of a strong drift inside of the frames."""
+    """What the correction leaves of a strong drift inside the frames."""
     rows: list[list[object]] = []
     for timing in timings:
         result = drift_raster.raster_residual(timing=timing, frames=frames)
         rows += drift_raster.rows(result, f"{timing.frame_time_s:g} s, {timing.averages}")
     show(
-        f"Drift inside of the frame: gold at 20 000x, 512 x 512, {frames} frames without a pause",
+        f"Drift inside the frame: gold at 20 000x, 512 x 512, {frames} frames without a pause",
         drift_raster.HEADER,
         rows,
         "Distance in output px between where the corrected frame puts a point and where it belongs,",

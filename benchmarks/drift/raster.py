@@ -1,4 +1,4 @@
-"""What is left of drift inside of a frame after the correction that a tracker's answer gives.
+"""What is left of drift inside a frame after the correction that a tracker's answer gives.
 
 The virtual microscope takes every pixel at its own time, so a drift that moves by several px during
 a frame shears and bends it. Where the corrected frame puts what a raw pixel saw is compared with

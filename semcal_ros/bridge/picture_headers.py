@@ -102,7 +102,9 @@ def read_picture_header(data: memoryview) -> PictureHeader:
     else:
         kinds = [kind for signature, kind in _OTHERS.items() if start.startswith(signature)]
         raise MessageError(
-            f"compressed data that are {kinds[0]}" if kinds else "compressed data of no known kind",
+            f"compressed data that are {kinds[0]}"
+            if kinds
+            else "compressed data of an unknown format",
             expected="PNG or JPEG",
             do="choose png at the publisher, or send sensor_msgs/msg/Image for 32FC1",
         )
@@ -120,7 +122,7 @@ def _check_size(header: PictureHeader, size: int) -> None:
     if pixels > _MAX_PIXELS_PER_BYTE * size:
         raise MessageError(
             f"{declared} in {size} bytes",
-            expected=f"at most {_MAX_PIXELS_PER_BYTE} pixels per byte, more than which no {header.codec} holds",
+            expected=f"at most {_MAX_PIXELS_PER_BYTE} pixels per byte, the most that a {header.codec} holds",
             do="check the publisher or the recording",
         )
 

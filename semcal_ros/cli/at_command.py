@@ -64,5 +64,5 @@ def _echo_camera(camera: dict[str, Any]) -> None:
     if not camera["in_range"]:
         low, high = camera["magnification_range"]
         click.echo(
-            f"warning: outside of the calibrated range {low:g} to {high:g}: extrapolated", err=True
+            f"warning: outside the calibrated range {low:g} to {high:g}: extrapolated", err=True
         )

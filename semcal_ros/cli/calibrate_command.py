@@ -43,7 +43,9 @@ def _parse_magnifications(
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
 @click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
 @click.option(
-    "--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE."
+    "--legendre",
+    type=click.IntRange(0, 20),
+    help="pda: fit Legendre polynomials of this degree instead of an ODE.",
 )
 @click.option(
     "--breakpoints",
@@ -56,9 +58,11 @@ def _parse_magnifications(
     type=click.Choice(RESIDUAL_MODES),
     default="auto",
     show_default=True,
-    help="joint: a field for what the distortion parameters cannot describe.",
+    help="joint: whether to add a field for what the distortion parameters cannot describe.",
 )
-@click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
+@click.option(
+    "--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a statistical test."
+)
 @click.option("--report", type=PATH, help="Also write an HTML report.")
 def command(
     recording: Path,

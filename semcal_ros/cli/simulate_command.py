@@ -21,12 +21,14 @@ __all__ = ["command"]
     type=click.Choice(PLAN_KINDS),
     default="grid",
     show_default=True,
-    help="Chess grid at many poses; one place under drift; steps or a sweep of the magnification.",
+    help="Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it.",
 )
 @click.option(
     "--preset", "name", type=click.Choice(sorted(PRESETS)), default="jsm820", show_default=True
 )
-@click.option("--specimen", type=click.Choice(SPECIMEN_KINDS), help="All but grid: what is seen.")
+@click.option(
+    "--specimen", type=click.Choice(SPECIMEN_KINDS), help="Specimen of all plans but grid."
+)
 @click.option(
     "--drift", "drift_name", type=click.Choice(sorted(DRIFTS)), help="Drift of the specimen."
 )
@@ -51,7 +53,9 @@ __all__ = ["command"]
     help="Width and height.",
 )
 @click.option("--bits", type=click.Choice(["8", "16"]), default="8", show_default=True)
-@click.option("--electrons", type=click.FloatRange(0), help="Per pixel; 0 for no shot noise.")
+@click.option(
+    "--electrons", type=click.FloatRange(0), help="Electrons per pixel; 0 for no shot noise."
+)
 @click.option("--blur", type=click.FloatRange(0), help="Sigma of the beam in px.")
 @click.option("--seed", type=int, default=0, show_default=True)
 @overwrite_option

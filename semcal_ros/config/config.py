@@ -408,6 +408,6 @@ def _check_magnification(given: dict[str, Any], read: MagnificationConfig, sourc
         if key in given and read.quantity != quantity:
             raise ConfigError(
                 f"{source}: key magnification.{key} with the quantity {read.quantity}",
-                expected=f"it only with the quantity {quantity}",
+                expected=f"this key only with the quantity {quantity}",
                 do="remove the key or correct the quantity",
             )

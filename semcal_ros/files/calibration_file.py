@@ -180,7 +180,9 @@ def _check_schema(data: Mapping[str, Any], source: str) -> None:
     try:
         error = next(_validator().iter_errors(data), None)
     except TypeError as wrong:  # the validator compares names with patterns
-        raise CalibrationFileError(f"{source}: a key that is not text", expected="names") from wrong
+        raise CalibrationFileError(
+            f"{source}: a key that is not text", expected="text as keys"
+        ) from wrong
     if error is not None:
         where = ".".join(str(p) for p in error.absolute_path) or "top level"
         raise CalibrationFileError(
@@ -332,7 +334,7 @@ def _check_covariance(matrix: Array) -> None:
     if least < -_NEGATIVE_CORRELATION * len(matrix):
         raise InvalidValueError(
             f"a covariance whose correlations have the eigenvalue {least:.2g}",
-            expected="none below zero",
+            expected="no negative eigenvalue",
             do="calibrate again: the file was changed by hand, or damaged",
         )
 

@@ -206,7 +206,7 @@ def open_video(
             video.release()
         found = _count_frames(file)
         if found != frames:
-            raise _incomplete(path, f"{found} of {frames} frames came out")
+            raise _incomplete(path, f"{found} of {frames} frames were encoded")
         os.replace(file, target)
 
 

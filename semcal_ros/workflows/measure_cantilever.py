@@ -234,7 +234,7 @@ def measure_cantilever(
     if microscope.scan is None:
         notes.append(f"the configuration has no scan: frames are instants; {GIVE_FRAME_TIME}")
     if not all(one.camera.in_range for one in series):
-        notes.append("frames outside of the calibrated range")
+        notes.append("frames outside the calibrated range")
     agreement = compare_series([one.measured for one in series], poses)
     return CantileverMeasurement(tuple(series), agreement, poses, tuple(notes))
 

@@ -188,7 +188,7 @@ def reconstruct(
     on_progress("measuring the ball", 0, None)
     ball = measure_ball(structure, height_sigma_m=height_sigma_m)
     if outside:
-        notes.append(f"{outside} frames are outside of the calibrated range")
+        notes.append(f"{outside} frames are outside the calibrated range")
     notes += _doubts(structure, microscope.scan is not None)
     return Reconstruction(structure, ball, tracker.frames, tuple(notes))
 
@@ -241,7 +241,7 @@ def _doubts(structure: Structure, timed: bool) -> list[str]:
         notes.append("the adjustment did not converge")
     if not structure.settled:
         notes.append(
-            f"measuring did not settle in {structure.passes} passes: points still moved by more "
+            f"measuring did not converge in {structure.passes} passes: points still moved by more "
             "than half of their 1-sigma"
         )
     return notes

@@ -179,8 +179,8 @@ class _Reading:
         time_s = start_time_s(frame, first.stamp_ns, self.config)
         if taken.frames and time_s < taken.frames[-1][2]:
             raise BagError(
-                f"image {index + 1} was taken {taken.frames[-1][2] - time_s:g} s before the one "
-                "before it",
+                f"image {index + 1} was taken {taken.frames[-1][2] - time_s:g} s before the "
+                "previous one",
                 expected="images in the order of time",
                 do="record each pass of a replay to a recording of its own",
             )
@@ -221,7 +221,7 @@ class _Reading:
                 do="choose one with --at G",
             )
         raise BagError(
-            f"--at {self.at:g}: {self.opened.path} has no such frames",
+            f"no frames at magnification {self.at:g} in {self.opened.path}",
             expected=f"one of {listed}",
             do="choose one of these magnifications",
         )

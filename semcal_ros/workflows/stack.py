@@ -242,10 +242,10 @@ def _usable(selection: FrameSelection) -> Mask:
     usable = selection.path.trusted
     if not usable.any():
         raise BagError(
-            f"{len(usable)} frames and none with a known drift, the first: "
+            f"{len(usable)} frames, none of them with a known drift; the first: "
             f"{selection.path[0].status_text}",
             expected="a specimen with structure",
-            do="look at `semcal drift`, or average the frames where they are with --no-drift",
+            do="check with `semcal drift`, or average the frames where they are with --no-drift",
         )
     return usable
 

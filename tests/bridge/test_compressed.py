@@ -312,7 +312,7 @@ def put(offset: int, value: int, kind: str) -> Callable[[bytearray, int], None]:
 
 BAD_PICTURES = {
     "empty": (b"", "without data"),
-    "text": (b"no picture at all", "no known kind"),
+    "text": (b"no picture at all", "unknown format"),
     "tiff": (encoded(".tiff", GREY.astype(np.float32)), "are TIFF.*Image for 32FC1"),
     "webp": (encoded(".webp", COLOUR), "are WebP"),
     "png signature only": (SIGNATURE, "truncated"),
@@ -396,7 +396,7 @@ def test_pictures_that_are_refused(new: New, name: str) -> None:
         ("32FC1; png compressed ", encoded(".png", WIDE), "32FC1"),
         ("bayer_rggb8; jpeg compressed mono8", JPEG, "bayer_rggb8.*mono16"),
         ("bgra8; jpeg compressed bgr8", encoded(".jpg", COLOUR), "bgra8"),
-        ("16UC1; compressedDepth png", bytes(12) + encoded(".png", WIDE), "no known kind"),
+        ("16UC1; compressedDepth png", bytes(12) + encoded(".png", WIDE), "unknown format"),
         ("16UC1; compressedDepth png", encoded(".png", WIDE), "compressedDepth"),
         ("mono8; tiff compressed ", encoded(".png", GREY), "tiff"),
         ("h264", encoded(".png", GREY), "h264"),

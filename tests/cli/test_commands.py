@@ -75,7 +75,7 @@ def test_at_flags_extrapolation(folder, capsys):
     assert run("at", folder / "cal.yaml", 9000) == 0
     captured = capsys.readouterr()
     assert "nm per px" in captured.out
-    assert "outside of the calibrated range" in captured.err
+    assert "outside the calibrated range" in captured.err
 
 
 @pytest.mark.slow

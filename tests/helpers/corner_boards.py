@@ -79,7 +79,7 @@ class Board:
         return h[:, :2] / h[:, 2:]
 
     def corners(self, margin: float = 6.0) -> tuple[NDArray[np.int64], Array]:
-        """Indices and pixels of the corners at least ``margin`` px inside of the image."""
+        """Indices and pixels of the corners at least ``margin`` px inside the image."""
         frame = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
         corner_uv = self.board_from_image(frame.astype(np.float64))
         low, high = np.floor(corner_uv.min(axis=0)) - 2, np.ceil(corner_uv.max(axis=0)) + 2

@@ -210,7 +210,7 @@ def test_an_absurd_magnification_is_refused_and_the_old_one_not_used_on(bench: B
 
 
 def test_the_ends_of_the_magnifications_that_are_possible_give_an_answer(bench: Bench) -> None:
-    """Far outside of the calibrated range: an image with a warning, or a reason, and then all is well again."""
+    """Far outside the calibrated range: an image with a warning, or a reason, and then all is well again."""
     for done, magnification in enumerate((1.0, 1e8), 1):
         bench.set_magnification(magnification)
         bench.send(texture())

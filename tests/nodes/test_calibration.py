@@ -186,7 +186,7 @@ def test_what_lies_outside_of_the_directory_is_refused(session: Session, tmp_pat
     ):
         result = session.set_output(path)
         assert not result.successful
-        assert f"inside of {session.folder}" in result.reason
+        assert f"inside {session.folder}" in result.reason
 
 
 def test_a_file_that_became_a_link_to_elsewhere_is_not_written(

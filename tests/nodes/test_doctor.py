@@ -173,7 +173,7 @@ def test_a_calibration_that_does_not_fit_and_a_clock_nobody_uses_are_named(
     assert report.has(
         "note", "time", "/lab/driver publishes /clock", "/sem/rectifier", "use_sim_time"
     )
-    assert report.has("note", "/sem/rectifier", "outside of the calibrated range")
+    assert report.has("note", "/sem/rectifier", "outside the calibrated range")
 
 
 def test_nothing_but_an_image_elsewhere(peer: Peer) -> None:

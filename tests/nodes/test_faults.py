@@ -149,7 +149,7 @@ def test_a_magnification_out_of_the_calibrated_range_is_answered_and_said(bench:
     bench.peer.wait_for(lambda: bench.images, "the frame")
     state = bench.peer.wait_for(
         lambda: (
-            "outside of the calibrated range" in bench.state().get("message", "") and bench.state()
+            "outside the calibrated range" in bench.state().get("message", "") and bench.state()
         ),
         "the warning",
     )

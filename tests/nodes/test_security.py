@@ -1,4 +1,4 @@
-"""DDS security: the shipped policy, refusal instead of running open, and what who is outside of a policy gets."""
+"""DDS security: the shipped policy, refusal instead of running open, and what who is outside a policy gets."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def find_strip(
         If there is no strip, or its base and free end cannot be told apart.
     """
     if (base_px is None) != (tip_px is None):
-        raise InvalidValueError("one end of the cantilever", expected="both or none")
+        raise InvalidValueError("only one end of the cantilever", expected="both or none")
     shrink = max(1, int(np.ceil(max(image.shape) / _SEARCHED_PX)))
     grey = np.asarray(image, dtype=np.float32)
     if shrink > 1:
@@ -175,7 +175,7 @@ def _search_strip(smooth: Array) -> Strip:
         if strength > best:
             best, angle, offset = strength, float(turn), 0.5 * (low + up) + first
     if best <= 0.0:
-        raise InvalidValueError("no strip in the picture", expected="a cantilever", do=_GIVE_CLICKS)
+        raise InvalidValueError("no strip in the image", expected="a cantilever", do=_GIVE_CLICKS)
     across = np.array([-np.sin(angle), np.cos(angle)])
     middle = 0.5 * (np.array(size) - 1.0)
     point = middle + (offset - float(across @ middle)) * across
@@ -237,7 +237,7 @@ def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Arr
     )
     if inside.size < 2:
         raise InvalidValueError(
-            "base and tip between which nothing is in view", expected="a beam in the picture"
+            "a beam that is out of view between base and tip", expected="a beam in the image"
         )
     return points[inside[0]], points[inside[-1]]
 
@@ -287,7 +287,7 @@ def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip
     side = min(smooth.shape)
     if run is None or strong <= 0.0 or run[1] - run[0] < _LEAST_LENGTH * side:
         raise InvalidValueError(
-            "no strip that is long enough in the picture", expected="a cantilever", do=_GIVE_CLICKS
+            "no long enough strip in the image", expected="a cantilever", do=_GIVE_CLICKS
         )
     ends = [offset * across + steps[k] * along for k in run]
     seen = [
@@ -342,7 +342,7 @@ def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: f
     is_base = [s and f <= 0.5 for s, f in zip(seen, free, strict=True)]
     if is_tip[0] == is_tip[1] and is_base[0] == is_base[1]:
         raise InvalidValueError(
-            "a strip of which base and free end cannot be told apart",
+            "a strip whose base and free end cannot be told apart",
             expected="a cantilever with at least one of its ends in view",
             do=_GIVE_CLICKS,
         )

@@ -330,7 +330,7 @@ class _Refinement:
         if np.count_nonzero(points) < 12 or np.count_nonzero(views) < 3:
             raise StructureError(
                 f"{np.count_nonzero(points)} points in {np.count_nonzero(views)} views that agree",
-                expected="at least 12 in 3",
+                expected="at least 12 points in 3 views",
                 do="record more texture, slower movements or larger turns",
             )
         use = points[self.seen.point] & views[self.seen.view]

@@ -91,7 +91,7 @@ def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
     grey = check_image(image, channels=(1,), least_side=32)
     picture = np.ascontiguousarray(grey, dtype=np.float32)
     if not np.all(np.isfinite(picture)):
-        return _reject("image: holds values that are not finite")
+        return _reject("the image has values that are not finite")
     factor = -(-max(picture.shape) // _SEARCHED_PX)
     stretched = _stretch(picture, factor)
     if stretched is None:

@@ -192,7 +192,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     covariance = np.linalg.inv(normal) / np.outer(size, size) * factor
     rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
     pose = PlanePose(pose.x_m, pose.y_m, math.remainder(pose.angle_rad, 2.0 * math.pi))
-    reason = "" if settled else f"the pose did not settle in {_MOST_STEPS} steps"
+    reason = "" if settled else f"the pose did not converge in {_MOST_STEPS} steps"
     return PoseFit(pose, covariance, scale, _compute_scale_sigma(view), rms_px, view, reason)
 
 

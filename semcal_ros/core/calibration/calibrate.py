@@ -227,7 +227,7 @@ def calibrate_views(
     CalibrationError
         If the views do not allow a calibration.
     InvalidValueError
-        For breakpoints outside of the magnifications of the views.
+        For breakpoints outside the magnifications of the views.
     """
     options = options or CalibrationOptions()
     ordered = _check_views(views)
@@ -326,7 +326,7 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
             "calibrate with this breakpoint"
         )
     if not adjustment.settled:
-        warnings.append("the choice of the number of coefficients did not settle")
+        warnings.append("the choice of the number of coefficients did not converge")
     details = {
         "iterations": result.iterations,
         "converged": result.converged,

@@ -126,7 +126,7 @@ class CalibrationModel:
     def at(self, magnification: float) -> ScanCamera:
         """Return the camera at a magnification.
 
-        Outside of :attr:`magnification_range` the functions continue along their tangents in log g,
+        Outside :attr:`magnification_range` the functions continue along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range.
 
         Raises

@@ -38,7 +38,7 @@ class Undistortion:
     q
         (n, 2) normalised ideal coordinates; NaN where ``converged`` is false.
     converged
-        (n,) bool. False outside of the model's domain, or where Newton's method did not converge.
+        (n,) bool. False outside the model's domain, or where Newton's method did not converge.
     iterations
         Number of Newton steps that were taken.
     residual

@@ -76,7 +76,7 @@ def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
     return bool(np.median(miss / allowed) < 1.0)
 
 
-# Corners nearer to the frame than this are not fitted: up to half of their window is outside of the
+# Corners nearer to the frame than this are not fitted: up to half of their window is outside the
 # image.
 MARGIN_PX = 2.0
 # Least contrast relative to the median of the image. Saddle points are kept down to about the same

@@ -132,7 +132,7 @@ def _max_displacement_px(frame: ScanFrame, motion: Array) -> Array:
 
 
 def _find_scanned_region(size: tuple[int, int], camera: ScanCamera | None) -> Region:
-    """Rectangle of output pixels that all come from inside of the raw frame."""
+    """Rectangle of output pixels that all come from inside the raw frame."""
     width, height = size
     left, top, right, bottom = 0, 0, width, height
     for _ in range(_MAX_SHRINKS):

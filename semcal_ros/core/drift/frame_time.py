@@ -335,7 +335,7 @@ def _assess(fit: _Fit, frames: int, interval_s: float) -> FrameTimeEstimate:
     time_s, sigma = fit.time_s, fit.sigma_s
     reason = ""
     if not fit.converged:
-        reason = f"the weights did not settle in {_MAX_ITERATIONS} steps"
+        reason = f"the weights did not converge in {_MAX_ITERATIONS} steps"
     elif not abs(time_s) > _MIN_RATIO * sigma:
         reason = f"{time_s:.3g} +- {sigma:.2g} s: the velocity of the drift changes too little"
     elif time_s < 0.0:

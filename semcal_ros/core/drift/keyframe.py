@@ -146,7 +146,7 @@ def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
 
 
 def _map_region(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:
-    """Upright rectangle inside of the affine image of a rectangle and inside of the picture."""
+    """Upright rectangle inside the affine image of a rectangle and inside the picture."""
     left, top, right, bottom = region[0] + 2, region[1] + 2, region[2] - 3, region[3] - 3
     corners = np.array(
         [[left, top], [right, top], [left, bottom], [right, bottom]], dtype=np.float64

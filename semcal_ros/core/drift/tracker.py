@@ -182,7 +182,9 @@ class DriftTracker:
         """
         track = self._track
         if track is None:
-            raise InvalidValueError("a forecast before the first frame", expected="a frame before")
+            raise InvalidValueError(
+                "a forecast before the first frame", expected="at least one frame"
+            )
         state = track.filter.state.without_keyframes()
         return DriftPredictor(state, track.filter.process_noise, track.camera)
 
@@ -316,7 +318,7 @@ class DriftTracker:
             match = self._match(track, frame, candidate)
             if isinstance(match, _Match) and is_repeated:
                 # Noise never comes twice: the scan is paused, or the driver sent the frame again.
-                reason = "image: the same picture as the frame before"
+                reason = "image: the same as the previous frame"
                 repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
                 match = _RejectedMatch(repeated, match.registration)
             if isinstance(match, _Match):

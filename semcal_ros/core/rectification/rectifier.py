@@ -139,7 +139,7 @@ class Rectifier:
         return self._whole_maps(key, fitted, drift, timing)
 
     def remapped(self, image: AnyImage, map_x: Array32, map_y: Array32) -> AnyImage:
-        """The image at raw positions as :meth:`maps` gives them; 0 outside of it."""
+        """The image at raw positions as :meth:`maps` gives them; 0 outside it."""
         return self._remap(image, map_x, map_y, None)
 
     def _remap(

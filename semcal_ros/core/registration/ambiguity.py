@@ -95,7 +95,7 @@ def choose_peak(
             return Rejection(
                 MatchFailure.AMBIGUOUS,
                 f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
-                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well",
+                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the image equally well",
             )
         if deviations < 0.0:
             best = peak, alignment, energies
@@ -122,7 +122,7 @@ def _prefer_prediction(
         x, y = highest.shift_px
         return Rejection(
             MatchFailure.AMBIGUOUS,
-            f"ambiguous: the picture says ({x:.1f}, {y:.1f}) px, far from the prediction",
+            f"ambiguous: the image shows a shift of ({x:.1f}, {y:.1f}) px, far from the prediction",
         )
     return predicted, alignments[0]
 

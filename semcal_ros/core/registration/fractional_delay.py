@@ -23,7 +23,7 @@ __all__ = ["FINE", "SHARP", "Band", "gradients", "sample_shifted"]
 
 # Frequencies at which a filter of up to 16 taps is fitted: four times as many.
 _SAMPLES = 64
-# Of the diagonal of the normal matrix, added to it: what lies outside of the band is left free, and
+# Of the diagonal of the normal matrix, added to it: what lies outside the band is left free, and
 # this keeps the weights small there.
 _RIDGE = 1e-9
 # Squared frequency, (rad/px)^2, below which the power of a picture is taken as constant.
@@ -126,7 +126,7 @@ def sample_shifted(
     image
         (h, w) of uint8, uint16 or float32.
     corner, size
-        (left, top) and (width, height) of the patch, which must lie inside of the image.
+        (left, top) and (width, height) of the patch, which must lie inside the image.
     fraction
         (2,) sub-pixel shift (x, y), each in [-1, 1].
     smoothing

@@ -44,7 +44,7 @@ from semcal_ros.core.registration.tiles import (
 __all__ = ["Alignment", "align", "tile_residual_energies", "unmeasured_alignment"]
 
 
-# A start that needs more steps than these is outside of the range of convergence.
+# A start that needs more steps than these is outside the range of convergence.
 _MAX_PASSES = 12
 _MAX_COARSE_PASSES = 4
 # The gradient extrapolates over a pixel or two of a sharp picture; longer steps may overshoot.

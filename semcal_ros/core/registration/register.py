@@ -140,7 +140,7 @@ def _crop(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
         raise InvalidValueError(
             f"region {region} of an image of {width} x {height} px",
-            expected="(left, top, right, bottom) inside of the image",
+            expected="(left, top, right, bottom) inside the image",
         )
     return gray[top:bottom, left:right], region
 
@@ -150,16 +150,16 @@ def _find_defect(gray: AnyImage, settings: RegistrationSettings) -> str:
     if min(gray.shape) < _MIN_SIDE_PX:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
-        return "picture holds values that are not finite"
+        return "values that are not finite"
     stride = max(1, min(gray.shape) // _SATURATION_SAMPLES)
     some = np.ascontiguousarray(gray[::stride, ::stride])
     lowest, highest = some.min(), some.max()
     if lowest == highest:
-        return f"blank picture (all pixels at {highest:g})"
+        return f"blank (all pixels at {highest:g})"
     for end in (lowest, highest):
         share = float(np.count_nonzero(some == end)) / some.size
         if share > settings.max_saturated:
-            return f"saturated picture ({100.0 * share:.0f} % of the pixels at {end:g})"
+            return f"saturated ({100.0 * share:.0f} % of the pixels at {end:g})"
     return ""
 
 
@@ -197,7 +197,7 @@ def prepare_reference(
         return Reference(inside, coarse, (), 0.0, defect, limits)
     statistics = measure_picture(gray, averaged)
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
-        return Reference(inside, coarse, (), 0.0, "featureless picture (noise only)", limits)
+        return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
     levels = []
     for factor in _reduction_factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
@@ -361,7 +361,7 @@ def _check(
     if not alignment.converged:
         return Rejection(
             MatchFailure.NOT_CONVERGED,
-            f"refinement did not settle in {alignment.iterations} steps",
+            f"refinement did not converge in {alignment.iterations} steps",
         )
     apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
     if apart > peak.step_px + _STAGE_TOLERANCE_PX:
@@ -371,7 +371,7 @@ def _check(
     if correlation < limits.min_correlation:
         return Rejection(
             MatchFailure.DISSIMILAR,
-            f"pictures differ (noise-corrected correlation {correlation:.2f})",
+            f"images differ (noise-corrected correlation {correlation:.2f})",
         )
     allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
     shear = np.abs(alignment.joint_px[2:])
@@ -381,6 +381,6 @@ def _check(
     if np.any(np.abs(alignment.half_difference_px) > allowed):
         apart = float(np.max(np.abs(alignment.half_difference_px)))
         return Rejection(
-            MatchFailure.HALVES_DISAGREE, f"halves of the picture disagree by {apart:.1f} px"
+            MatchFailure.HALVES_DISAGREE, f"halves of the image disagree by {apart:.1f} px"
         )
     return None

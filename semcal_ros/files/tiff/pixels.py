@@ -115,7 +115,7 @@ def _decode_by_opencv(path: Path) -> NDArray[Any]:
     data = np.fromfile(path, dtype=np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise ValueError("the compressed picture cannot be decoded")
+        raise ValueError("the compressed image cannot be decoded")
     return np.asarray(image)
 
 
@@ -133,5 +133,5 @@ def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
     else:
         image = _decode_by_opencv(path)
     if image.shape != size or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"decoded picture is {image.dtype} {image.shape}")
+        raise ValueError(f"the decoded image is {image.dtype} {image.shape}")
     return np.ascontiguousarray(image)

@@ -44,7 +44,7 @@ _AT_ONCE = 8
 _MIXED = ParameterDeclaration(
     "mixed_frames",
     "drop",
-    "What becomes of frames that were being scanned while the magnification changed. flag: published, uncorrected for"
+    "What happens to frames that were being scanned while the magnification changed. flag: published, uncorrected for"
     " drift, with a camera_info that says uncalibrated.",
     choices=("drop", "flag"),
 )

@@ -71,7 +71,7 @@ def test_the_projection_of_a_frame_is_the_one_that_fits_its_own_k() -> None:
     for g, expected in zip(magnifications, published, strict=True):
         found = choose_projection(SCOPE.camera_at(g).K, published)
         np.testing.assert_array_equal(found, expected)
-    with pytest.raises(InvalidValueError, match="no projection of the magnification"):
+    with pytest.raises(InvalidValueError, match="projections has the magnification"):
         choose_projection(SCOPE.camera_at(1500.0).K, published)
 
 

@@ -1,4 +1,4 @@
-"""Drift inside of the frame, through a zoom, and over a long way, on recordings with known truth."""
+"""Drift inside the frame, through a zoom, and over a long way, on recordings with known truth."""
 
 from __future__ import annotations
 

@@ -229,7 +229,7 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
     # The cubic interpolation and the blur before it reach over the edge by less than 1 %.
     np.testing.assert_allclose(other.mean[top:bottom, left:right], 200.0, rtol=0.01)
     # And the region is not much smaller than it has to be: 150 px in the new pixels, or what of
-    # them lies inside of the picture.
+    # them lies inside the picture.
     corners = np.array([[20.0, 20.0], [169.0, 169.0]])
     seen = now.project_ideal(small_camera(2000.0).sem_from_ideal(corners))
     seen = np.clip(seen, 0.0, 191.0)

@@ -342,7 +342,7 @@ def test_a_frozen_picture_says_nothing_about_drift() -> None:
     for k in range(12):
         update = run.step(k, spoil=(lambda _: frozen) if 5 <= k < 9 else None)
         if 6 <= k < 9:
-            assert update.status_text == "coasting: image: the same picture as the frame before"
+            assert update.status_text == "coasting: image: the same as the previous frame"
     assert run.updates[9].accepted
     error, sigma = np.array(run.errors_px)[1:], np.array(run.sigmas_px)[1:]
     assert np.all(np.abs(error) < 4.5 * sigma + 0.03)

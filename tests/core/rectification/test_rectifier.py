@@ -119,7 +119,7 @@ def test_map_of_a_field_with_a_hole_in_the_distortion() -> None:
     camera = ScanCamera(
         100.0, 1e5, 1.0, 0.0, 95.5, 95.5, 0.0, 0.2, 0.0, 95.5, 95.5, 96.0, SIZE, SIZE
     )
-    # 4 xi_r r2 reaches 1 inside of the corners: no raw pixel there, black in the output.
+    # 4 xi_r r2 reaches 1 inside the corners: no raw pixel there, black in the output.
     out = Rectifier().rectify(np.full((SIZE, SIZE), 200, np.uint8), camera)
     assert out[0, 0] == 0
     assert out[96, 96] == 200
@@ -188,7 +188,7 @@ def test_writing_to_given_memory_gives_the_same_picture(dtype: type) -> None:
     picture = (200.0 * rng.random((100, SIZE))).astype(dtype)
     drift = RasterDrift(np.array([1e-6, 2e-6]), np.array([1e-7, 0.0]))
     memory = np.full(picture.nbytes + 1, 255, np.uint8)
-    # An odd address, as that of data inside of a message may be.
+    # An odd address, as that of data inside a message may be.
     out = memory[1:].view(dtype).reshape(picture.shape) if dtype is np.uint8 else None
     out = np.empty_like(picture) if out is None else out
     rectifier = Rectifier()

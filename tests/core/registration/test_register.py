@@ -178,7 +178,7 @@ def test_refuses_blank_saturated_and_featureless() -> None:
     burnt = np.clip((image - 60.0) * 10.0, 0, 255).astype(np.uint8)
     _refused(register_pair(reference, burnt), "image: saturated")
     _refused(register_pair(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
-    _refused(register_pair(_noise(0), _noise(1)), "reference: featureless picture (noise only)")
+    _refused(register_pair(_noise(0), _noise(1)), "reference: featureless (noise only)")
     _refused(register_pair(reference, _noise(2)), "stands out")
 
 
