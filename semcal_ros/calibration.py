@@ -1,4 +1,4 @@
-"""What programs hold: a calibration with its file, its figure and its corrected pictures."""
+"""What programs hold: a calibration with its file, its figure and its corrected images."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Calibration(CalibrationModel):
         """
         write_calibration(self, path)
 
-    # -- cameras and pictures ---------------------------------------------------------------------
+    # -- cameras and images ---------------------------------------------------------------------
 
     @overload
     def at(self, magnification: float) -> ScanCamera: ...

@@ -45,7 +45,7 @@ class FieldResidual:
     corrected
         (frames, points) with the tracker's drift and velocity.
     shifted
-        (frames, points) with its drift alone: what a correction of the whole picture leaves.
+        (frames, points) with its drift alone: what a correction of the whole image leaves.
     statuses
         Of the tracker, one per frame.
     moved_px

@@ -111,7 +111,7 @@ def command(
         _echo_summary(done.summary())
     echo_notes(done.notes)
     if not as_json:
-        echo_paths({"mesh": output, "points": cloud, "picture": figure})
+        echo_paths({"mesh": output, "points": cloud, "image": figure})
 
 
 def _echo_summary(result: dict[str, Any]) -> None:

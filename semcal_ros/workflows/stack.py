@@ -269,11 +269,11 @@ def _add_frames(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        picture, valid = summed.rectify(grey, camera, drift, selection.config.scan)
+        image, valid = summed.rectify(grey, camera, drift, selection.config.scan)
         if used[number]:
-            summed.add(picture, valid)
+            summed.add(image, valid)
         if film is not None:
-            film.write(picture, _caption(selection.times_s, number, bool(used[number])))
+            film.write(image, _caption(selection.times_s, number, bool(used[number])))
 
 
 def _video_levels(selection: FrameSelection) -> tuple[float, float]:

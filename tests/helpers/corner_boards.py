@@ -108,7 +108,7 @@ class Board:
         return bright.astype(np.float64)
 
     def clean(self, samples: int = 8) -> Array:
-        """(h, w) noise-free picture with values between ``dark`` and 1, before shading.
+        """(h, w) noise-free image with values between ``dark`` and 1, before shading.
 
         Pixels that an edge may cross are averaged over ``samples`` x ``samples`` points.
         """
@@ -138,7 +138,7 @@ class Board:
     def render(
         self, rng: np.random.Generator, dtype: type = np.uint8, samples: int = 8
     ) -> NDArray[np.generic]:
-        """(h, w) picture with shading and shot noise, quantised."""
+        """(h, w) image with shading and shot noise, quantised."""
         picture = self.clean(samples)
         y, x = np.mgrid[0.0 : self.height, 0.0 : self.width]
         ramp = 1.0 + self.shading * ((x / self.width - 0.5) + 0.7 * (y / self.height - 0.5) ** 2)
@@ -155,7 +155,7 @@ def position_bound(board: Board, ij: NDArray[np.int64]) -> Array:
     """(n, 2, 2) Cramer-Rao bound of the corners ``ij`` from the pixels nearest to each, px^2.
 
     Everything but the position is taken for known. The information is that of Poisson counts, with
-    derivatives of the noise-free picture from rendering the board twice, a little moved; nothing of
+    derivatives of the noise-free image from rendering the board twice, a little moved; nothing of
     the finder is used. For boards without distortion and perspective, where all corners move alike.
     """
     assert board.distortion == 0 and board.perspective == 0 and board.electrons > 0

@@ -83,7 +83,7 @@ def pixels(message: Any) -> NDArray[Any]:
 
 
 def noisy(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
-    """The picture as another frame would show it."""
+    """The image as another frame would show it."""
     noise = np.random.default_rng(seed).normal(0.0, NOISE, picture.shape)
     return np.clip(np.round(picture + noise), 0, 255).astype(np.uint8)
 

@@ -167,7 +167,7 @@ def test_pixels_that_are_no_numbers_stay_where_they_are(bench: Bench) -> None:
         bench.send(image_message(image, float(bench.sent), encoding="32FC1"))
         message = bench.expect(bench.sent)
         assert message.encoding == "32FC1"
-    # Nothing of it stays in a picture that the drift is measured against.
+    # Nothing of it stays in an image that the drift is measured against.
     message = bench.exchange(texture(3))
     np.testing.assert_array_equal(pixels(message), bench.kind.right(texture(3), MAGNIFICATION))
 

@@ -88,7 +88,7 @@ def test_only_the_operator_may_call_the_whole_suite_and_only_it_has_wildcards() 
     calls = {name: {t for t in g.publish if t[:2] == "rq"} for name, g in GRANTED.items()}
     wild = {name for name, g in GRANTED.items() if any("*" in t for t in g.all)}
     assert wild == {"/sem/operator"}
-    # The servo lets the corrector begin anew where its picture has left the field.
+    # The servo lets the corrector begin anew where its image has left the field.
     assert calls.pop("/sem/visual_servo") == {"rq/sem/stream_corrector/resetRequest"}
     assert {name for name, called in calls.items() if called} == {"/sem/operator"}
 

@@ -60,7 +60,7 @@ def test_frames_follow_magnification_and_depth(peer: Peer) -> None:
 
 @pytest.mark.parametrize("tracking", ["every_frame", "forecast"])
 def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: str) -> None:
-    """The stage moves at a known speed; the compensator finds that drift and holds the picture."""
+    """The stage moves at a known speed; the compensator finds that drift and holds the image."""
     speed_px_s = np.array([6.0, -3.0])
     raw = peer.collect(Image, "image_raw")
     held = peer.collect(Image, "image_stabilized")

@@ -250,11 +250,11 @@ def _is_inside(point: Array, shape: tuple[int, ...]) -> bool:
     )
 
 
-def _sample(picture: Array, points: Array) -> Array:
+def _sample(image: Array, points: Array) -> Array:
     """Interpolate grey levels at (n, 2) pixels; NaN outside the image."""
     maps = [np.ascontiguousarray(points[None, :, k], dtype=np.float32) for k in (0, 1)]
     out = cv2.remap(
-        picture.astype(np.float32),
+        image.astype(np.float32),
         maps[0],
         maps[1],
         cv2.INTER_LINEAR,
@@ -319,7 +319,7 @@ def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
 
 
 def _measure_freedom(
-    picture: Array, end: Array, outwards: Array, across: Array, half: float
+    image: Array, end: Array, outwards: Array, across: Array, half: float
 ) -> float:
     """Measure how dark it is beyond an end: 1 as beside the strip, 0 as on it, NaN out of view."""
     spread = np.linspace(-0.5 * half, 0.5 * half, 5)
@@ -327,7 +327,7 @@ def _measure_freedom(
 
     def level(steps: Array, offsets: Array) -> float:
         points = end + steps[:, None, None] * outwards + offsets[None, :, None] * across
-        values = _sample(picture, points.reshape(-1, 2))
+        values = _sample(image, points.reshape(-1, 2))
         return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
 
     inside = level(-beyond, spread)

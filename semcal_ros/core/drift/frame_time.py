@@ -7,7 +7,7 @@ much more it is sheared than its keyframe:
     shear = T (v - v_key) + B (p - p_key) + c_key + noise
 
 with the velocities v and positions p of the smoothed drift. B is the shear that a shift causes in
-pictures whose distortion was not removed, (2, 2) with a prior; c_key is the noise of the keyframe's
+images whose distortion was not removed, (2, 2) with a prior; c_key is the noise of the keyframe's
 own shear, which all frames that were compared with it share. T follows by weighted least squares where the
 velocity changes; a steady drift shears all frames alike and tells nothing.
 
@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 
-#: Shear per shift, 1-sigma, in pictures with their distortion, and where a calibration removed it: a
+#: Shear per shift, 1-sigma, in images with their distortion, and where a calibration removed it: a
 #: distortion of 1 % at the edge of the field, and what is left of it.
 SHEAR_OF_SHIFT_DISTORTED, SHEAR_OF_SHIFT_RECTIFIED = 0.01, 0.001
 

@@ -11,7 +11,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.picture_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
+from semcal_ros.bridge.codec_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
 from semcal_ros.core.errors import TiffError
 
 __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]

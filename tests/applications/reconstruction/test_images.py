@@ -17,7 +17,7 @@ from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
 
-# The same pixel size as 2048 px at 9000x, in a smaller picture.
+# The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
 CENTRE_M = (-2e-7, 0.0, 0.0)
 

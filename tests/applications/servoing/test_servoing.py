@@ -188,7 +188,7 @@ class Plant:
     def step(self, g: float, *, foretold: bool = True) -> ServoStep:
         """Frame, latency, command, and the rest of the period."""
         seen_at = self.time_s
-        # As in image_rect: the drift is taken out of the picture, and told.
+        # As in image_rect: the drift is taken out of the image, and told.
         shown = self.pose if self.held else self.in_sem
         view = view_of(shown, camera_at(g), self.rng)
         self._go(LATENCY_S)
@@ -300,7 +300,7 @@ def test_drift_is_commanded_away() -> None:
 
 @pytest.mark.parametrize("frame", ["instrument", "specimen"])
 def test_a_goal_is_held_in_its_frame(frame: str) -> None:
-    """The picture is held still on a drifting specimen: added again, the drift leads to a place under the beam; left
+    """The image is held still on a drifting specimen: added again, the drift leads to a place under the beam; left
     out, to a place on the specimen that goes with it."""
     rate = np.array([25e-9, -14e-9])
     plant = Plant(Servo(GOAL, QUICK), drift_m_s=rate, held=True)

@@ -369,7 +369,7 @@ def test_settle_puts_a_keyframe_where_the_frame_lies() -> None:
     draws = sampled(state, 40000, 1)
     own = noise + restless.frame_covariance(0.8)
     error = np.random.default_rng(2).standard_normal((40000, 4)) * np.sqrt(np.diag(own))
-    # The picture is that of p + b a; b times what was taken out for the acceleration is gone, and
+    # The image is that of p + b a; b times what was taken out for the acceleration is gone, and
     # so is the velocity that was taken out.
     where = np.column_stack(
         [draws[:, :2] + acceleration_term_s2 * (draws[:, 4:6] - removed[2:]), draws[:, 2:4]]
@@ -517,7 +517,7 @@ def follow(
     for k in range(1, len(stream.times)):
         state = Predict(float(stream.times[k]))(state, process_noise)
         frame = np.append(stream.seen[k], stream.seen_pace[k])
-        # A registration knows only the difference of two pictures.
+        # A registration knows only the difference of two images.
         count = 4 if with_shear else 2
         measure = Measure(
             current, (frame - truth[current])[:count], FRAME_NOISE[:count, :count], 1.0, BOW
@@ -569,7 +569,7 @@ def test_errors_of_simulated_streams_are_as_stated(with_shear: bool) -> None:
 
 
 def test_noise_of_a_keyframe_does_not_average_out() -> None:
-    # At rest, and known to be: only the noise of the pictures is left.
+    # At rest, and known to be: only the noise of the images is left.
     rest = ProcessNoise(0.0)
     state = AddKeyframe(0, np.zeros(4), 0.0, FRAME_NOISE, 0.0)(initial_state(0.0), rest)
     # A drift that may be anywhere but does not move.
@@ -588,7 +588,7 @@ def test_coming_back_to_the_first_keyframe_undoes_what_was_lost_on_the_way() -> 
         times += 1.0
         state = Predict(times)(state, process_noise)
         state = Measure(current, np.zeros(2), FRAME_NOISE[:2, :2])(state, process_noise).state
-        # As a picture it weighs a little otherwise than it did when it was measured.
+        # As an image it weighs a little otherwise than it did when it was measured.
         state = CloneKeyframe(k, current, np.zeros(4), 1.0, FRAME_NOISE * 0.2)(state, process_noise)
         current = k
         sigmas.append(float(np.sqrt(state.covariance[0, 0])))
@@ -600,7 +600,7 @@ def test_coming_back_to_the_first_keyframe_undoes_what_was_lost_on_the_way() -> 
     state = Predict(times + 1.0)(state, process_noise)
     back = Measure(0, np.zeros(2), FRAME_NOISE[:2, :2])(state, process_noise).state
     sigma = float(np.sqrt(back.covariance[0, 0]))
-    # Two pictures at most, as for the first frame after the keyframe.
+    # Two images at most, as for the first frame after the keyframe.
     assert sigma < np.sqrt(2.0) * SIGMA
     assert sigma < 0.75 * sigmas[-1]
     # The keyframes on the way become better known, too.

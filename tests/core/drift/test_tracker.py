@@ -100,7 +100,7 @@ def test_rekeys_before_the_overlap_is_lost_and_chains_the_uncertainty() -> None:
     keys = [k for k, u in enumerate(updates) if u.status_text == "keyframe"]
     assert len(keys) >= 4
     assert all(u.accepted for u in updates)
-    # 250 px of travel: more than the width of the picture.
+    # 250 px of travel: more than the width of the image.
     assert np.hypot(*updates[-1].drift_px) > 192.0
     error, sigma = np.array(run.errors_px), np.array(run.sigmas_px)
     assert np.all(np.abs(error) < 4.5 * sigma + 0.03)
@@ -332,7 +332,7 @@ def test_reference_recording_of_gold_on_carbon() -> None:
     drift = 1e-6 * np.array([f["drift_um"] for f in truth["frames"]])
     error = (np.array([u.drift_m for u in updates]) - (drift - drift[0])).T
     error_px = camera.ideal_from_sem_jacobian @ error
-    # The goal of the project is 0.03 px; the noise of the two pictures allows about 0.005.
+    # The goal of the project is 0.03 px; the noise of the two images allows about 0.005.
     assert float(np.sqrt(np.mean(np.sum(error_px**2, axis=0)))) < 0.03
 
 

@@ -1,4 +1,4 @@
-"""Rectification against the exact map and against pictures with known contents."""
+"""Rectification against the exact map and against images with known contents."""
 
 from __future__ import annotations
 

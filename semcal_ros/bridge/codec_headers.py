@@ -5,7 +5,7 @@ fills the rest of a truncated JPEG with grey). So the structure is checked here,
 (ISO/IEC 15948, https://www.w3.org/TR/png-3/, sections 5 and 11), with the checksum of every chunk; JPEG (ITU-T T.81,
 annex B).
 
-Pillow's ``open`` and ``verify`` would not do: of the damaged and foreign pictures that the tests hold they pass a
+Pillow's ``open`` and ``verify`` would not do: of the damaged and foreign images that the tests hold they pass a
 truncated and an arithmetic-coded JPEG, a PNG with two headers, and one whose end has a wrong checksum, and they take
 7.9 ms for a PNG of 2048 x 2048 pixels where this takes 2.3 ms.
 """
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["MAX_PIXELS", "PictureHeader", "read_picture_header"]
+__all__ = ["MAX_PIXELS", "CodecHeader", "read_codec_header"]
 
 MAX_PIXELS = 2**28
-"""Largest accepted picture: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
+"""Largest accepted image: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
 
 # Neither codec can hold more pixels in a byte. Deflate expands to at most 1032 times its size (https://zlib.net/zlib_tech.html);
 # a JPEG spends at least one bit on each block of 64 pixels, or of 128 with the coarsest subsampling.
@@ -34,7 +34,7 @@ _PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey and alpha", 6: "c
 _PNG_REFUSED = {b"tRNS": "transparency", b"acTL": "an animation", b"IHDR": "two headers"}
 _PNG_ACCEPTED = "a PNG with 8 or 16 bit grey or 8 bit colour, without alpha or palette"
 # Bounds the time that a stream of empty chunks costs. In libpng's chunks of 8 KiB this many hold
-# 512 MB, the largest accepted picture without any compression.
+# 512 MB, the largest accepted image without any compression.
 _MAX_PNG_CHUNKS = 65536
 
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
@@ -61,7 +61,7 @@ _OTHERS = {
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class CodecHeader:
     """Header of an image whose structure is complete.
 
     Attributes
@@ -80,7 +80,7 @@ class PictureHeader:
     encoding: str
 
 
-def read_picture_header(data: memoryview) -> PictureHeader:
+def read_codec_header(data: memoryview) -> CodecHeader:
     """Read the header of an image and check its structure from the first byte to the last.
 
     Parameters
@@ -112,7 +112,7 @@ def read_picture_header(data: memoryview) -> PictureHeader:
     return header
 
 
-def _check_size(header: PictureHeader, size: int) -> None:
+def _check_size(header: CodecHeader, size: int) -> None:
     pixels = header.width * header.height
     declared = f"a {header.codec} of {header.width} x {header.height} pixels"
     if pixels == 0:
@@ -138,7 +138,7 @@ def _damaged_error(codec: str, what: str) -> MessageError:
 # -- PNG -----------------------------------------------------------------------------------------------
 
 
-def _read_png(data: memoryview) -> PictureHeader:
+def _read_png(data: memoryview) -> CodecHeader:
     chunks = _png_chunks(data)
     name, body = next(chunks)
     if name != b"IHDR" or len(body) != 13:
@@ -151,7 +151,7 @@ def _read_png(data: memoryview) -> PictureHeader:
     for name, _ in chunks:
         if name in _PNG_REFUSED:
             raise MessageError(f"a png with {_PNG_REFUSED[name]}", expected=_PNG_ACCEPTED)
-    return PictureHeader("png", width, height, encoding)
+    return CodecHeader("png", width, height, encoding)
 
 
 def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
@@ -177,8 +177,8 @@ def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 # -- JPEG ----------------------------------------------------------------------------------------------
 
 
-def _read_jpeg(data: memoryview) -> PictureHeader:
-    header: PictureHeader | None = None
+def _read_jpeg(data: memoryview) -> CodecHeader:
+    header: CodecHeader | None = None
     for marker, body, end in _jpeg_segments(data):
         if marker in _FRAMES:
             header = _jpeg_frame(marker, body)
@@ -213,7 +213,7 @@ def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
         position = end
 
 
-def _jpeg_frame(marker: int, body: memoryview) -> PictureHeader:
+def _jpeg_frame(marker: int, body: memoryview) -> CodecHeader:
     if len(body) < 6:
         raise _damaged_error("jpeg", "its header is too short")
     depth, height, width, components = struct.unpack_from(">BHHB", body)
@@ -225,7 +225,7 @@ def _jpeg_frame(marker: int, body: memoryview) -> PictureHeader:
     encoding = _JPEG_ENCODINGS.get(components)
     if encoding is None:
         raise MessageError(f"a jpeg with {components} components", expected=_JPEG_ACCEPTED)
-    return PictureHeader("jpeg", width, height, encoding)
+    return CodecHeader("jpeg", width, height, encoding)
 
 
 def _check_jpeg_scans(coded: memoryview) -> None:
