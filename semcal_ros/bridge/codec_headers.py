@@ -127,7 +127,7 @@ def _check_size(header: CodecHeader, size: int) -> None:
         )
 
 
-def _damaged_error(codec: str, what: str) -> MessageError:
+def _make_damage_error(codec: str, what: str) -> MessageError:
     return MessageError(
         f"a damaged {codec}: {what}",
         expected="a whole one",
@@ -139,10 +139,10 @@ def _damaged_error(codec: str, what: str) -> MessageError:
 
 
 def _read_png(data: memoryview) -> CodecHeader:
-    chunks = _png_chunks(data)
+    chunks = _read_png_chunks(data)
     name, body = next(chunks)
     if name != b"IHDR" or len(body) != 13:
-        raise _damaged_error("png", "its header is missing")
+        raise _make_damage_error("png", "its header is missing")
     width, height, depth, colour = struct.unpack_from(">IIBB", body)
     encoding = _PNG_ENCODINGS.get((colour, depth))
     if encoding is None:
@@ -154,24 +154,24 @@ def _read_png(data: memoryview) -> CodecHeader:
     return CodecHeader("png", width, height, encoding)
 
 
-def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+def _read_png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Yield the name and content of each chunk except the end chunk."""
     position = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PNG_CHUNKS):
         if position + 12 > len(data):
-            raise _damaged_error("png", "it is truncated")
+            raise _make_damage_error("png", "it is truncated")
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 8 + length
         if end + 4 > len(data):
-            raise _damaged_error("png", "it is truncated")
+            raise _make_damage_error("png", "it is truncated")
         if zlib.crc32(data[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise _damaged_error("png", "a checksum is wrong")
+            raise _make_damage_error("png", "a checksum is wrong")
         name = bytes(data[position + 4 : position + 8])
         if name == b"IEND":
             return
         yield name, data[position + 8 : end]
         position = end + 4
-    raise _damaged_error("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
+    raise _make_damage_error("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
 
 
 # -- JPEG ----------------------------------------------------------------------------------------------
@@ -179,26 +179,26 @@ def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 def _read_jpeg(data: memoryview) -> CodecHeader:
     header: CodecHeader | None = None
-    for marker, body, end in _jpeg_segments(data):
+    for marker, body, end in _read_jpeg_segments(data):
         if marker in _FRAMES:
-            header = _jpeg_frame(marker, body)
+            header = _find_jpeg_frame(marker, body)
         elif marker == _SOS:
             _check_jpeg_scans(data[end:])
             break
     if header is None:
-        raise _damaged_error("jpeg", "its header is missing")
+        raise _make_damage_error("jpeg", "its header is missing")
     return header
 
 
-def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
+def _read_jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
     """Yield the marker, content and end of each segment up to the first scan."""
     position = 2
     while True:
         if position + 4 > len(data):
-            raise _damaged_error("jpeg", "it is truncated")
+            raise _make_damage_error("jpeg", "it is truncated")
         marker = data[position + 1]
         if data[position] != 0xFF or marker in (0x00, _EOI):
-            raise _damaged_error("jpeg", "a marker is missing")
+            raise _make_damage_error("jpeg", "a marker is missing")
         if marker == 0xFF:  # filling
             position += 1
             continue
@@ -208,14 +208,14 @@ def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
         (length,) = struct.unpack_from(">H", data, position + 2)
         end = position + 2 + length
         if length < 2 or end > len(data):
-            raise _damaged_error("jpeg", "it is truncated")
+            raise _make_damage_error("jpeg", "it is truncated")
         yield marker, data[position + 4 : end], end
         position = end
 
 
-def _jpeg_frame(marker: int, body: memoryview) -> CodecHeader:
+def _find_jpeg_frame(marker: int, body: memoryview) -> CodecHeader:
     if len(body) < 6:
-        raise _damaged_error("jpeg", "its header is too short")
+        raise _make_damage_error("jpeg", "its header is too short")
     depth, height, width, components = struct.unpack_from(">BHHB", body)
     if marker not in _HUFFMAN_FRAMES or depth != 8:
         kind = "" if marker in _HUFFMAN_FRAMES else "lossless, hierarchical or arithmetic-coded "
@@ -232,6 +232,6 @@ def _check_jpeg_scans(coded: memoryview) -> None:
     # In coded data a byte 0xFF is followed by 0 or a restart number, so these two are never pixels.
     scans = bytes(coded)
     if scans.rfind(bytes((0xFF, _EOI))) < 0:
-        raise _damaged_error("jpeg", "it is truncated")
+        raise _make_damage_error("jpeg", "it is truncated")
     if scans.count(bytes((0xFF, _SOS))) >= _MAX_SCANS:
-        raise _damaged_error("jpeg", f"it has more than {_MAX_SCANS} scans")
+        raise _make_damage_error("jpeg", f"it has more than {_MAX_SCANS} scans")

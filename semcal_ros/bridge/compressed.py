@@ -103,7 +103,7 @@ def _agree_on_encoding(text: str, header: CodecHeader) -> tuple[str, bool]:
     """Return the encoding of the image, and whether its decoded channels must be reversed."""
     original, codec, target = _parse_format(text)
     if codec and codec != header.codec:
-        raise _contradiction(text, header)
+        raise _make_contradiction(text, header)
     if not original:
         return header.encoding, False
     if original in ("bgr8", "rgb8") and header.encoding == "bgr8":
@@ -113,7 +113,7 @@ def _agree_on_encoding(text: str, header: CodecHeader) -> tuple[str, bool]:
     if original == "mono16" and (header.codec, target) == ("jpeg", "mono8"):
         original = "mono8"
     if original != header.encoding:
-        raise _contradiction(text, header)
+        raise _make_contradiction(text, header)
     return original, False
 
 
@@ -135,7 +135,7 @@ def _parse_format(text: str) -> tuple[str, str, str]:
     return original, codec, words[2] if len(words) == 3 else ""
 
 
-def _contradiction(text: str, header: CodecHeader) -> MessageError:
+def _make_contradiction(text: str, header: CodecHeader) -> MessageError:
     return MessageError(
         f"a compressed image of format {text[:60]!r} whose data are {header.encoding} as {header.codec}",
         expected="data as the format says",

@@ -51,16 +51,16 @@ def command(
     """
     found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
     if as_json:
-        echo_json({"findings": [_as_dict(finding) for finding in found], **_counts(found)})
+        echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})
     else:
         for finding in found:
             click.echo(f"{finding.level.value:<8} {finding}")
-        click.echo(", ".join(f"{count} {name}" for name, count in _counts(found).items()))
+        click.echo(", ".join(f"{count} {name}" for name, count in _count_levels(found).items()))
     if any(finding.level is Severity.PROBLEM for finding in found):
         sys.exit(1)
 
 
-def _counts(found: list[Finding]) -> dict[str, int]:
+def _count_levels(found: list[Finding]) -> dict[str, int]:
     levels = [finding.level for finding in found]
     return {
         "problems": levels.count(Severity.PROBLEM),

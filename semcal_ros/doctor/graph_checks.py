@@ -113,7 +113,10 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
     subscriptions = graph.subscriptions.get(topic.name, ())
     if not publishers and not topic.is_input:
         return []
-    found = [*_types(topic, publishers, "published"), *_types(topic, subscriptions, "expected")]
+    found = [
+        *_check_types(topic, publishers, "published"),
+        *_check_types(topic, subscriptions, "expected"),
+    ]
     senders = [p for p in publishers if p.type == topic.type]
     listeners = [s for s in subscriptions if s.type == topic.type]
     if not publishers:
@@ -122,25 +125,25 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
         found.append(
             problem(
                 topic.name,
-                f"{_nodes(senders)} publish on it",
+                f"{_format_nodes(senders)} publish on it",
                 expected="one publisher",
                 do="stop all but one, or remap the topic of the others",
             )
         )
-    found += _qualities(topic, senders, listeners)
+    found += _check_qualities(topic, senders, listeners)
     if not found:
-        heard = f"heard by {_nodes(listeners)}" if listeners else "nobody listens"
-        sent = f"{topic.type} by {_nodes(senders)} ({senders[0].quality})"
+        heard = f"heard by {_format_nodes(listeners)}" if listeners else "nobody listens"
+        sent = f"{topic.type} by {_format_nodes(senders)} ({senders[0].quality})"
         made = note if topic.is_input and not listeners else ok
         found.append(made(topic.name, f"{sent}, {heard}"))
     return found
 
 
-def _nodes(endpoints: list[Endpoint]) -> str:
+def _format_nodes(endpoints: list[Endpoint]) -> str:
     return ", ".join(dict.fromkeys(e.node for e in endpoints))
 
 
-def _types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
+def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
     for end in ends:
         if end.type != topic.type:
             change = (
@@ -173,7 +176,7 @@ def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
     )
 
 
-def _qualities(
+def _check_qualities(
     topic: Topic, senders: list[Endpoint], listeners: list[Endpoint]
 ) -> Iterator[Finding]:
     for sender in senders:

@@ -46,7 +46,7 @@ def rate_hz(arrivals: tuple[Arrival, ...]) -> float | None:
     return (len(arrivals) - 1) * 1e9 / span_ns if span_ns > 0 else None
 
 
-def _rate(arrivals: tuple[Arrival, ...]) -> str:
+def _format_rate(arrivals: tuple[Arrival, ...]) -> str:
     rate = rate_hz(arrivals)
     return "one" if rate is None else f"{rate:.3g} Hz"
 
@@ -67,10 +67,8 @@ def check_images(topic: Topic, session: Session) -> list[Finding]:
         ]
     image = session.image
     if image is None:
-        return [ok("images", f"{_rate(arrivals)} of {topic.type}")]
-    seen = (
-        f"{_rate(arrivals)}, {image.width} x {image.height} {image.encoding}, {image.bytes} bytes"
-    )
+        return [ok("images", f"{_format_rate(arrivals)} of {topic.type}")]
+    seen = f"{_format_rate(arrivals)}, {image.width} x {image.height} {image.encoding}, {image.bytes} bytes"
     if image.trouble:
         return [problem("images", f"{seen}: {image.trouble}")]
     return [ok("images", seen)]
@@ -156,10 +154,10 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
     age_s = median(
         (a.received_ns - stamp) * 1e-9 for a, stamp in zip(arrivals, stamps, strict=True)
     )
-    return [*found, _age(age_s, bool(session.graph.publishers.get("/clock")))]
+    return [*found, _check_age(age_s, bool(session.graph.publishers.get("/clock")))]
 
 
-def _age(age_s: float, replay: bool) -> Finding:
+def _check_age(age_s: float, replay: bool) -> Finding:
     if abs(age_s) > _OTHER_CLOCK_S:
         seen = f"stamps are {abs(age_s) / 3600:.3g} h {'old' if age_s > 0 else 'in the future'}: from another clock"
         if replay:
@@ -231,7 +229,7 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
                 do="see its diagnostics below",
             )
         ]
-    seen = f"{_rate(made)} for {_rate(taken)} of images"
+    seen = f"{_format_rate(made)} for {_format_rate(taken)} of images"
     # Either count may miss one message at each end of the interval.
     if len(made) + 2 < 0.8 * len(taken):
         return [

@@ -73,7 +73,7 @@ def _check_factor(factor: float, display_width_m: float) -> None:
         )
 
 
-def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
+def _remove_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
     """Return the collected views without those that the calibration left out."""
     if not result.outliers:
         return collected
@@ -112,7 +112,7 @@ def calibrate_found(
         on_stage=lambda name, part: on_stage(name, 0.95 * part),
     )
     on_stage("summary", 0.95)
-    collected = _without_outliers(collected, result)
+    collected = _remove_outliers(collected, result)
     warnings = list(result.warnings)
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         warnings.append(

@@ -201,9 +201,7 @@ class _ImagesInMemory(Recording):
 
     def __init__(self, source: Iterable[tuple[Any, ...]], config: MicroscopeConfig) -> None:
         super().__init__(Path("memory"), config)
-        self._recorded = [
-            _recorded_frame(index, entry, config) for index, entry in enumerate(source)
-        ]
+        self._recorded = [_make_frame(index, entry, config) for index, entry in enumerate(source)]
 
     @property
     def frame_count(self) -> int:
@@ -213,7 +211,7 @@ class _ImagesInMemory(Recording):
         yield from self._recorded
 
 
-def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig) -> RecordedFrame:
+def _make_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig) -> RecordedFrame:
     if not isinstance(entry, tuple | list) or len(entry) not in (2, 3):
         raise InvalidValueError(
             f"image {index} without a magnification",

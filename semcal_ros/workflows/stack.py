@@ -190,9 +190,9 @@ def stack(
             on_first=lambda frame: _check_output(output, frame),
             on_frame=count_frames(on_progress, "drift" if drift else "reading", opened.frame_count),
         )
-        used = _usable(selection)
+        used = _choose_usable(selection)
         summed = Stack(selection.size, interpolation)
-        grey = _video_levels(selection)
+        grey = _choose_video_levels(selection)
         with open_video(film_path, selection.size, len(selection.indices), fps, grey) as film:
             _add_frames(opened, model, selection, used, summed, film, on_progress)
         notes = opened.notes
@@ -235,7 +235,7 @@ def _check_output(output: str | os.PathLike[str] | None, frame: RecordedFrame) -
         )
 
 
-def _usable(selection: FrameSelection) -> Mask:
+def _choose_usable(selection: FrameSelection) -> Mask:
     """Return which of the chosen frames go into the average, (n,) bool."""
     if selection.path is None:
         return np.ones(len(selection.indices), dtype=bool)
@@ -273,10 +273,10 @@ def _add_frames(
         if used[number]:
             summed.add(image, valid)
         if film is not None:
-            film.write(image, _caption(selection.times_s, number, bool(used[number])))
+            film.write(image, _format_caption(selection.times_s, number, bool(used[number])))
 
 
-def _video_levels(selection: FrameSelection) -> tuple[float, float]:
+def _choose_video_levels(selection: FrameSelection) -> tuple[float, float]:
     """Return the grey levels that are shown as black and white."""
     if selection.dtype == np.uint8 or not selection.levels:
         return 0.0, 255.0
@@ -284,7 +284,7 @@ def _video_levels(selection: FrameSelection) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
+def _format_caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
     """Format the number and time of a frame."""
     text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
     return text if used else f"{text}  not tracked"

@@ -325,7 +325,7 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
             f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range there, "
             "calibrate with this breakpoint"
         )
-    if not adjustment.settled:
+    if not adjustment.converged:
         warnings.append("the choice of the number of coefficients did not converge")
     details = {
         "iterations": result.iterations,

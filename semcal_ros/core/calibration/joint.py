@@ -58,7 +58,7 @@ __all__ = [
 
 RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
-# Rounds of choosing the numbers of coefficients. A choice that alternates never settles; the
+# Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
@@ -84,7 +84,7 @@ _COARSE = 1e-6
 _MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
 # RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
 # the noise of good corners.
-_FIELD_SETTLED_PX = 1e-3
+_FIELD_CONVERGED_PX = 1e-3
 # Largest start of rho, 1/m. The depth gradient of weakly tilted views is noisy, and a pivot nearer
 # than 5 mm would be noise.
 _MAX_START_RHO = 200.0
@@ -102,14 +102,14 @@ class FittedField:
         Its strength, and the result of cross-validation.
     system
         The reduced system at the solution, from which magnifications can be left out.
-    settled
+    converged
         Whether camera and field stopped changing.
     """
 
     field: ResidualField
     choice: FieldChoice
     system: FieldSystem
-    settled: bool
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Adjustment:
         The adjustment that gave their coefficients.
     rounds
         Number of times that the numbers of coefficients were chosen.
-    settled
+    converged
         Whether the last choice was the same as that of the round before.
     """
 
@@ -132,7 +132,7 @@ class Adjustment:
     problem: Problem
     result: BundleResult
     rounds: int
-    settled: bool
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -287,12 +287,12 @@ def _select_and_adjust(
     """Choose the number of coefficients of every function until the choice no longer changes."""
     problem = build_problem(setup, functions, setup.views, height_sigma_m)
     result = refine(problem, replace(state, theta=stack_coefficients(functions)), tolerance=_COARSE)
-    settled, rounds = len(setup.magnifications) < 3, 0
-    while rounds < _MAX_ROUNDS and not settled:
+    converged, rounds = len(setup.magnifications) < 3, 0
+    while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
         chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
-        settled = chosen == sizes
-        if settled:
+        converged = chosen == sizes
+        if converged:
             break
         sizes = chosen
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
@@ -301,7 +301,7 @@ def _select_and_adjust(
             problem, replace(result.state, theta=stack_coefficients(functions)), tolerance=_COARSE
         )
     functions = with_coefficients(functions, result.state.theta)
-    return Adjustment(functions, problem, result, rounds, settled)
+    return Adjustment(functions, problem, result, rounds, converged)
 
 
 def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
@@ -340,7 +340,7 @@ def _add_field(
         pairs = zip(before.views, after.views, strict=True)
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
         before = after
-        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
+        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_CONVERGED_PX:
             return adjustment, FittedField(field, choice, system, True)
     return adjustment, FittedField(field, choice, system, False)
 

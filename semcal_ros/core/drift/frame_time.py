@@ -92,7 +92,7 @@ class FrameTimeEstimate:
     chi2_per_dof
         Robust mean square of the normalised residuals; near 1 where all is as stated.
     converged
-        Whether the iterated weights settled.
+        Whether the iterated weights converged.
     observable
         Whether the estimate can be relied on.
     reason
@@ -249,7 +249,7 @@ def _observe(path: DriftPath, update: DriftUpdate, mean: _KeyframeMean) -> tuple
 
 @dataclass(frozen=True)
 class _Fit:
-    """T and its 1-sigma, s; the robust mean square of the residuals; whether the weights settled."""
+    """T and its 1-sigma, s; the robust mean square of the residuals; whether the weights converged."""
 
     time_s: float
     sigma_s: float

@@ -19,9 +19,9 @@ from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
-    carry_covariance,
     centre_covariance,
     scale_covariance,
+    zoom_covariance,
 )
 from semcal_ros.core.drift.estimates import (
     DriftPredictor,
@@ -460,7 +460,7 @@ class DriftTracker:
         """
         before, now = track.store[measure.key].frame.camera, frame.camera
         assert before is not None and now is not None
-        noise = carry_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
+        noise = zoom_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
         key = _rekey(track, frame, match, measure, noise)
         return measure_itself(key, measure, match.removed)
 

@@ -15,10 +15,10 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
-    carry_covariance,
     centre_covariance,
     relative_scale_sigma,
     scale_covariance,
+    zoom_covariance,
 )
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
@@ -450,7 +450,7 @@ def test_a_camera_that_is_known_exactly_leaves_nothing_open() -> None:
     for exact in (None, camera):
         np.testing.assert_array_equal(scale_covariance(exact, np.ones(2), np.ones(2)), 0.0)
         assert relative_scale_sigma(exact) == 0.0
-    np.testing.assert_array_equal(carry_covariance(camera, small_camera(3000.0)), 0.0)
+    np.testing.assert_array_equal(zoom_covariance(camera, small_camera(3000.0)), 0.0)
 
 
 def test_a_zoom_about_a_wrong_principal_point_is_an_apparent_step() -> None:
@@ -483,7 +483,7 @@ def test_the_principal_point_is_as_uncertain_as_its_camera_says() -> None:
     covariance = np.zeros((10, 10))
     covariance[3:5, 3:5] = [[4.0, 1.2], [1.2, 2.25]]
     pair = [replace(small_camera(g), covariance=covariance) for g in (2000.0, 3400.0)]
-    np.testing.assert_array_equal(carry_covariance(*pair), 0.0)
+    np.testing.assert_array_equal(zoom_covariance(*pair), 0.0)
 
 
 def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() -> None:
@@ -498,4 +498,4 @@ def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() ->
     for camera in cameras:
         way = np.linalg.solve(camera.ideal_from_sem_jacobian, [95.5 - 60.0, 95.5 - 140.0])
         expected += 0.01**2 * np.outer(way, way)
-    np.testing.assert_allclose(carry_covariance(*cameras), expected, rtol=1e-9)
+    np.testing.assert_allclose(zoom_covariance(*cameras), expected, rtol=1e-9)
