@@ -16,6 +16,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.failures import MatchFailure
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, lattice, noisy, small_camera
 
 TIMING = ScanTiming(0.9, 1, 0.1)
@@ -154,6 +155,17 @@ def test_a_move_of_the_stage_is_not_drift() -> None:
     assert moved.status_text.startswith("coasting: ")
     assert float(np.max(np.abs(run.errors_px[-1]))) < 1.0
     assert run.step(5).status_text == "tracked"
+
+
+@pytest.mark.parametrize("jump", [(70.0, 0.0), (0.0, -70.0)])
+def test_a_jump_along_one_axis_is_a_move_of_the_stage(jump: tuple[float, float]) -> None:
+    texture, tracker = Texture(4), DriftTracker(DriftSettings(max_jump=0.3))
+    for k in range(5):
+        tracker.update(noisy(texture.view((0.2 * k, 0.0), 160), 4.0, k), float(k))
+    update = tracker.update(noisy(texture.view(jump, 160), 4.0, 9), 5.0)
+    assert update.rejection is not None
+    # 70 of 160 px is more than 0.3 of the width.
+    assert update.rejection.status is MatchFailure.STAGE_MOVE
 
 
 def test_goes_on_at_another_place_after_a_while() -> None:

@@ -91,6 +91,19 @@ def test_averaged_scans_shear_by_one_pass_only() -> None:
     assert middle[0, 0] == pytest.approx(SIZE / 2, abs=0.01)
 
 
+def test_averaged_scans_bend_by_the_mean_over_their_passes() -> None:
+    acceleration = np.array([6.0, -4.0])
+    timing = ScanTiming(0.4, averages=5, flyback_fraction=0.1)
+    xy = _grid(7, 5) * 20.0
+    size = (140, 100)
+    raw = raw_from_output(xy, size, None, RasterDrift(STILL, STILL, acceleration), timing)
+    # Each pass by itself, as a scan of its own.
+    single = ScanTiming(0.4, flyback_fraction=0.1).pixel_offset_s(raw[:, 1], raw[:, 0], 100, 140)
+    since_s = single[:, None] + 0.4 * np.arange(5) - 1.0
+    expected = xy + 0.5 * acceleration * np.mean(since_s**2, axis=1)[:, None]
+    np.testing.assert_allclose(raw, expected, atol=1e-4)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.floats(-0.05, 0.05),
