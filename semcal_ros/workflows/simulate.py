@@ -82,8 +82,9 @@ def plan_recording(
     chosen = check_positives(magnifications, "magnifications")
     wanted = _MAGNIFICATIONS.get(kind, len(chosen))
     if chosen and len(chosen) != wanted:
+        listed = ", ".join(f"{g:g}" for g in chosen)
         raise InvalidValueError(
-            f"{len(chosen)} magnifications for the plan {kind}", expected=f"{wanted} or none"
+            f"plan {kind} with magnifications {listed}", expected=f"{wanted} of them, or none"
         )
     if kind == "grid":
         plan = calibration_plan(

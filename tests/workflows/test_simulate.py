@@ -46,8 +46,8 @@ def test_every_plan_has_its_defaults(kind, frames):
     ("kind", "arguments", "reason"),
     [
         ("film", {}, "one of grid, drift"),
-        ("drift", {"magnifications": (1.0, 2.0)}, "2 magnifications for the plan drift"),
-        ("zoom", {"magnifications": (1.0,)}, "expected 2 or none"),
+        ("drift", {"magnifications": (1.0, 2.0)}, "plan drift with magnifications 1, 2"),
+        ("zoom", {"magnifications": (1.0,)}, "expected 2 of them, or none"),
         ("steps", {"magnifications": (-1.0,)}, "magnifications: -1"),
         ("steps", {"specimen": "cat"}, "specimen 'cat'"),
         ("zoom", {"drift": "no"}, "drift preset 'no'"),
