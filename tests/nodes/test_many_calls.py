@@ -128,8 +128,8 @@ def test_every_call_is_answered(
 
     for node, process in zip((CALIBRATION_SERVER, PARAMETER_SERVER), nodes, strict=True):
         assert process.process.poll() is None
-        before = len(peers[0]._diagnostics)
-        peers[0].wait_for(lambda b=before: len(peers[0]._diagnostics) > b, "a report")
+        before = len(peers[0].diagnostics)
+        peers[0].wait_for(lambda b=before: len(peers[0].diagnostics) > b, "a report")
         assert peers[0].state(node)
     received = int(peers[0].state(CALIBRATION_SERVER)["received"])
     peers[0].wait_for(

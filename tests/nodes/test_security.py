@@ -121,7 +121,8 @@ def names(found: list[tuple[str, list[str]]]) -> list[str]:
 def test_the_policy_grants_a_node_what_it_uses_and_no_more(node: str, tmp_path: Path) -> None:
     granted = GRANTED[f"/sem/{node}"]
     needed = granted.all - SOMETIMES
-    with peer("peer", {}) as observer, running(node, parameters_of(node, tmp_path)):
+    # Each executable is started here as a user starts it.
+    with peer("peer", {}) as observer, running(node, parameters_of(node, tmp_path), cold=True):
         # Its last entity is made before it reports.
         observer.wait_for(lambda: observer.state(f"/sem/{node}"), f"{node} to report")
         known = observer.node.get_node_names_and_namespaces
