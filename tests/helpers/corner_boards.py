@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import Rejection
+from tests.helpers.made_once import made_once
 
 
 @dataclass(frozen=True)
@@ -198,3 +200,10 @@ def rejected(image: NDArray[Any]) -> Rejection[LatticeStatus]:
     detection = find_lattice(image)
     assert isinstance(detection, Rejection)
     return detection
+
+
+def seen_photograph(path: Path) -> LatticeDetection:
+    """The lattice of a photograph of the reference data, found once in a run."""
+    return made_once(
+        f"photograph-{path.stem}", lambda: detected(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    )
