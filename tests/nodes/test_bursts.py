@@ -248,7 +248,7 @@ def test_a_recording_that_is_played_too_fast(
 ) -> None:
     """What the node could not follow is counted, and the last frame of the recording comes out."""
     # All the same: a magnification that was lost on the way is sent again later than its frame.
-    magnifications = [2000.0] * 60
+    magnifications = [2000.0] * 150
     # Large enough for the node to be busy when the next one comes, slow enough for it to get the first one.
     pictures = write_recording(tmp_path / "bag", magnifications, size=512)
     images = peer.collect(Image, "image_rect")
