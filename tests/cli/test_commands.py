@@ -56,11 +56,13 @@ def test_the_display_width_is_that_of_the_calibration(folder, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == plain
 
 
+@pytest.mark.slow
 def test_calibration_and_report_are_there(folder):
     assert (folder / "cal.yaml").read_text().startswith("# Calibration")
     assert "<html" in (folder / "r.html").read_text()
 
 
+@pytest.mark.slow
 def test_calibration_agrees_with_the_truth(folder, capsys):
     truth = json.loads((folder / "grid" / "truth.json").read_text())
     for row in truth["parameters"]:
@@ -74,6 +76,7 @@ def test_calibration_agrees_with_the_truth(folder, capsys):
         assert min(answer["projection_sigma_px"]) > 0
 
 
+@pytest.mark.slow
 def test_at_flags_extrapolation(folder, capsys):
     assert run("at", folder / "cal.yaml", 9000) == 0
     captured = capsys.readouterr()
@@ -100,6 +103,7 @@ def test_evaluate_on_views_that_were_not_used(folder, capsys):
         assert json.loads(capsys.readouterr().out)["views"] == 2
 
 
+@pytest.mark.slow
 def test_rectify_pairs_every_image_with_a_camera_info(folder):
     out = folder / "zoom_rect"
     assert run("rectify", folder / "zoom", "--calibration", folder / "cal.yaml", "-o", out) == 0
@@ -118,6 +122,7 @@ def test_rectify_pairs_every_image_with_a_camera_info(folder):
     assert projections[-1][0, 0] / projections[0][0, 0] == pytest.approx(4.0, rel=0.02)
 
 
+@pytest.mark.slow
 def test_drift_follows_the_truth(folder):
     table = folder / "drift.csv"
     assert run("drift", folder / "gold", "--calibration", folder / "cal.yaml", "-o", table) == 0
@@ -134,6 +139,7 @@ def test_drift_follows_the_truth(folder):
     assert all(float(r["sigma_x_m"]) > 0 for r in rows[1:])
 
 
+@pytest.mark.slow
 def test_info_counts(folder, capsys):
     assert run("info", folder / "zoom") == 0
     out = capsys.readouterr().out
@@ -211,6 +217,7 @@ def _file(path: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_an_existing_output_is_not_touched(folder, tmp_path, capsys):
     before = sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir())
     line = refused(
@@ -226,6 +233,7 @@ def test_an_existing_output_is_not_touched(folder, tmp_path, capsys):
     assert sorted((p.name, p.stat().st_size) for p in (folder / "zoom").iterdir()) == before
 
 
+@pytest.mark.slow
 def test_the_module_is_the_command(folder):
     done = subprocess.run(
         [sys.executable, "-m", "semcal_ros", "at", str(folder / "cal.yaml"), "1e3"],

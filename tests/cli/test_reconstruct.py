@@ -72,6 +72,7 @@ def test_the_ball_comes_out(folder, capsys):
     assert b"comment unit nm" in (folder / "c.ply").read_bytes()[:200]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("output", "reason"),
     [("ball.obj", "ball.obj"), ("missing/ball.ply", "no folder")],
@@ -83,6 +84,7 @@ def test_outputs_are_checked_before_any_work(folder, capsys, output, reason):
     assert reason in line
 
 
+@pytest.mark.slow
 def test_a_specimen_that_does_not_turn_is_refused(folder, capsys):
     options = ("--calibration", folder / "cal.yaml", "-o", folder / "flat.ply")
     assert run("reconstruct", folder / "grid", *options) == 2

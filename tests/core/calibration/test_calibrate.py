@@ -171,5 +171,5 @@ def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
     views = grid_views(microscope.camera_at, [1000.0], views=2)
     blind = replace(microscope.camera_at(1000.0), xi_r=-50.0, ex=5000.0)
     assert not np.isfinite(blind.undistort(views[0].image_xy)).any()
-    with pytest.raises(CalibrationError, match="can undistort 0 corners"):
+    with pytest.raises(CalibrationError, match="can undistort only 0 corners"):
         fit_poses(views, lambda _: blind)

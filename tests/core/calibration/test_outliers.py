@@ -35,6 +35,7 @@ def _misnamed(views, index, factor):
 
 
 # Too large and too small are found from the same residuals: each microscope shows one of them.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "factor"), [("jsm820", 1.06), ("parallel", 0.94), ("strong_perspective", 1.06)]
 )
@@ -51,6 +52,7 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor):
         np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed"),
     [("jsm820", 0), ("jsm820", 1), ("pincushion", 0), ("spiral", 0), ("parallel", 0)],
@@ -61,6 +63,7 @@ def test_ordinary_views_stay(name, seed):
     assert result.outliers == () and len(result.views) == 28
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_scale_is_not_a_matter_of_single_views():
     views = [
         replace(v, board_xy_m=v.board_xy_m / 1.03) if v.magnification > 3000.0 else v

@@ -16,6 +16,8 @@ from semcal_ros.synthetic.laws import Exponential
 from semcal_ros.synthetic.microscope import Residual
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
+pytestmark = pytest.mark.slow
+
 MICROSCOPES = {
     "spiral": preset("spiral"),
     "scan_nonlinear": preset("scan_nonlinear"),
