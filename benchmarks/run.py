@@ -12,7 +12,7 @@ calibration  calibration methods (joint with and without residual field, the pap
 coverage     how often the stated uncertainty of a calibration holds the truth
 drift        registration beside phase correlation, ECC, scikit-image, imreg_dft and pystackreg
              where they are installed, and the Cramer-Rao bound; the time of the tracker, and what
-             it leaves of a drift inside of the frames
+             it leaves of a drift inside the frames
 rectify      rectification beside a bare cv2.remap; its map beside the exact inverse
 live         one frame through core and node, and the stream over DDS, beside a bare remap and copy
 ===========  =======================================================================================

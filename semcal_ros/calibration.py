@@ -1,4 +1,4 @@
-"""What programs hold: a calibration with its file, its figure and its corrected pictures."""
+"""What programs hold: a calibration with its file, its figure and its corrected images."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Calibration(CalibrationModel):
         """
         write_calibration(self, path)
 
-    # -- cameras and pictures ---------------------------------------------------------------------
+    # -- cameras and images ---------------------------------------------------------------------
 
     @overload
     def at(self, magnification: float) -> ScanCamera: ...
@@ -94,7 +94,7 @@ class Calibration(CalibrationModel):
     def at(self, magnification: float | Iterable[float]) -> ScanCamera | tuple[ScanCamera, ...]:
         """The camera at a magnification, or the cameras at several.
 
-        Outside of :attr:`magnification_range` the functions go on along their tangents in log g,
+        Outside :attr:`magnification_range` the functions go on along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range.
 
         Parameters

@@ -41,7 +41,16 @@ def _claim_domain() -> tuple[int, int]:
     raise RuntimeError("all ROS domain ids are in use by other test runs; wait for them to end")
 
 
+def _share() -> None:
+    """One folder for all processes of this run (``tests/helpers/made_once.py``): the first makes it."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        shared = tempfile.mkdtemp(prefix="semcal-tests-")
+        atexit.register(shutil.rmtree, shared, ignore_errors=True)
+        os.environ["SEMCAL_TESTS_SHARED"] = shared
+
+
 def _isolate() -> int:
+    _share()
     domain_id, lock = _claim_domain()
     logs = tempfile.mkdtemp(prefix="semcal-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
@@ -52,6 +61,9 @@ def _isolate() -> int:
         MPLBACKEND="Agg",
         # As the executables do: threads of OpenBLAS would only wait for each other.
         OPENBLAS_NUM_THREADS="1",
+        # The tests share the processors already. Processes for one recording would each import all again,
+        # about 2 s of a processor; the test that needs several says so.
+        LOKY_MAX_CPU_COUNT="1",
     )
     # Other people's settings must not decide over the outcome of a test.
     for name in (

@@ -1,4 +1,4 @@
-"""The calibration as programs hold it: comparison, text, figure, cameras, pictures."""
+"""The calibration as programs hold it: comparison, text, figure, cameras, images."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""Registration of two noisy pictures beside other libraries and the Cramer-Rao bound.
+"""Registration of two noisy images beside other libraries and the Cramer-Rao bound.
 
 Gold on carbon, the chess grid, a fine random texture and a few bright particles, blurred by a beam of
 1 px sigma, are seen at exactly known shifts (pairs.py), given white noise and rounded to 8 or
-16 bits. Noise is stated in dB: 20 log10 of the picture's standard deviation over that of the noise.
+16 bits. Noise is stated in dB: 20 log10 of the image's standard deviation over that of the noise.
 
-The bound is that of a shift between two pictures which both have noise, computed from the scene
+The bound is that of a shift between two images which both have noise, computed from the scene
 alone: the inverse of sum(gradient gradient^T) / (2 sigma^2) over the pixels that overlap, sigma
 containing the rounding.
 
-Then the tracker: what a live stream costs, and what it leaves of a drift inside of the frames.
+Then the tracker: what a live stream costs, and what it leaves of a drift inside the frames.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from semcal_ros.synthetic import preset
 
 @dataclass(frozen=True)
 class Group:
-    """Pairs of pictures of one size; the noise changes from row to row."""
+    """Pairs of images of one size; the noise changes from row to row."""
 
     size: int
     large: bool
@@ -150,13 +150,13 @@ def tracking(sizes: tuple[int, ...], frames: int) -> None:
 
 
 def raster(timings: tuple[ScanTiming, ...], frames: int) -> None:
-    """What the correction leaves of a strong drift inside of the frames."""
+    """What the correction leaves of a strong drift inside the frames."""
     rows: list[list[object]] = []
     for timing in timings:
         result = drift_raster.raster_residual(timing=timing, frames=frames)
         rows += drift_raster.rows(result, f"{timing.frame_time_s:g} s, {timing.averages}")
     show(
-        f"Drift inside of the frame: gold at 20 000x, 512 x 512, {frames} frames without a pause",
+        f"Drift inside the frame: gold at 20 000x, 512 x 512, {frames} frames without a pause",
         drift_raster.HEADER,
         rows,
         "Distance in output px between where the corrected frame puts a point and where it belongs,",
@@ -177,7 +177,7 @@ def explain() -> None:
         "decides between repeats of the grid; findTransformECC and pystackreg begin at no shift, which\n"
         "decides it too where the shift is small. cost: (RMS/bound)^2 x time, the time in which averaging\n"
         "would reach the variance of the bound; a method that refuses or is wrong in more than 5 % of\n"
-        "the pairs fails. wins: least cost for a single pair, and for a further picture of a stream.\n"
+        "the pairs fails. wins: least cost for a single pair, and for a further image of a stream.\n"
         "The RMS of 10 pairs is itself only good to 16 %, that of 20 to 11 %."
     )
 

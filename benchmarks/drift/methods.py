@@ -1,4 +1,4 @@
-"""Ways to find the shift between two pictures, all called alike.
+"""Ways to find the shift between two images, all called alike.
 
 A method is given a :class:`~benchmarks.drift.pairs.Pair` and answers with the shift (x, y) and its 1-sigma
 where it states one, or None where it refuses. Libraries that are not installed leave a method
@@ -57,7 +57,7 @@ class Method:
     prepare
         Work that a stream does once for its reference; its time does not count.
     stream_only
-        The time is that of a further picture of a stream, not that of a pair.
+        The time is that of a further image of a stream, not that of a pair.
     """
 
     name: str
@@ -140,7 +140,7 @@ def _skimage(normalization: str | None) -> Callable[[Pair, None], Answer]:
 
 
 def imreg(pair: Pair, prepared: None) -> Answer:
-    # Odds of 0: the picture is never upside down, as its authors leave to be decided by the data.
+    # Odds of 0: the image is never upside down, as its authors leave to be decided by the data.
     found = imreg_dft.translation(pair.reference, pair.image, odds=0)
     return -np.asarray(found["tvec"], dtype=np.float64)[::-1], None
 

@@ -1,6 +1,6 @@
-"""Pairs of noisy pictures whose shift is exact, with the Cramer-Rao bound of each.
+"""Pairs of noisy images whose shift is exact, with the Cramer-Rao bound of each.
 
-A scene is drawn once on a grid finer than a pixel, far enough beyond the picture for every shift.
+A scene is drawn once on a grid finer than a pixel, far enough beyond the image for every shift.
 By definition it is the sum of one Gaussian beam per point of that grid, which is a function of the
 position like any other: a shifted view evaluates it at shifted pixels, and its gradient is a sum of
 derivatives of the same Gaussians. Nothing is interpolated, so the shift of a view is true to the
@@ -74,7 +74,7 @@ class Scene:
         return self._scale * np.stack(both).astype(np.float64)
 
     def bound_px(self, gradient: Array, shift: Shift, sigma: float) -> float:
-        """Cramer-Rao bound of one coordinate of a shift, RMS over both, where both pictures have
+        """Cramer-Rao bound of one coordinate of a shift, RMS over both, where both images have
         white noise of ``sigma``.
         """
         x, y = (round(s) for s in shift)
@@ -203,7 +203,7 @@ _DRAWN: dict[str, Callable[[int, int, int], Image]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """Two noisy pictures, the shift between them, its bound, and what a tracker would expect."""
+    """Two noisy images, the shift between them, its bound, and what a tracker would expect."""
 
     reference: Gray
     image: Gray
@@ -257,7 +257,7 @@ def small_shifts(count: int, rng: np.random.Generator) -> list[Shift]:
 
 
 def large_shifts(count: int, size: int, rng: np.random.Generator) -> list[Shift]:
-    """From a tenth to a third of the picture along both axes."""
+    """From a tenth to a third of the image along both axes."""
     lengths = rng.uniform(0.1 * size, size / 3.0, (count, 2)) * rng.choice([-1, 1], (count, 2))
     return [(float(x), float(y)) for x, y in lengths]
 

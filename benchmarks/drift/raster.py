@@ -1,4 +1,4 @@
-"""What is left of drift inside of a frame after the correction that a tracker's answer gives.
+"""What is left of drift inside a frame after the correction that a tracker's answer gives.
 
 The virtual microscope takes every pixel at its own time, so a drift that moves by several px during
 a frame shears and bends it. Where the corrected frame puts what a raw pixel saw is compared with
@@ -45,7 +45,7 @@ class FieldResidual:
     corrected
         (frames, points) with the tracker's drift and velocity.
     shifted
-        (frames, points) with its drift alone: what a correction of the whole picture leaves.
+        (frames, points) with its drift alone: what a correction of the whole image leaves.
     statuses
         Of the tracker, one per frame.
     moved_px

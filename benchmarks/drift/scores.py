@@ -125,7 +125,7 @@ def _stated(normalised: np.ndarray) -> dict[str, float]:
 
 
 def winners(scores: Iterable[Score]) -> dict[str, Method]:
-    """Whose cost is least, for a single ``pair`` and for a further picture of a ``stream``."""
+    """Whose cost is least, for a single ``pair`` and for a further image of a ``stream``."""
     able = [s for s in scores if s.cost == s.cost]
     tasks = {"pair": [s for s in able if not s.method.stream_only], "stream": able}
     return {task: min(few, key=lambda s: s.cost).method for task, few in tasks.items() if few}

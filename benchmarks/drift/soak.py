@@ -3,8 +3,8 @@
     python -m benchmarks.drift.soak [--frames 20000]
 
 A periodic random texture is shifted exactly, by the phase of its Fourier coefficients. The path
-leads out by 300 px of pictures that are 128 px wide, and back to where it began: over new ground,
-over some ten keyframes, and over the old ground again. Every picture has noise of its own.
+leads out by 300 px of images that are 128 px wide, and back to where it began: over new ground,
+over some ten keyframes, and over the old ground again. Every image has noise of its own.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The live stream: one frame inside of a process, and all of it over DDS."""
+"""The live stream: one frame inside a process, and all of it over DDS."""

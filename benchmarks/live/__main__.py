@@ -1,6 +1,6 @@
 """One frame from message to message, and the stream over DDS, beside the least that must be done.
 
-callback.py measures what happens inside of a process, stream.py what three processes see
+callback.py measures what happens inside a process, stream.py what three processes see
 of each other; this makes one table and a plot of both.
 """
 
@@ -113,7 +113,7 @@ def main() -> None:
     sizes = SIZES[:3] if options.quick else SIZES
     inside = callbacks(sizes, options.quick)
     show(
-        "Live, inside of a process: time as ratio to cv2.remap with maps at hand and one copy",
+        "Live, inside a process: time as ratio to cv2.remap with maps at hand and one copy",
         ["frames", "floor ms", *COLUMNS],
         inside,
         "core: Rectifier.rectify; node: from the message that has arrived to the messages published.",

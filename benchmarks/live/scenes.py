@@ -1,4 +1,4 @@
-"""The microscope, the calibration and the pictures of the live benchmarks."""
+"""The microscope, the calibration and the images of the live benchmarks."""
 
 from __future__ import annotations
 

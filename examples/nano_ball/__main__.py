@@ -5,7 +5,7 @@ calibrated, the ball is reconstructed with that calibration and compared with th
 seen.
 
     .venv/bin/python -m examples.nano_ball            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
-    .venv/bin/python -m examples.nano_ball --quick    # 120 frames
+    .venv/bin/python -m examples.nano_ball --quick    # 60 frames of one turn to and fro
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import INK, OURS, SECOND, create_figure, style_axes
 from semcal_ros.synthetic.drift import drift_preset
-from semcal_ros.synthetic.specimens.ball import BallPlan, ball_plan
+from semcal_ros.synthetic.specimens.ball import BallPlan, Turning, ball_plan
 
 GRID_MAGNIFICATIONS = (100, 500, 1000, 2000, 3000, 4500, 6000, 7500, 9000, 10000)
 CONFIG = """\
@@ -162,12 +162,16 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--frames", type=int, help="of the ball (default 2000)")
-    parser.add_argument("--quick", action="store_true", help="120 frames, a smaller calibration")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="60 frames of a simpler movement, a smaller calibration",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("nano_ball_output"))
     parser.add_argument("--images", type=Path, help="folder for the figures (default: the output)")
     given = parser.parse_args()
-    frames = given.frames or (120 if given.quick else 2000)
+    frames = given.frames or (60 if given.quick else 2000)
     out, images = given.output, given.images or given.output
     out.mkdir(parents=True, exist_ok=True)
     config = out / "strips.yaml"
@@ -184,7 +188,11 @@ def main() -> None:
     # Fewer frames are some of the same movement, not a faster one.
     interval_s = 0.1 * max(1.0, 2000 / frames)
     drift = drift_preset("settling")
-    plan = ball_plan(frames=frames, interval_s=interval_s, drift=drift, seed=given.seed)
+    # So few frames follow a simpler movement only: from one to the next, features must stay alike.
+    motion = Turning(frames * interval_s, rolls=1.0, yaws=1.0) if given.quick else None
+    plan = ball_plan(
+        frames=frames, interval_s=interval_s, motion=motion, drift=drift, seed=given.seed
+    )
     record(plan, out / "ball")
 
     # 3. Reconstruct.

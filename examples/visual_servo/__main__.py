@@ -9,7 +9,7 @@
     python -m examples.visual_servo [--quick] [--live | --replay] [--preset jsm820] [--drift slow] [--fixed-axis]
 
 With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
-With --replay the frames of the continuous case become a recording, which bag_player replays to the nodes: what
+With --replay the frames of the continuous case then become a recording, which bag_player replays to the nodes: what
 visual_servo says of each frame is compared with the truth.
 """
 
@@ -44,7 +44,10 @@ from semcal_ros.workflows.find_grid import find_views
 
 CONTINUOUS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0, 7500.0, 10000.0)
 DISCRETE = (500.0, 1000.0, 2000.0, 5000.0)
+QUICK = (250.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
 VIEWS = 4
+QUICK_VIEWS = 3
+QUICK_SIZE = 256
 STEPS = 7
 GOAL = PlanePose(3e-6, -2e-6, math.radians(5.0))
 START = Pose.flat((40e-6, -28e-6, 0.0), math.radians(22.0))
@@ -53,9 +56,12 @@ NEAR_PX = 1.0
 LAST = 5
 
 
-def calibrations(microscope: VirtualMicroscope, seed: int) -> tuple[Calibration, Calibration]:
+def calibrations(
+    microscope: VirtualMicroscope, seed: int, *, quick: bool
+) -> tuple[Calibration, Calibration]:
     """The continuous and the discrete calibration from one recording."""
-    plan = calibration_plan(microscope, magnifications=CONTINUOUS, views=VIEWS, seed=seed)
+    shown, views = (QUICK, QUICK_VIEWS) if quick else (CONTINUOUS, VIEWS)
+    plan = calibration_plan(microscope, magnifications=shown, views=views, seed=seed)
     frames = (
         (f"frame {i}", plan.render(i), frame.magnification) for i, frame in enumerate(plan.frames)
     )
@@ -148,10 +154,10 @@ def printed(results: dict[str, dict[str, object]]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer frames and magnifications")
+    parser.add_argument("--quick", action="store_true", help="fewer and smaller frames")
     parser.add_argument("--live", action="store_true", help="the nodes, over ROS")
     parser.add_argument(
-        "--replay", action="store_true", help="the recording, replayed to the nodes"
+        "--replay", action="store_true", help="the recording then replayed to the nodes"
     )
     parser.add_argument("--rate", type=float, default=1.0, help="of the replay")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="jsm820")
@@ -163,7 +169,9 @@ def main() -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     scope = preset(options.preset)
-    continuous, discrete = calibrations(scope, seed=options.seed + 1)
+    if options.quick and not options.live:
+        scope = scope.with_image_size(QUICK_SIZE, QUICK_SIZE)
+    continuous, discrete = calibrations(scope, options.seed + 1, quick=options.quick)
     print(f"calibrated {options.preset} ({time.monotonic() - began:.0f} s)", flush=True)
     continuous.save(options.output / "cal.yaml")
     if options.live:
@@ -176,12 +184,6 @@ def main() -> int:
         return 0
     settings = ServoSettings(axis_sigma_px=0.0) if options.fixed_axis else ServoSettings()
     task = Task(scope, START, GOAL, schedule(options.quick), options.drift, options.seed, settings)
-    if options.replay:
-        from examples.visual_servo.replay import replayed
-
-        run = servo_run(task, cases_of(scope, continuous, discrete)[-1])
-        replayed(options.output, run, scope, GOAL, options.rate)
-        return 0
     work = Parallel(n_jobs=min(cpu_count(), 3))
     cases = cases_of(scope, continuous, discrete)
     runs = work(delayed(servo_run)(task, case) for case in cases)
@@ -200,6 +202,10 @@ def main() -> int:
     print(
         f"{options.output}/results.json, {options.output}/visual_servo.png ({time.monotonic() - began:.0f} s)"
     )
+    if options.replay:
+        from examples.visual_servo.replay import replayed
+
+        replayed(options.output, runs[-1], scope, GOAL, options.rate)
     return 0
 
 

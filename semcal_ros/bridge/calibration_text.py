@@ -49,7 +49,7 @@ def fill_calibration_text(message: Any, text: str) -> None:
     try:
         size = len(text.encode("utf-8"))
     except UnicodeEncodeError as error:
-        raise InvalidValueError("a calibration text with half a character") from error
+        raise InvalidValueError("a calibration text with an incomplete character") from error
     if not text.strip() or size > MAX_TEXT_BYTES:
         raise InvalidValueError(
             f"a calibration text of {size} bytes", expected=f"1 to {MAX_TEXT_BYTES} bytes"

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.codec_headers import CodecHeader, read_codec_header
 from semcal_ros.bridge.fields import assign_bytes, require_fields
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.bridge.images import ENCODINGS, image_from_message
-from semcal_ros.bridge.picture_headers import PictureHeader, read_picture_header
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 __all__ = [
@@ -77,9 +77,9 @@ def image_from_compressed(message: Any) -> tuple[NDArray[Any], str]:
     """
     require_fields(message, ("format", "data"), "sensor_msgs/msg/CompressedImage")
     data = _read_bytes(message.data)
-    picture = read_picture_header(data.data)
-    encoding, swapped = _agree_on_encoding(str(message.format), picture)
-    image = _decode(data, picture)
+    header = read_codec_header(data.data)
+    encoding, swapped = _agree_on_encoding(str(message.format), header)
+    image = _decode(data, header)
     if swapped:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     image.flags.writeable = False
@@ -99,21 +99,21 @@ def _read_bytes(data: Any) -> NDArray[np.uint8]:
         ) from error
 
 
-def _agree_on_encoding(text: str, picture: PictureHeader) -> tuple[str, bool]:
+def _agree_on_encoding(text: str, header: CodecHeader) -> tuple[str, bool]:
     """Return the encoding of the image, and whether its decoded channels must be reversed."""
     original, codec, target = _parse_format(text)
-    if codec and codec != picture.codec:
-        raise _contradiction(text, picture)
+    if codec and codec != header.codec:
+        raise _make_contradiction(text, header)
     if not original:
-        return picture.encoding, False
-    if original in ("bgr8", "rgb8") and picture.encoding == "bgr8":
+        return header.encoding, False
+    if original in ("bgr8", "rgb8") and header.encoding == "bgr8":
         # Without a target, image_transport takes the channels for red, green, blue.
         got = "bgr" if target.startswith("bgr") else "rgb"
         return original, not original.startswith(got)
-    if original == "mono16" and (picture.codec, target) == ("jpeg", "mono8"):
+    if original == "mono16" and (header.codec, target) == ("jpeg", "mono8"):
         original = "mono8"
-    if original != picture.encoding:
-        raise _contradiction(text, picture)
+    if original != header.encoding:
+        raise _make_contradiction(text, header)
     return original, False
 
 
@@ -135,16 +135,16 @@ def _parse_format(text: str) -> tuple[str, str, str]:
     return original, codec, words[2] if len(words) == 3 else ""
 
 
-def _contradiction(text: str, picture: PictureHeader) -> MessageError:
+def _make_contradiction(text: str, header: CodecHeader) -> MessageError:
     return MessageError(
-        f"a compressed image of format {text[:60]!r} whose data are {picture.encoding} as {picture.codec}",
+        f"a compressed image of format {text[:60]!r} whose data are {header.encoding} as {header.codec}",
         expected="data as the format says",
         do="correct the publisher",
     )
 
 
-def _decode(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
-    pixel = ENCODINGS[picture.encoding]
+def _decode(data: NDArray[np.uint8], header: CodecHeader) -> NDArray[Any]:
+    pixel = ENCODINGS[header.encoding]
     channels = () if pixel.channels == 1 else (pixel.channels,)
     # Unchanged: no conversion of depth or colour, and no rotation by an orientation in the metadata.
     image: Any = None
@@ -152,17 +152,17 @@ def _decode(data: NDArray[np.uint8], picture: PictureHeader) -> NDArray[Any]:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         reason = " ".join(str(error).split())
-        raise MessageError(f"a {picture.codec} that cannot be decoded: {reason}") from error
+        raise MessageError(f"a {header.codec} that cannot be decoded: {reason}") from error
     if image is None:
         raise MessageError(
-            f"a {picture.codec} that cannot be decoded",
+            f"a {header.codec} that cannot be decoded",
             expected="an intact one",
             do="check the publisher or the recording",
         )
-    if image.shape != (picture.height, picture.width, *channels) or image.dtype != pixel.dtype:
+    if image.shape != (header.height, header.width, *channels) or image.dtype != pixel.dtype:
         raise MessageError(
-            f"a {picture.codec} that decodes to {image.dtype} of shape {image.shape}",
-            expected=f"{picture.width} x {picture.height} pixels {picture.encoding}, as its header says",
+            f"a {header.codec} that decodes to {image.dtype} of shape {image.shape}",
+            expected=f"{header.width} x {header.height} pixels {header.encoding}, as its header says",
         )
     decoded: NDArray[Any] = image
     return decoded

@@ -119,7 +119,7 @@ def _sigma_px(camera: ScanCamera) -> Array:
     sigma = np.linalg.norm(camera.project_sigma(camera.sem_from_ideal(pixels)), axis=1)
     if not np.all(np.isfinite(sigma)):
         raise InvalidValueError(
-            "a distortion without an answer at an image corner", expected="4 xi_r r2 below 1"
+            "a distortion that is undefined at an image corner", expected="4 xi_r r2 below 1"
         )
     return np.asarray(sigma, dtype=np.float64)
 

@@ -85,7 +85,7 @@ def _floats(values: ArrayLike, what: str) -> Array:
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidValueError(f"a {what} that is no array of numbers") from error
+        raise InvalidValueError(f"a {what} that is not an array of numbers") from error
 
 
 def _pair(values: ArrayLike, what: str) -> tuple[float, float]:

@@ -111,5 +111,5 @@ def new_nested(owner: Any, type_name: str, **fields: Any) -> Any:
             return found(**fields)
     raise MessageError(
         f"a message of class {module_name}.{type(owner).__name__}",
-        expected=f"a message of rclpy or rosbags, beside which {type_name} is defined",
+        expected=f"a message of rclpy or rosbags, whose package defines {type_name}",
     )

@@ -58,7 +58,7 @@ def projection_from_message(message: Any) -> Array:
     fits = values.ndim == 1 and 0 <= offset == values.size - 12
     if not (fits and np.all(np.isfinite(values[offset:]))):
         raise MessageError(
-            f"a projection of {values.size} numbers from number {offset} on",
+            f"a projection of {values.size} numbers from index {offset} on",
             expected="12 finite numbers, 3 rows of 4",
         )
     return values[offset:].reshape(3, 4)

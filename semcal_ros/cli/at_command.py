@@ -33,7 +33,7 @@ def command(calibration: Path, magnification: float, as_json: bool) -> None:
         _echo_camera(described)
 
 
-def _matrix(name: str, values: Any) -> str:
+def _format_matrix(name: str, values: Any) -> str:
     rows = [" ".join(f"{v:14.6g}" for v in row) for row in values]
     return "\n".join(f"{name if i == 0 else '':9}[{row}]" for i, row in enumerate(rows))
 
@@ -49,11 +49,11 @@ def _echo_camera(camera: dict[str, Any]) -> None:
     click.echo(f"  x            {x * 1e9:.4f} +- {sx * 1e9:.4f}")
     click.echo(f"  y            {y * 1e9:.4f} +- {sy * 1e9:.4f}")
     if camera["K"] is not None:
-        click.echo(_matrix("K", camera["K"]))
-        click.echo(_matrix("P", camera["P"]))
+        click.echo(_format_matrix("K", camera["K"]))
+        click.echo(_format_matrix("P", camera["P"]))
     else:
         click.echo("K, P         parallel projection: no finite focal length")
-    click.echo(_matrix("P_affine", camera["P_affine"]))
+    click.echo(_format_matrix("P_affine", camera["P_affine"]))
     click.echo(f"xi_r         {value['xi_r']:.6g} +- {sigma['xi_r']:.2g}")
     click.echo(f"xi_t         {value['xi_t']:.6g} +- {sigma['xi_t']:.2g}")
     click.echo(
@@ -64,5 +64,5 @@ def _echo_camera(camera: dict[str, Any]) -> None:
     if not camera["in_range"]:
         low, high = camera["magnification_range"]
         click.echo(
-            f"warning: outside of the calibrated range {low:g} to {high:g}: extrapolated", err=True
+            f"warning: outside the calibrated range {low:g} to {high:g}: extrapolated", err=True
         )

@@ -53,7 +53,9 @@ def _parse_untilted(
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
 @click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
 @click.option(
-    "--legendre", type=click.IntRange(0, 20), help="pda: Legendre degree instead of an ODE."
+    "--legendre",
+    type=click.IntRange(0, 20),
+    help="pda: fit Legendre polynomials of this degree instead of an ODE.",
 )
 @click.option(
     "--breakpoints",
@@ -66,7 +68,10 @@ def _parse_untilted(
     type=click.Choice(RESIDUAL_MODES),
     default="auto",
     show_default=True,
-    help="joint: a field for what the distortion parameters cannot describe.",
+    help="joint: whether to add a field for what the distortion parameters cannot describe.",
+)
+@click.option(
+    "--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a statistical test."
 )
 @click.option(
     "--untilted",
@@ -89,7 +94,6 @@ def _parse_untilted(
     metavar="LENGTH",
     help="1-sigma of the height of what is measured later above or below the untilted grid.",
 )
-@click.option("--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a test.")
 @click.option("--report", type=PATH, help="Also write an HTML report.")
 def command(
     recording: Path,

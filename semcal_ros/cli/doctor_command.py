@@ -22,19 +22,22 @@ __all__ = ["command"]
     "--calibration",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Check this one instead of that of the topic `calibration`.",
+    help="Calibration to check, instead of the one on the topic `calibration`.",
 )
 @click.option(
-    "--namespace", default="/sem", show_default=True, help="Of the suite's nodes and topics."
+    "--namespace",
+    default="/sem",
+    show_default=True,
+    help="Namespace of the suite's nodes and topics.",
 )
 @click.option(
     "--seconds",
     type=click.FloatRange(0.1, 3600.0),
     default=3.0,
     show_default=True,
-    help="How long to listen; more than one frame takes.",
+    help="How long to listen; choose more than one frame takes.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
     config: str, calibration: Path | None, namespace: str, seconds: float, as_json: bool
 ) -> None:
@@ -48,16 +51,16 @@ def command(
     """
     found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
     if as_json:
-        echo_json({"findings": [_as_dict(finding) for finding in found], **_counts(found)})
+        echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})
     else:
         for finding in found:
             click.echo(f"{finding.level.value:<8} {finding}")
-        click.echo(", ".join(f"{count} {name}" for name, count in _counts(found).items()))
+        click.echo(", ".join(f"{count} {name}" for name, count in _count_levels(found).items()))
     if any(finding.level is Severity.PROBLEM for finding in found):
         sys.exit(1)
 
 
-def _counts(found: list[Finding]) -> dict[str, int]:
+def _count_levels(found: list[Finding]) -> dict[str, int]:
     levels = [finding.level for finding in found]
     return {
         "problems": levels.count(Severity.PROBLEM),

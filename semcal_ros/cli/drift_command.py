@@ -31,15 +31,15 @@ __all__ = ["command"]
 @recording_argument
 @output_option("CSV file.")
 @calibration_option("Work in rectified coordinates.")
-@click.option("--plot", type=PATH, help="Figure as png, svg or pdf, too.")
+@click.option("--plot", type=PATH, help="Also draw a figure: .png, .svg or .pdf.")
 @click.option(
     "--forecast",
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="S",
-    help="Also print the drift that long after the last frame.",
+    help="Also forecast the drift this long after the last frame.",
 )
 @click.option(
-    "--live", is_flag=True, help="What was known live, without hindsight of later frames."
+    "--live", is_flag=True, help="Drift as known live, without hindsight from later frames."
 )
 @recording_options
 def command(

@@ -20,7 +20,7 @@ __all__ = ["command"]
 @click.option(
     "--databar-rows",
     type=click.IntRange(0),
-    help="Rows of text at the bottom, where the metadata do not tell (Zeiss).",
+    help="Rows of text at the bottom, if the metadata do not say (Zeiss).",
 )
 @config_option
 @overwrite_option

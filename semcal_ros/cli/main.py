@@ -44,7 +44,7 @@ class _Group(click.Group):
             raise SemcalError(
                 f"semcal {cmd_name} cannot be loaded ({error})",
                 expected="the packages of requirements/base.txt, in versions that fit each other",
-                do="run `make setup`, or install them anew",
+                do="run `make setup`, or reinstall them",
             ) from error
         command: click.Command = module.command
         return command

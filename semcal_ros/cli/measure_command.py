@@ -78,25 +78,27 @@ def command() -> None:
     "--poses",
     type=click.IntRange(1),
     metavar="N",
-    help="Each magnification has N poses with equally many frames, one after the other; "
-    "without, each frame is a pose.",
+    help="Number of poses at each magnification, with equally many frames each; "
+    "by default, each frame is a pose.",
 )
 @click.option(
     "--shape",
     type=click.Choice(SHAPES),
     default="free",
     show_default=True,
-    help="Of the bent beam: second and third order; a beam loaded at its end; second order.",
+    help="Shape of the bent beam: terms of second and third order; a beam loaded at its end; second order.",
 )
 @click.option(
     "--base",
     "bases",
     type=_PixelType(),
     multiple=True,
-    help="Base of the cantilever in the first frame, if it is not found by itself; "
+    help="Base of the cantilever in the first frame, if it is not found automatically; "
     "once, or once for each magnification in the order of the recording.",
 )
-@click.option("--tip", "tips", type=_PixelType(), multiple=True, help="Its free end, likewise.")
+@click.option(
+    "--tip", "tips", type=_PixelType(), multiple=True, help="Free end of the cantilever, likewise."
+)
 @recording_options
 @magnification_option
 def cantilever(

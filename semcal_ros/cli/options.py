@@ -54,14 +54,12 @@ frame_time_option = click.option(
 magnification_option = click.option(
     "--magnification",
     type=float,
-    help="Of all images: only for a folder of ordinary ones (png, jpg), which do not tell it.",
+    help="Magnification of all images: only for a folder of ordinary ones (png, jpg), which do not contain it.",
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."
 )
-json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Machine-readable output, SI units."
-)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, in SI units.")
 
 
 def recording_options(command: Command) -> Command:
@@ -136,11 +134,11 @@ def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -
         target = path.resolve()
         if target in taken:
             raise InvalidValueError(
-                f"{option} {path} is another output, too", expected="a file of its own"
+                f"{option} {path} is also another output", expected="a file of its own"
             )
         if source is not None and (target == source or source in target.parents):
             raise InvalidValueError(
-                f"{option} {path} belongs to the recording", expected="a file outside of it"
+                f"{option} {path} belongs to the recording", expected="a file outside it"
             )
         taken.add(target)
 
@@ -151,7 +149,7 @@ def require_folder(path: Path) -> None:
         raise InvalidValueError(
             f"{path}: there is no folder {path.absolute().parent}",
             expected="an existing folder",
-            do="make it first",
+            do="create it first",
         )
     if path.is_dir():
         raise InvalidValueError(f"{path} is a folder", expected="the name of a file")

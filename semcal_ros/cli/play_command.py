@@ -18,13 +18,13 @@ __all__ = ["command"]
     "--rate", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True
 )
 @click.option("--loop", is_flag=True, help="Start again at the end.")
-@click.option("--paused", is_flag=True, help="Wait for a call of ~/pause.")
+@click.option("--paused", is_flag=True, help="Start paused; a call of ~/pause goes on.")
 @click.option(
     "--wait",
     type=click.IntRange(0, 100),
     default=0,
     show_default=True,
-    help="Start when images and magnification have so many subscribers each.",
+    help="Wait until images and magnification have this many subscribers each.",
 )
 @click.option("--no-clock", is_flag=True, help="Do not publish /clock.")
 def command(

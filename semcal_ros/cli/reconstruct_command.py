@@ -26,14 +26,14 @@ __all__ = ["command"]
 @recording_argument
 @calibration_option(required=True)
 @output_option("Mesh: .ply or .stl.")
-@click.option("--cloud", type=PATH, help="All points, as .ply.")
-@click.option("--figure", type=PATH, help="Picture of cloud and mesh: .png.")
+@click.option("--cloud", type=PATH, help="Also write all points: .ply.")
+@click.option("--figure", type=PATH, help="Image of cloud and mesh: .png.")
 @click.option(
     "--unit",
     type=click.Choice(list(UNITS_PER_M)),
     default="nm",
     show_default=True,
-    help="Of lengths in the mesh and the cloud.",
+    help="Unit of lengths in the mesh and the cloud.",
 )
 @click.option(
     "--spacing",
@@ -47,7 +47,7 @@ __all__ = ["command"]
     type=click.IntRange(3, 2000),
     default=150,
     show_default=True,
-    help="The most that are used.",
+    help="Largest number of keyframes used.",
 )
 @click.option(
     "--height-sigma",
@@ -111,7 +111,7 @@ def command(
         _echo_summary(done.summary())
     echo_notes(done.notes)
     if not as_json:
-        echo_paths({"mesh": output, "points": cloud, "picture": figure})
+        echo_paths({"mesh": output, "points": cloud, "image": figure})
 
 
 def _echo_summary(result: dict[str, Any]) -> None:

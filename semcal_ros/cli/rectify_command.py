@@ -27,7 +27,9 @@ __all__ = ["command"]
 @output_option("Bag to make.")
 @no_drift_option("Leave drift in; correct distortion only.")
 @interpolation_option("linear")
-@click.option("--namespace", default="/sem", show_default=True, help="Of the topics in the output.")
+@click.option(
+    "--namespace", default="/sem", show_default=True, help="Namespace of the topics in the output."
+)
 @recording_options
 @overwrite_option
 def command(
@@ -63,7 +65,7 @@ def command(
     echo_notes(done.notes)
     if done.extrapolated:
         click.echo(
-            f"warning: {done.extrapolated} frames are outside of the calibrated range", err=True
+            f"warning: {done.extrapolated} frames are outside the calibrated range", err=True
         )
     echo_states(done.states)
     click.echo(f"{done.frame_count} frames: {output}")

@@ -35,14 +35,14 @@ __all__ = ["command"]
 @recording_argument
 @output_option("Average: .tif (32-bit, with the pixel size) or .png (as deep as the recording).")
 @calibration_option("Undo distortion, too.")
-@click.option("--sigma", type=PATH, help=".tif of its standard error.")
+@click.option("--sigma", type=PATH, help="Standard error of the average: .tif.")
 @click.option("--video", type=PATH, help="Stabilised video: .mp4 or .avi.")
 @click.option(
     "--fps",
     type=click.FloatRange(*FPS_RANGE),
     default=10.0,
     show_default=True,
-    help="Of the video.",
+    help="Frames per second of the video.",
 )
 @click.option("--at", type=float, metavar="G", help="Take the frames of this magnification.")
 @no_drift_option("Average the frames where they are.")
@@ -102,7 +102,7 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
     if not calibrated:
         echo_nominal_unit(result.config.display_width_m, "the pixel size is the nominal one")
     elif not result.camera.in_range:
-        click.echo("warning: the frames are outside of the calibrated range", err=True)
+        click.echo("warning: the frames are outside the calibrated range", err=True)
     if result.other_kind:
         echo_notes([f"{result.other_kind} frames of another size or encoding are left out"])
     echo_states(result.states)

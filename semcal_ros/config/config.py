@@ -59,23 +59,23 @@ _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 _MAX_SEEN = 80  # characters of a wrong value in an error, which is one line
 
 
-def _whole(value: Any) -> Any:
+def _read_whole(value: Any) -> Any:
     # JSON Schema counts 4.0 as an integer, and so do people.
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _unit(value: Any) -> Any:
+def _read_unit(value: Any) -> Any:
     # YAML reads the unit 1 as a number; True equals 1 too.
     return "1" if isinstance(value, (int, float)) and value == 1 and value is not True else value
 
 
-def _largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
+def _sort_largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(sorted(sizes, reverse=True))
 
 
 # `strict`: no text for a number and no bool for an integer.
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Whole = BeforeValidator(_whole)
+_Whole = BeforeValidator(_read_whole)
 # 255 characters are the longest name that DDS takes.
 _Name = Annotated[str, Field(strict=True, min_length=1, max_length=255)]
 _Topic = Annotated[
@@ -177,7 +177,7 @@ class MagnificationConfig:
     field: _FieldPath = Field(
         default="data", description="a path of field names such as data, vector.x or position[0]"
     )
-    unit: Annotated[Literal["1", "m", "mm", "um", "nm", "pm"], BeforeValidator(_unit)] = Field(
+    unit: Annotated[Literal["1", "m", "mm", "um", "nm", "pm"], BeforeValidator(_read_unit)] = Field(
         default="1", description="1 for a magnification; m, mm, um, nm or pm for a length"
     )
     display_width_m: _DisplayWidth | None = Field(
@@ -262,7 +262,7 @@ class _ScanKeys:
     )
 
 
-def _scan_timing(value: Any) -> ScanTiming:
+def _read_scan_timing(value: Any) -> ScanTiming:
     if isinstance(value, ScanTiming):
         return value
     keys = TypeAdapter(_ScanKeys).validate_python(value)
@@ -311,10 +311,11 @@ class MicroscopeConfig:
         default=MagnificationConfig(), description="a mapping of magnification settings"
     )
     scan: (
-        Annotated[ScanTiming, PlainValidator(_scan_timing, json_schema_input_type=_ScanKeys)] | None
+        Annotated[ScanTiming, PlainValidator(_read_scan_timing, json_schema_input_type=_ScanKeys)]
+        | None
     ) = Field(default=None, description="a mapping of scan settings")
     squares_m: Annotated[
-        tuple[_SquareSize, ...], Field(min_length=1), AfterValidator(_largest_first)
+        tuple[_SquareSize, ...], Field(min_length=1), AfterValidator(_sort_largest_first)
     ] = Field(
         default=(25e-6, 10e-6, 5e-6, 2e-6, 1e-6),
         description="a list of square sizes in m, each above 0 and at most 1, such as [10.0e-6]",
@@ -365,13 +366,13 @@ Problems = dict[Location, tuple[str, Any]]
 
 
 @lru_cache(maxsize=1)
-def _checker() -> TypeAdapter[MicroscopeConfig]:
+def _make_checker() -> TypeAdapter[MicroscopeConfig]:
     return TypeAdapter(MicroscopeConfig)
 
 
 def config_schema() -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a configuration file, for editors that complete and check."""
-    return _checker().json_schema()
+    return _make_checker().json_schema()
 
 
 def load_config(name_or_path: str | Path) -> MicroscopeConfig:
@@ -401,18 +402,20 @@ def parse_config(text: str, *, source: str = "configuration") -> MicroscopeConfi
     values = load_yaml(text, source)
     found: Problems = {}
     try:
-        config = _checker().validate_python(values)
+        config = _make_checker().validate_python(values)
     except ValidationError as error:
-        found = _problems(error)
-    for location, kind in _omissions(values):
+        found = _list_problems(error)
+    for location, kind in _find_omissions(values):
         found.setdefault(location, (kind, None))
     if found:
-        raise _refusal(source, found, MicroscopeConfig, do="compare with msg_configs/generic.yaml")
+        raise _make_refusal(
+            source, found, MicroscopeConfig, do="compare with msg_configs/generic.yaml"
+        )
     _check_magnification(values["magnification"], config.magnification, source)
     return config
 
 
-def _problems(error: ValidationError) -> Problems:
+def _list_problems(error: ValidationError) -> Problems:
     return {
         problem["loc"]: (problem["type"], problem["input"])
         for problem in error.errors(include_url=False, include_context=False)
@@ -426,12 +429,12 @@ def _explain(error: ValidationError, declared: type[Any]) -> ConfigError:
         (names[at[0]], *at[1:])
         if at and isinstance(at[0], int) and at[0] < len(names)
         else at: problem
-        for at, problem in _problems(error).items()
+        for at, problem in _list_problems(error).items()
     }
-    return _refusal(declared.__name__, found, declared)
+    return _make_refusal(declared.__name__, found, declared)
 
 
-def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
+def _find_omissions(values: Any) -> Iterator[tuple[Location, str]]:
     """Keys that only a file must have, and keys without a value."""
     if not isinstance(values, dict):
         return
@@ -447,24 +450,24 @@ def _omissions(values: Any) -> Iterator[tuple[Location, str]]:
         yield from (((*above, key), "none") for key, value in mapping.items() if value is None)
 
 
-def _refusal(source: str, found: Problems, declared: type[Any], do: str = "") -> ConfigError:
+def _make_refusal(source: str, found: Problems, declared: type[Any], do: str = "") -> ConfigError:
     """What is wrong with the value of one key, in one line."""
     # A misspelt key causes a missing one as well: name the misspelt one.
-    location = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _path(at)))
+    location = min(found, key=lambda at: (found[at][0] not in _UNKNOWN, _format_path(at)))
     kind, value = found[location]
     depth, mapping = _innermost(location, declared)
     fields = mapping.__pydantic_fields__
-    path = _path(location)
+    path = _format_path(location)
     if kind in _UNKNOWN:
         return ConfigError(
-            f"{source}: unknown key {_cut(path)}", expected="one of " + ", ".join(fields), do=do
+            f"{source}: unknown key {_shorten(path)}", expected="one of " + ", ".join(fields), do=do
         )
     key = location[depth] if location else ""
     expected = fields[key].description if location else "a mapping of settings"
     if kind == "missing":
         return ConfigError(f"{source}: key {path} is missing", expected=expected, do=do)
     where = f"key {path}" if path else "the whole file"
-    return ConfigError(f"{source}: {where} is {_shown(value)}", expected=expected, do=do)
+    return ConfigError(f"{source}: {where} is {_format_value(value)}", expected=expected, do=do)
 
 
 def _innermost(location: Location, declared: type[Any]) -> tuple[int, Any]:
@@ -477,18 +480,18 @@ def _innermost(location: Location, declared: type[Any]) -> tuple[int, Any]:
     return 0, declared
 
 
-def _path(location: Location) -> str:
+def _format_path(location: Location) -> str:
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     return "".join(parts).lstrip(".")
 
 
-def _cut(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _MAX_SEEN else text[:_MAX_SEEN] + "..."
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     try:
-        return _cut(repr(value))
+        return _shorten(repr(value))
     except ValueError:  # Python does not print integers of more than 4300 digits
         return "an enormous number"
 
@@ -507,6 +510,6 @@ def _check_magnification(given: dict[str, Any], read: MagnificationConfig, sourc
         if key in given and read.quantity != quantity:
             raise ConfigError(
                 f"{source}: key magnification.{key} with the quantity {read.quantity}",
-                expected=f"it only with the quantity {quantity}",
+                expected=f"this key only with the quantity {quantity}",
                 do="remove the key or correct the quantity",
             )

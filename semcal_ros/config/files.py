@@ -23,10 +23,10 @@ def config_directories() -> tuple[Path, ...]:
     ``share/semcal_ros/msg_configs`` under each prefix of the ament index, and the same under the
     Python environment's prefix.
     """
-    return tuple(dict.fromkeys(place for place in _candidates() if place.is_dir()))
+    return tuple(dict.fromkeys(place for place in _list_candidates() if place.is_dir()))
 
 
-def _candidates() -> Iterator[Path]:
+def _list_candidates() -> Iterator[Path]:
     package = Path(__file__).resolve().parents[1]
     yield package.parent / "msg_configs"
     yield package / "msg_configs"
@@ -55,9 +55,9 @@ def find_config_file(name_or_path: str | Path) -> Path:
         There is no such configuration.
     """
     text = str(name_or_path)
-    path = _existing_file(Path(text))
+    path = _find_existing_file(Path(text))
     if path is None and text == Path(text).name:
-        path = _shipped_file(Path(text))
+        path = _find_shipped_file(Path(text))
     if path is not None:
         return path
     raise ConfigError(
@@ -67,17 +67,17 @@ def find_config_file(name_or_path: str | Path) -> Path:
     )
 
 
-def _shipped_file(name: Path) -> Path | None:
+def _find_shipped_file(name: Path) -> Path | None:
     stem = name.stem if name.suffix in _SUFFIXES else name.name
     candidates = (
-        _existing_file(place / f"{stem}{suffix}")
+        _find_existing_file(place / f"{stem}{suffix}")
         for place in config_directories()
         for suffix in _SUFFIXES
     )
     return next(filter(None, candidates), None)
 
 
-def _existing_file(path: Path) -> Path | None:
+def _find_existing_file(path: Path) -> Path | None:
     try:
         expanded = path.expanduser()
         return expanded if expanded.is_file() else None

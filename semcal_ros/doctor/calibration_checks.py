@@ -62,7 +62,7 @@ def check_calibration(
         return [
             note(
                 "calibration",
-                "none on the topic calibration, and none given",
+                "no calibration on its topic, and none given",
                 do="calibrate (`semcal calibrate`), give the file to the nodes, or to this command: --calibration",
             )
         ]

@@ -73,8 +73,8 @@ def diagnose(
         except (SemcalError, RuntimeError) as error:
             found.append(problem("ROS 2", f"does not start here: {' '.join(str(error).split())}"))
     if session is None:
-        do = "mend what is said above first"
-        return [*found, note("topics", "not looked at, as ROS 2 does not work here", do=do)]
+        do = "first correct the problems above"
+        return [*found, note("topics", "not checked, since ROS 2 does not work here", do=do)]
     return found + evaluate(session, around, (config_name, config), given, namespace)
 
 
@@ -153,7 +153,7 @@ def _judge_calibrations(
         found.append(
             note(
                 "calibration",
-                f"the nodes have another one than {given[0]}",
+                f"the nodes have another calibration than {given[0]}",
                 do="give it to the nodes, or to parameter_server alone and call its ~/reload",
             )
         )

@@ -109,7 +109,9 @@ def check_rclpy(seen: Environment) -> list[Finding]:
             f"; {', '.join(seen.installations)} is installed, but not sourced or for another Python"
         )
         return [
-            problem("ROS 2", f"rclpy is not there{here * bool(seen.installations)}", do=_GET_ROS)
+            problem(
+                "ROS 2", f"rclpy is not installed{here * bool(seen.installations)}", do=_GET_ROS
+            )
         ]
     if _wrong_middleware(seen):
         return []  # check_rmw reports it
@@ -231,7 +233,7 @@ def check_discovery(seen: Environment) -> list[Finding]:
                 "discovery",
                 "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF and no ROS_STATIC_PEERS are set",
                 expected="LOCALHOST or SUBNET",
-                do="set it in all shells alike; no node finds another like this",
+                do="set it in all shells alike; otherwise no node finds another",
             )
         ]
     found = []
@@ -316,7 +318,7 @@ def check_shared_memory(seen: Environment) -> list[Finding]:
                 f"{free / _MB:.0f} MiB are free",
                 expected=f"{memory.segment_bytes / _MB:.1f} MiB for each process of the DDS profile",
                 do="enlarge it (a container: --shm-size=2g), or remove /dev/shm/fast* that killed processes left,"
-                " while no ROS process runs; a process without goes over UDP",
+                " while no ROS process runs; a process without it uses UDP",
             )
         ]
     return [ok("/dev/shm", f"{free / _MB:.0f} MiB are free")]

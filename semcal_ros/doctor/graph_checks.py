@@ -85,7 +85,7 @@ def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
             "nodes",
             f"{count} nodes have the name {name}",
             expected="one",
-            do="end all but one, or give them names or namespaces: `--ros-args -r __ns:=/other`",
+            do="stop all but one, or give them other names or namespaces: `--ros-args -r __ns:=/other`",
         )
         for name, count in Counter(graph.nodes).items()
         if count > 1
@@ -113,7 +113,10 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
     subscriptions = graph.subscriptions.get(topic.name, ())
     if not publishers and not topic.is_input:
         return []
-    found = [*_types(topic, publishers, "published"), *_types(topic, subscriptions, "expected")]
+    found = [
+        *_check_types(topic, publishers, "published"),
+        *_check_types(topic, subscriptions, "expected"),
+    ]
     senders = [p for p in publishers if p.type == topic.type]
     listeners = [s for s in subscriptions if s.type == topic.type]
     if not publishers:
@@ -122,25 +125,25 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
         found.append(
             problem(
                 topic.name,
-                f"{_nodes(senders)} publish on it",
+                f"{_format_nodes(senders)} publish on it",
                 expected="one publisher",
-                do="end all but one, or remap the topic of the others",
+                do="stop all but one, or remap the topic of the others",
             )
         )
-    found += _qualities(topic, senders, listeners)
+    found += _check_qualities(topic, senders, listeners)
     if not found:
-        heard = f"heard by {_nodes(listeners)}" if listeners else "nobody listens"
-        sent = f"{topic.type} by {_nodes(senders)} ({senders[0].quality})"
+        heard = f"heard by {_format_nodes(listeners)}" if listeners else "nobody listens"
+        sent = f"{topic.type} by {_format_nodes(senders)} ({senders[0].quality})"
         made = note if topic.is_input and not listeners else ok
         found.append(made(topic.name, f"{sent}, {heard}"))
     return found
 
 
-def _nodes(endpoints: list[Endpoint]) -> str:
+def _format_nodes(endpoints: list[Endpoint]) -> str:
     return ", ".join(dict.fromkeys(e.node for e in endpoints))
 
 
-def _types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
+def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
     for end in ends:
         if end.type != topic.type:
             change = (
@@ -173,7 +176,7 @@ def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
     )
 
 
-def _qualities(
+def _check_qualities(
     topic: Topic, senders: list[Endpoint], listeners: list[Endpoint]
 ) -> Iterator[Finding]:
     for sender in senders:
@@ -192,23 +195,23 @@ def _qualities(
                     f"{listener.node} asks for {' and '.join(refused)}, {sender.node} offers {sender.quality}:"
                     " nothing arrives there",
                     expected="a publisher that offers at least what is asked for",
-                    do="change the quality of service of either; nodes of the suite give way by themselves",
+                    do="change the quality of service of either; nodes of the suite adapt by themselves",
                 )
         if not sender.reliable:
             yield note(
                 topic.name,
-                f"{sender.node} publishes {sender.quality}: what does not get through at once is lost, images that"
-                " exceed the shared memory most often",
+                f"{sender.node} publishes {sender.quality}: what is not delivered at once is lost, most often"
+                " images larger than the shared memory",
                 expected="reliable",
                 do="change the quality of service of the publisher",
             )
         if topic.keys == "magnification" and not sender.transient_local:
             yield note(
                 topic.name,
-                f"{sender.node} publishes {sender.quality}: who starts later learns the {topic.what} only with its"
-                " next message",
+                f"{sender.node} publishes {sender.quality}: a node that starts later gets the {topic.what} only with"
+                " its next message",
                 expected="transient local",
-                do="change the durability of the publisher, or publish again and again",
+                do="change the durability of the publisher, or publish it repeatedly",
             )
 
 
@@ -257,9 +260,9 @@ def check_simulated_time(graph: Graph) -> list[Finding]:
         return [
             note(
                 "time",
-                f"{', '.join(clocks)} publishes /clock, but {', '.join(real)} keep to the real time",
+                f"{', '.join(clocks)} publishes /clock, but {', '.join(real)} use the real time",
                 expected="use_sim_time:=true for all nodes of a replay",
-                do="without it frames are corrected all the same, but no latency is reported",
+                do="otherwise frames are still corrected, but no latency is reported",
             )
         ]
     return [ok("time", "simulated, by /clock" if clocks else "real, no /clock")] if known else []

@@ -46,7 +46,7 @@ def rate_hz(arrivals: tuple[Arrival, ...]) -> float | None:
     return (len(arrivals) - 1) * 1e9 / span_ns if span_ns > 0 else None
 
 
-def _rate(arrivals: tuple[Arrival, ...]) -> str:
+def _format_rate(arrivals: tuple[Arrival, ...]) -> str:
     rate = rate_hz(arrivals)
     return "one" if rate is None else f"{rate:.3g} Hz"
 
@@ -60,17 +60,15 @@ def check_images(topic: Topic, session: Session) -> list[Finding]:
         return [
             problem(
                 "images",
-                f"{topic.name} has a publisher, but nothing came within {session.seconds:g} s",
+                f"{topic.name} has a publisher, but nothing arrived within {session.seconds:g} s",
                 do="a slow scan: give more --seconds; else see the lines above, and check a firewall (UDP from 7400"
                 " on), or users and containers that do not share /dev/shm",
             )
         ]
     image = session.image
     if image is None:
-        return [ok("images", f"{_rate(arrivals)} of {topic.type}")]
-    seen = (
-        f"{_rate(arrivals)}, {image.width} x {image.height} {image.encoding}, {image.bytes} bytes"
-    )
+        return [ok("images", f"{_format_rate(arrivals)} of {topic.type}")]
+    seen = f"{_format_rate(arrivals)}, {image.width} x {image.height} {image.encoding}, {image.bytes} bytes"
     if image.trouble:
         return [problem("images", f"{seen}: {image.trouble}")]
     return [ok("images", seen)]
@@ -117,9 +115,9 @@ def check_magnification(
         return [
             problem(
                 "magnification",
-                f"{topic.name} has a publisher, but nothing came within {session.seconds:g} s; frames"
+                f"{topic.name} has a publisher, but nothing arrived within {session.seconds:g} s; frames"
                 " are not used before it is known",
-                do="change the magnification once, or let the publisher be transient local",
+                do="change the magnification once, or make the publisher transient local",
             )
         ]
     if seen.value is None:
@@ -139,7 +137,7 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
                 "stamps",
                 "all stamps are zero",
                 expected="the time of the acquisition",
-                do="let the driver set header.stamp: drift rates and the pairing of topics rest on it",
+                do="make the driver set header.stamp: drift rates and the pairing of topics rest on it",
             )
         ]
     found = []
@@ -148,7 +146,7 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
         found.append(
             note(
                 "stamps",
-                f"{back} of {len(stamps) - 1} stamps are not later than the one before",
+                f"{back} of {len(stamps) - 1} stamps are not later than the previous one",
                 expected="a stamp of its own for each frame",
                 do="two publishers, or a recording that loops; otherwise correct the driver",
             )
@@ -156,19 +154,19 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
     age_s = median(
         (a.received_ns - stamp) * 1e-9 for a, stamp in zip(arrivals, stamps, strict=True)
     )
-    return [*found, _age(age_s, bool(session.graph.publishers.get("/clock")))]
+    return [*found, _check_age(age_s, bool(session.graph.publishers.get("/clock")))]
 
 
-def _age(age_s: float, replay: bool) -> Finding:
+def _check_age(age_s: float, replay: bool) -> Finding:
     if abs(age_s) > _OTHER_CLOCK_S:
-        seen = f"stamps are {abs(age_s) / 3600:.3g} h {'old' if age_s > 0 else 'in the future'}: those of another clock"
+        seen = f"stamps are {abs(age_s) / 3600:.3g} h {'old' if age_s > 0 else 'in the future'}: from another clock"
         if replay:
             return ok("stamps", f"{seen}, as in a replay with /clock")
         return note(
             "stamps",
             seen,
             expected="the time of this host, unless this is a replay",
-            do="a replay: `semcal play` publishes /clock; a driver: let it stamp with the time of the host",
+            do="a replay: `semcal play` publishes /clock; a driver: make it stamp with the time of the host",
         )
     if age_s < -_SKEW_S:
         return problem(
@@ -228,10 +226,10 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
             problem(
                 output.name,
                 f"{nodes} published none of {len(taken)} images",
-                do="its diagnostics below tell why",
+                do="see its diagnostics below",
             )
         ]
-    seen = f"{_rate(made)} for {_rate(taken)} of images"
+    seen = f"{_format_rate(made)} for {_format_rate(taken)} of images"
     # Either count may miss one message at each end of the interval.
     if len(made) + 2 < 0.8 * len(taken):
         return [
@@ -259,6 +257,6 @@ def check_diagnostics(session: Session, namespace: str) -> list[Finding]:
     heard = {status.node for status in session.statuses}
     silent = [name for name in session.graph.suite(namespace) if name not in heard]
     return found + [
-        note(name, "no diagnostics came", expected="one a second", do="give more --seconds")
+        note(name, "no diagnostics arrived", expected="one a second", do="give more --seconds")
         for name in silent
     ]

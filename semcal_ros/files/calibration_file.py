@@ -81,7 +81,7 @@ def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationM
     try:
         _check_kind(data, source)
         _check_schema(data, source)
-        model = CalibrationModel(**_fields_from(data))
+        model = CalibrationModel(**_read_fields(data))
         _check_cameras(model)
     except (ValueError, ArithmeticError) as error:
         # YAML allows integers of any length, and floats whose products overflow.
@@ -106,8 +106,8 @@ def format_calibration(model: CalibrationModel) -> str:
         "image_height_px": int(model.image_height),
         "display_width_m": float(model.display_width_m),
         "magnifications": [float(g) for g in model.magnifications],
-        "functions": {name: _function_to(model.functions[name]) for name in FUNCTION_NAMES},
-        "statistics": _plain(model.statistics),
+        "functions": {name: _write_function(model.functions[name]) for name in FUNCTION_NAMES},
+        "statistics": _to_plain(model.statistics),
         "covariance": {
             "size": size,
             "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
@@ -116,7 +116,7 @@ def format_calibration(model: CalibrationModel) -> str:
     if model.scale_sigma != ScaleSigma():
         data["scale_sigma"] = asdict(model.scale_sigma)
     if field is not None:
-        data["residual_field"] = _field_to(field, model.covariance[size:])
+        data["residual_field"] = _write_field(field, model.covariance[size:])
     body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
     return _HEADER + body
 
@@ -174,16 +174,18 @@ def _check_kind(data: Any, source: str) -> None:
 
 
 @lru_cache(maxsize=1)
-def _validator() -> Any:
+def _make_validator() -> Any:
     schema = resources.files("semcal_ros.files").joinpath("calibration.schema.json")
     return jsonschema.Draft202012Validator(json.loads(schema.read_text(encoding="utf-8")))
 
 
 def _check_schema(data: Mapping[str, Any], source: str) -> None:
     try:
-        error = next(_validator().iter_errors(data), None)
+        error = next(_make_validator().iter_errors(data), None)
     except TypeError as wrong:  # the validator compares names with patterns
-        raise CalibrationFileError(f"{source}: a key that is not text", expected="names") from wrong
+        raise CalibrationFileError(
+            f"{source}: a key that is not text", expected="text as keys"
+        ) from wrong
     if error is not None:
         where = ".".join(str(p) for p in error.absolute_path) or "top level"
         raise CalibrationFileError(
@@ -193,16 +195,16 @@ def _check_schema(data: Mapping[str, Any], source: str) -> None:
         )
 
 
-def _fields_from(data: Mapping[str, Any]) -> dict[str, Any]:
-    covariance, field = _covariance_from(data["covariance"]), None
+def _read_fields(data: Mapping[str, Any]) -> dict[str, Any]:
+    covariance, field = _read_covariance(data["covariance"]), None
     if "residual_field" in data:
-        field = _field_from(data["residual_field"])
-        covariance = _with_field_covariance(
+        field = _read_field(data["residual_field"])
+        covariance = _add_field_covariance(
             covariance, data["residual_field"]["covariance"], field.size
         )
-    width, *magnifications = _finite([data["display_width_m"], *data["magnifications"]])
+    width, *magnifications = _check_finite([data["display_width_m"], *data["magnifications"]])
     return {
-        "functions": {name: _function_from(data["functions"][name]) for name in FUNCTION_NAMES},
+        "functions": {name: _read_function(data["functions"][name]) for name in FUNCTION_NAMES},
         "covariance": covariance,
         # The schema counts 512.0 as an integer.
         "image_width": int(data["image_width_px"]),
@@ -216,7 +218,7 @@ def _fields_from(data: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _finite(values: Sequence[Any]) -> list[float]:
+def _check_finite(values: Sequence[Any]) -> list[float]:
     numbers = [float(value) for value in values]
     if not np.all(np.isfinite(numbers)):
         raise InvalidValueError("numbers that are not finite", expected="finite numbers")
@@ -235,18 +237,18 @@ def _check_cameras(model: CalibrationModel) -> None:
                 camera.resized(1, 1).P  # noqa: B018
 
 
-def _function_from(data: Mapping[str, Any]) -> ContinuousFunction:
+def _read_function(data: Mapping[str, Any]) -> ContinuousFunction:
     low, high = data["magnification_range"]
     return ContinuousFunction(
         data["kind"],
         np.array(data["coefficients"], dtype=np.float64),
         (float(low), float(high)),
-        np.array(_finite(data.get("shape", []))),
+        np.array(_check_finite(data.get("shape", []))),
         np.array(data.get("breaks", []), dtype=np.float64),
     )
 
 
-def _function_to(function: ContinuousFunction) -> dict[str, Any]:
+def _write_function(function: ContinuousFunction) -> dict[str, Any]:
     out: dict[str, Any] = {
         "kind": function.kind,
         "magnification_range": [float(g) for g in function.g_range],
@@ -259,7 +261,7 @@ def _function_to(function: ContinuousFunction) -> dict[str, Any]:
     return out
 
 
-def _field_from(data: Mapping[str, Any]) -> ResidualField:
+def _read_field(data: Mapping[str, Any]) -> ResidualField:
     low, high = data["magnification_range"]
     rows = [np.array(part, dtype=np.float64) for part in data["coefficients"]]
     if any(row.shape != rows[0].shape for row in rows):
@@ -268,7 +270,7 @@ def _field_from(data: Mapping[str, Any]) -> ResidualField:
     return ResidualField(knots_x, knots_y, (float(low), float(high)), np.stack(rows))
 
 
-def _field_to(field: ResidualField, covariance: Array) -> dict[str, Any]:
+def _write_field(field: ResidualField, covariance: Array) -> dict[str, Any]:
     """``covariance`` holds the rows of the field's coefficients, its last columns being their own."""
     own = len(covariance)
     cross, square = np.split(covariance, [covariance.shape[1] - own], axis=1)
@@ -283,7 +285,7 @@ def _field_to(field: ResidualField, covariance: Array) -> dict[str, Any]:
     }
 
 
-def _with_field_covariance(functions: Array, packed: str, own: int) -> Array:
+def _add_field_covariance(functions: Array, packed: str, own: int) -> Array:
     """The covariance of the functions' coefficients and of the field's, from its parts in the file."""
     size = len(functions)
     expected = own * size + own * (own + 1) // 2
@@ -308,7 +310,7 @@ def _with_field_covariance(functions: Array, packed: str, own: int) -> Array:
     return whole
 
 
-def _covariance_from(data: Mapping[str, Any]) -> Array:
+def _read_covariance(data: Mapping[str, Any]) -> Array:
     size, rows = int(data["size"]), data["upper_rows"]
     if [len(row) for row in rows] != list(range(size, 0, -1)):
         raise InvalidValueError(
@@ -336,17 +338,17 @@ def _check_covariance(matrix: Array) -> None:
     if least < -_NEGATIVE_CORRELATION * len(matrix):
         raise InvalidValueError(
             f"a covariance whose correlations have the eigenvalue {least:.2g}",
-            expected="none below zero",
+            expected="no negative eigenvalue",
             do="calibrate again: the file was changed by hand, or damaged",
         )
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Convert statistics to plain YAML types."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _to_plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [_to_plain(v) for v in value]
     if isinstance(value, np.generic):
         return value.item()
     return value

@@ -58,7 +58,7 @@ class AllowedPaths:
             return real
         if not self._folders:
             raise InvalidValueError(
-                f"file {path}, and no folder whose files may be named while the node runs",
+                f"file {path}, but no folder whose files may be named while the node runs",
                 expected="the parameter directory to name one",
                 do="start the node with -p directory:=FOLDER",
             )
@@ -66,6 +66,6 @@ class AllowedPaths:
         behind = "" if str(real) == path else f", which is {real}"
         raise InvalidValueError(
             f"file {path}{behind}",
-            expected=f"a file inside of {folders}",
+            expected=f"a file inside {folders}",
             do="choose one there, or start the node with another directory",
         )

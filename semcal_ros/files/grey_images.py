@@ -49,7 +49,7 @@ def write_grey_image(
     """
     suffix = path.suffix.lower()
     if suffix in TIFF_SUFFIXES:
-        data = _tiff(values, pixel_size_m)
+        data = _encode_tiff(values, pixel_size_m)
     elif suffix == ".png" and dtype is not None and dtype.kind == "u":
         top = np.iinfo(dtype).max
         levels = np.clip(np.rint(np.nan_to_num(values)), 0, top).astype(dtype)
@@ -62,7 +62,7 @@ def write_grey_image(
     atomic_write_bytes(path, data)
 
 
-def _tiff(values: NDArray[np.float32], pixel_size_m: tuple[float, float]) -> bytes:
+def _encode_tiff(values: NDArray[np.float32], pixel_size_m: tuple[float, float]) -> bytes:
     """Encode a file of 32-bit grey levels whose pixel size ImageJ understands."""
     per_um = [1e-6 / size for size in pixel_size_m]
     file = io.BytesIO()

@@ -60,7 +60,7 @@ def check_plain_yaml(text: str, source: str) -> None:
             else:
                 continue
             raise CalibrationFileError(
-                f"{source}: {what}{_line(event.start_mark)}",
+                f"{source}: {what}{_format_line(event.start_mark)}",
                 expected="a calibration written by semcal",
             )
     except (yaml.YAMLError, *CONSTRUCTOR_ERRORS) as error:
@@ -69,11 +69,11 @@ def check_plain_yaml(text: str, source: str) -> None:
 
 def _invalid(source: str, error: Exception) -> CalibrationFileError:
     return CalibrationFileError(
-        f"{source}: not valid YAML{_line(getattr(error, 'problem_mark', None))}",
+        f"{source}: not valid YAML{_format_line(getattr(error, 'problem_mark', None))}",
         expected="a complete calibration file",
         do="restore the file or calibrate again",
     )
 
 
-def _line(mark: Any) -> str:
+def _format_line(mark: Any) -> str:
     return "" if mark is None else f" at line {mark.line + 1}"

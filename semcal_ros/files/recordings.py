@@ -246,7 +246,7 @@ class _BagRecording(Recording):
             )
         if images < self.frame_count:
             self._pass_notes.append(
-                f"the recording declares {self.frame_count} images and holds {images}"
+                f"the recording declares {self.frame_count} images but holds {images}"
             )
 
     def _frame(self, raw: RawMessage) -> tuple[RecordedFrame | None, bool]:

@@ -127,7 +127,7 @@ class VideoWriter:
         self._stream.width, self._stream.height = even
         self._stream.pix_fmt = codec.pixel_format
 
-    def write(self, picture: NDArray[np.float32], caption: str) -> None:
+    def write(self, image: NDArray[np.float32], caption: str) -> None:
         """Add a frame (h, w), NaN shown as 0, with a line of text at the bottom.
 
         Raises
@@ -136,7 +136,7 @@ class VideoWriter:
             If the file cannot be written.
         """
         scale = 255.0 / (self._high - self._low)
-        grey = np.clip(np.rint((np.nan_to_num(picture) - self._low) * scale), 0, 255)
+        grey = np.clip(np.rint((np.nan_to_num(image) - self._low) * scale), 0, 255)
         right, bottom = self._border
         frame = np.pad(grey.astype(np.uint8), ((0, bottom), (0, right)))
         _draw_caption(frame, caption)
@@ -206,7 +206,7 @@ def open_video(
             video.release()
         found = _count_frames(file)
         if found != frames:
-            raise _incomplete(path, f"{found} of {frames} frames came out")
+            raise _incomplete(path, f"{found} of {frames} frames were encoded")
         os.replace(file, target)
 
 

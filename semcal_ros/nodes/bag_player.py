@@ -67,7 +67,7 @@ _PARAMETERS = (
     ParameterDeclaration(
         "rate", 1.0, "Speed of the replay.", "s of recording per s", 0.001, 1000.0
     ),
-    ParameterDeclaration("loop", False, "Begin again at the end."),
+    ParameterDeclaration("loop", False, "Start again at the end."),
     ParameterDeclaration(
         "clock", False, "Publish the time of the recording on /clock.", fixed=True
     ),

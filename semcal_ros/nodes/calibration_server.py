@@ -152,10 +152,10 @@ class CalibrationServer(StreamNode):
         detection = find_lattice(grey)
         message = Image()
         if isinstance(detection, Rejection):
-            picture = corner_overlay(grey, np.empty((0, 2)), detection.reason)
+            image = corner_overlay(grey, np.empty((0, 2)), detection.reason)
         else:
-            picture = corner_overlay(grey, detection.xy, "")
-        fill_image(message, picture, "bgr8", frame.header)
+            image = corner_overlay(grey, detection.xy, "")
+        fill_image(message, image, "bgr8", frame.header)
         self._overlay.publish(message)
         if isinstance(detection, Rejection):
             raise CalibrationError(

@@ -27,7 +27,7 @@ from semcal_ros.nodes.common.run import DeferredSignals, run_node
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
 from semcal_ros.nodes.servo.output import ErrorOutput, StageOutput
-from semcal_ros.nodes.servo.settings import SERVO_PARAMETERS, read_goal, read_servo_settings
+from semcal_ros.nodes.servo.parameters import SERVO_PARAMETERS, read_goal, read_servo_settings
 
 __all__ = ["VisualServo", "main"]
 

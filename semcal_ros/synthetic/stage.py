@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.stage import StageReading
@@ -89,7 +90,7 @@ class GridFaults:
         )
 
 
-def _turn(axis: Sequence[float], angle: float) -> Array:
+def _turn(axis: ArrayLike, angle: float) -> Array:
     """Rotate about an axis by Rodrigues' formula."""
     x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -151,7 +152,9 @@ def stage_views(
             points[:, :2] += rng.uniform(-0.5, 0.5, 2) * square_m
             points[:, 2] += level + stage.height_sigma_m * rng.normal()
             xy, seen = _seen(camera, points, scale)
-            xy = xy + np.outer(xy[:, 1] / camera.height - 0.5, stage.drift_sigma_px * rng.normal(size=2))
+            xy = xy + np.outer(
+                xy[:, 1] / camera.height - 0.5, stage.drift_sigma_px * rng.normal(size=2)
+            )
             jitter = stage.line_jitter_px * rng.normal(size=camera.height)
             xy[:, 0] += jitter[np.clip(np.round(xy[:, 1]).astype(int), 0, camera.height - 1)]
             xy = xy + noise_px * rng.normal(size=xy.shape)

@@ -81,7 +81,7 @@ def _check_factor(factor: float, display_width_m: float) -> None:
         )
 
 
-def _without_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
+def _remove_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
     """Return the collected views without those that the calibration left out."""
     if not result.outliers:
         return collected
@@ -162,7 +162,7 @@ def calibrate_found(
         on_stage=lambda name, part: on_stage(name, 0.95 * part),
     )
     on_stage("summary", 0.95)
-    collected = _without_outliers(collected, result)
+    collected = _remove_outliers(collected, result)
     warnings = list(result.warnings)
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         warnings.append(
@@ -242,7 +242,8 @@ def calibrate(
     ----------
     source
         A bag, a folder of images of the chess grid, or an iterable of (image, magnification)
-        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3).
+        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3). Grey levels are
+        processed as float32, float64 too: 24 bits, more than any detector has.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     display_width_m, squares_m, squares_sigma

@@ -249,13 +249,13 @@ def _assign_squares(
     )
 
 
-def _micrometres(sides_m: Iterable[float]) -> str:
+def _format_micrometres(sides_m: Iterable[float]) -> str:
     return ", ".join(f"{float(f'{1e6 * side:.3g}'):.6g}" for side in sides_m)
 
 
 def _explain_misfit(apparent_m: float, squares_m: Sequence[float]) -> Rejection[ViewStatus]:
     return Rejection(
         ViewStatus.UNKNOWN_SQUARES,
-        f"the other views make its squares {_micrometres([apparent_m])} um at this magnification, and squares_m has "
-        f"{_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m",
+        f"according to the other views its squares are {_format_micrometres([apparent_m])} um, but squares_m"
+        f" has {_format_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m",
     )

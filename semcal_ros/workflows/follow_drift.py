@@ -119,7 +119,7 @@ def estimate_timing(
     shear_of_shift = SHEAR_OF_SHIFT_DISTORTED if model is None else SHEAR_OF_SHIFT_RECTIFIED
     estimate = estimate_frame_time(path, shear_of_shift=shear_of_shift)
     if estimate.observable:
-        time_s = _with_sigma(estimate.frame_time_s, estimate.sigma_s)
+        time_s = _format_with_sigma(estimate.frame_time_s, estimate.sigma_s)
         note = (
             f"the configuration has no scan; the frames are sheared as if one pass took {time_s} s"
         )
@@ -133,7 +133,7 @@ def estimate_timing(
     )
 
 
-def _with_sigma(value: float, sigma: float) -> str:
+def _format_with_sigma(value: float, sigma: float) -> str:
     """Format a value with as many decimals as the first digit of its uncertainty."""
     digits = int(np.clip(-np.floor(np.log10(sigma)), 0, 9)) if sigma > 0.0 else 3
     return f"{value:.{digits}f} +- {sigma:.{digits}f}"

@@ -166,9 +166,10 @@ def open_source(
     Parameters
     ----------
     source
-        See :data:`Source`. Images are (h, w) grey levels without a databar, of which uint8, uint16
-        and float32 are kept as they are, or (h, w, 3) of uint8 in the channel order of OpenCV.
-        Where they have no times, they are taken to be a second apart.
+        See :data:`Source`. Images are (h, w) grey levels without a databar, or (h, w, 3) of uint8
+        in the channel order of OpenCV. Grey levels of other types than uint8, uint16 and float32
+        become float32, in which all images are processed: 24 bits, more than any detector has.
+        Where images have no times, they are taken to be a second apart.
     config
         How to read it.
     magnification
@@ -200,9 +201,7 @@ class _ImagesInMemory(Recording):
 
     def __init__(self, source: Iterable[tuple[Any, ...]], config: MicroscopeConfig) -> None:
         super().__init__(Path("memory"), config)
-        self._recorded = [
-            _recorded_frame(index, entry, config) for index, entry in enumerate(source)
-        ]
+        self._recorded = [_make_frame(index, entry, config) for index, entry in enumerate(source)]
 
     @property
     def frame_count(self) -> int:
@@ -212,7 +211,7 @@ class _ImagesInMemory(Recording):
         yield from self._recorded
 
 
-def _recorded_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig) -> RecordedFrame:
+def _make_frame(index: int, entry: tuple[Any, ...], config: MicroscopeConfig) -> RecordedFrame:
     if not isinstance(entry, tuple | list) or len(entry) not in (2, 3):
         raise InvalidValueError(
             f"image {index} without a magnification",

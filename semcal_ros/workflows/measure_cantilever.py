@@ -203,8 +203,8 @@ def measure_cantilever(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
-    runs, notes = _read(_sources(source), model, microscope, magnification)
-    ends = _ends(bases, tips, len(runs))
+    runs, notes = _read(_list_sources(source), model, microscope, magnification)
+    ends = _pair_ends(bases, tips, len(runs))
     total = 2 * sum(len(run.images) for run in runs)
     advance = count_frames(on_progress, "bending", total)
     series = []
@@ -234,7 +234,7 @@ def measure_cantilever(
     if microscope.scan is None:
         notes.append(f"the configuration has no scan: frames are instants; {GIVE_FRAME_TIME}")
     if not all(one.camera.in_range for one in series):
-        notes.append("frames outside of the calibrated range")
+        notes.append("frames outside the calibrated range")
     agreement = compare_series([one.measured for one in series], poses)
     return CantileverMeasurement(tuple(series), agreement, poses, tuple(notes))
 
@@ -256,7 +256,7 @@ class _Run:
         self.times_s.append(start_time_s(frame, first_ns, microscope))
 
 
-def _sources(source: Source | Sequence[str | os.PathLike[str]]) -> list[Source]:
+def _list_sources(source: Source | Sequence[str | os.PathLike[str]]) -> list[Source]:
     """Recordings, each on its own; images in memory are one."""
     if isinstance(source, (str, os.PathLike)):
         return [source]
@@ -307,7 +307,7 @@ def _read(
     return list(found.values()), notes
 
 
-def _ends(
+def _pair_ends(
     bases: Sequence[Pixel], tips: Sequence[Pixel], count: int
 ) -> list[tuple[Pixel | None, Pixel | None]]:
     """Base and tip for each of ``count`` magnifications."""

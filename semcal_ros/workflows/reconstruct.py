@@ -188,8 +188,8 @@ def reconstruct(
     on_progress("measuring the ball", 0, None)
     ball = measure_ball(structure, height_sigma_m=height_sigma_m)
     if outside:
-        notes.append(f"{outside} frames are outside of the calibrated range")
-    notes += _doubts(structure, microscope.scan is not None)
+        notes.append(f"{outside} frames are outside the calibrated range")
+    notes += _list_doubts(structure, microscope.scan is not None)
     return Reconstruction(structure, ball, tracker.frames, tuple(notes))
 
 
@@ -217,7 +217,7 @@ def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyfr
     return [keyframes[int(k)] for k in chosen]
 
 
-def _doubts(structure: Structure, timed: bool) -> list[str]:
+def _list_doubts(structure: Structure, timed: bool) -> list[str]:
     notes = []
     if structure.unplaced:
         notes.append(f"{structure.unplaced} keyframes could not be linked to the others")
@@ -239,9 +239,9 @@ def _doubts(structure: Structure, timed: bool) -> list[str]:
         )
     if not structure.adjustment.converged:
         notes.append("the adjustment did not converge")
-    if not structure.settled:
+    if not structure.converged:
         notes.append(
-            f"measuring did not settle in {structure.passes} passes: points still moved by more "
+            f"measuring did not converge in {structure.passes} passes: points still moved by more "
             "than half of their 1-sigma"
         )
     return notes

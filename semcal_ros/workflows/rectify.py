@@ -183,12 +183,12 @@ def rectify(
                 bag.write(frame, image, camera, update)
             count += 1
             advance(1)
-        notes = (*opened.notes, *_timing_notes(microscope, follower, model))
+        notes = (*opened.notes, *_note_timing(microscope, follower, model))
     kinds = dict(states.most_common())
     return RectifiedRecording(count, target, tuple(frames), kinds, extrapolated, notes)
 
 
-def _timing_notes(
+def _note_timing(
     microscope: MicroscopeConfig, follower: DriftFollower | None, model: Calibration
 ) -> list[str]:
     """Return notes on an unconfigured scan timing that the drift reveals, too late to use it."""

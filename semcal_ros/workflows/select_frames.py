@@ -155,19 +155,19 @@ class _Reading:
         on_frame: Callable[[int], object],
     ) -> tuple[_Taken, FrameSelection]:
         counts: Counter[str] = Counter()
-        wanted = None if self.at is None else _label(self.at)
+        wanted = None if self.at is None else _format_magnification(self.at)
         taken = _Taken(DriftFollower() if self.drift else None)
         first: RecordedFrame | None = None
         for index, frame in enumerate(self.opened.frames()):
             on_frame(1)
-            label = _label(frame.magnification)
+            label = _format_magnification(frame.magnification)
             counts[label] += 1
             if label != (wanted or label) or (wanted is None and len(counts) > 1):
                 continue  # the frame will be refused or ignored: only the magnification matters
             if first is None:
                 on_first(frame)
                 first = frame
-            if _kind(frame) != _kind(first):
+            if _get_kind(frame) != _get_kind(first):
                 taken.other_kind += 1
                 continue
             self._take(taken, index, frame, first)
@@ -179,8 +179,8 @@ class _Reading:
         time_s = start_time_s(frame, first.stamp_ns, self.config)
         if taken.frames and time_s < taken.frames[-1][2]:
             raise BagError(
-                f"image {index + 1} was taken {taken.frames[-1][2] - time_s:g} s before the one "
-                "before it",
+                f"image {index + 1} was taken {taken.frames[-1][2] - time_s:g} s before the "
+                "previous one",
                 expected="images in the order of time",
                 do="record each pass of a replay to a recording of its own",
             )
@@ -189,7 +189,7 @@ class _Reading:
             camera = camera_for(frame, self.calibration, self.config)
             taken.follower.update(frame, time_s, camera, self.config.scan)
         if self.levels:
-            taken.levels.append(_black_white(frame))
+            taken.levels.append(_estimate_black_white(frame))
 
     def _select(self, taken: _Taken, first: RecordedFrame) -> FrameSelection:
         height, width = first.image.shape[:2]
@@ -221,22 +221,22 @@ class _Reading:
                 do="choose one with --at G",
             )
         raise BagError(
-            f"--at {self.at:g}: {self.opened.path} has no such frames",
+            f"no frames at magnification {self.at:g} in {self.opened.path}",
             expected=f"one of {listed}",
             do="choose one of these magnifications",
         )
 
 
-def _label(magnification: float) -> str:
+def _format_magnification(magnification: float) -> str:
     """Format a magnification for the user: repeated values of a topic may differ in the last digits."""
     return f"{magnification:.6g}"
 
 
-def _kind(frame: RecordedFrame) -> tuple[object, ...]:
+def _get_kind(frame: RecordedFrame) -> tuple[object, ...]:
     return (*frame.image.shape, frame.encoding)
 
 
-def _black_white(frame: RecordedFrame) -> tuple[float, float]:
+def _estimate_black_white(frame: RecordedFrame) -> tuple[float, float]:
     values = frame.image[::_SPARSE, ::_SPARSE]
     if values.dtype.kind == "f":
         values = values[np.isfinite(values)]

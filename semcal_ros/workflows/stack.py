@@ -190,9 +190,9 @@ def stack(
             on_first=lambda frame: _check_output(output, frame),
             on_frame=count_frames(on_progress, "drift" if drift else "reading", opened.frame_count),
         )
-        used = _usable(selection)
+        used = _choose_usable(selection)
         summed = Stack(selection.size, interpolation)
-        grey = _video_levels(selection)
+        grey = _choose_video_levels(selection)
         with open_video(film_path, selection.size, len(selection.indices), fps, grey) as film:
             _add_frames(opened, model, selection, used, summed, film, on_progress)
         notes = opened.notes
@@ -235,17 +235,17 @@ def _check_output(output: str | os.PathLike[str] | None, frame: RecordedFrame) -
         )
 
 
-def _usable(selection: FrameSelection) -> Mask:
+def _choose_usable(selection: FrameSelection) -> Mask:
     """Return which of the chosen frames go into the average, (n,) bool."""
     if selection.path is None:
         return np.ones(len(selection.indices), dtype=bool)
     usable = selection.path.trusted
     if not usable.any():
         raise BagError(
-            f"{len(usable)} frames and none with a known drift, the first: "
+            f"{len(usable)} frames, none of them with a known drift; the first: "
             f"{selection.path[0].status_text}",
             expected="a specimen with structure",
-            do="look at `semcal drift`, or average the frames where they are with --no-drift",
+            do="check with `semcal drift`, or average the frames where they are with --no-drift",
         )
     return usable
 
@@ -269,14 +269,14 @@ def _add_frames(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        picture, valid = summed.rectify(grey, camera, drift, selection.config.scan)
+        image, valid = summed.rectify(grey, camera, drift, selection.config.scan)
         if used[number]:
-            summed.add(picture, valid)
+            summed.add(image, valid)
         if film is not None:
-            film.write(picture, _caption(selection.times_s, number, bool(used[number])))
+            film.write(image, _format_caption(selection.times_s, number, bool(used[number])))
 
 
-def _video_levels(selection: FrameSelection) -> tuple[float, float]:
+def _choose_video_levels(selection: FrameSelection) -> tuple[float, float]:
     """Return the grey levels that are shown as black and white."""
     if selection.dtype == np.uint8 or not selection.levels:
         return 0.0, 255.0
@@ -284,7 +284,7 @@ def _video_levels(selection: FrameSelection) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
+def _format_caption(times_s: tuple[float, ...], number: int, used: bool) -> str:
     """Format the number and time of a frame."""
     text = f"{number + 1}/{len(times_s)}  {times_s[number] - times_s[0]:.1f} s"
     return text if used else f"{text}  not tracked"

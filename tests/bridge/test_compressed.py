@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.codec_headers import MAX_PIXELS
 from semcal_ros.bridge.compressed import (
     CODECS,
     decoded_image,
@@ -24,7 +25,6 @@ from semcal_ros.bridge.compressed import (
 )
 from semcal_ros.bridge.fields import assign_bytes
 from semcal_ros.bridge.images import ENCODINGS, fill_image
-from semcal_ros.bridge.picture_headers import MAX_PIXELS
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message
 
@@ -283,7 +283,7 @@ def test_png_made_by_hand_with_metadata() -> None:
 
 
 def test_interlaced_png() -> None:
-    # Adam7 takes a 2 x 2 picture in three passes: (0, 0), (0, 1), then the second row.
+    # Adam7 takes a 2 x 2 image in three passes: (0, 0), (0, 1), then the second row.
     data = png(2, 2, 8, 0, b"\0\x01\0\x02\0\x03\x04", interlace=1)
     np.testing.assert_array_equal(read("png", data)[0], [[1, 2], [3, 4]])
 
@@ -310,9 +310,9 @@ def put(offset: int, value: int, kind: str) -> Callable[[bytearray, int], None]:
     return lambda data, start: struct.pack_into(kind, data, start + offset, value)
 
 
-BAD_PICTURES = {
+BAD_IMAGES = {
     "empty": (b"", "without data"),
-    "text": (b"no picture at all", "no known kind"),
+    "text": (b"no image at all", "unknown format"),
     "tiff": (encoded(".tiff", GREY.astype(np.float32)), "are TIFF.*Image for 32FC1"),
     "webp": (encoded(".webp", COLOUR), "are WebP"),
     "png signature only": (SIGNATURE, "truncated"),
@@ -375,9 +375,9 @@ BAD_PICTURES = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_PICTURES)
-def test_pictures_that_are_refused(new: New, name: str) -> None:
-    data, reason = BAD_PICTURES[name]
+@pytest.mark.parametrize("name", BAD_IMAGES)
+def test_images_that_are_refused(new: New, name: str) -> None:
+    data, reason = BAD_IMAGES[name]
     with pytest.raises(MessageError, match=reason) as caught:
         image_from_compressed(message_of(new, "", data))
     assert "\n" not in str(caught.value)
@@ -396,7 +396,7 @@ def test_pictures_that_are_refused(new: New, name: str) -> None:
         ("32FC1; png compressed ", encoded(".png", WIDE), "32FC1"),
         ("bayer_rggb8; jpeg compressed mono8", JPEG, "bayer_rggb8.*mono16"),
         ("bgra8; jpeg compressed bgr8", encoded(".jpg", COLOUR), "bgra8"),
-        ("16UC1; compressedDepth png", bytes(12) + encoded(".png", WIDE), "no known kind"),
+        ("16UC1; compressedDepth png", bytes(12) + encoded(".png", WIDE), "unknown format"),
         ("16UC1; compressedDepth png", encoded(".png", WIDE), "compressedDepth"),
         ("mono8; tiff compressed ", encoded(".png", GREY), "tiff"),
         ("h264", encoded(".png", GREY), "h264"),

@@ -389,7 +389,10 @@ def session(**changes: Any) -> Session:
 def test_images() -> None:
     only(check_images(IMAGES, session()), OK, "10 Hz", "96 x 96 mono8")
     only(
-        check_images(IMAGES, session(arrivals={})), PROBLEM, "nothing came within 3 s", "--seconds"
+        check_images(IMAGES, session(arrivals={})),
+        PROBLEM,
+        "nothing arrived within 3 s",
+        "--seconds",
     )
     bad = ImageSeen(96, 96, "bayer_rggb8", 9216, "bad encoding; expected mono8")
     only(check_images(IMAGES, session(image=bad)), PROBLEM, "bayer_rggb8")
@@ -447,7 +450,7 @@ def test_magnification() -> None:
         return check_magnification(MAGNIFICATION, describe_magnifications(heard, config), heard)
 
     only(found(session()), OK, "1000")
-    only(found(session(reading=None)), PROBLEM, "nothing came", "transient local")
+    only(found(session(reading=None)), PROBLEM, "nothing arrived", "transient local")
     only(
         found(session(reading=None, reading_trouble="a value of -1; expected more")), PROBLEM, "-1"
     )
@@ -522,7 +525,7 @@ def test_the_calibration_in_force_is_the_given_one_or_that_of_the_topic() -> Non
     other = replace(CALIBRATION, magnifications=(500.0, 900.0))
     found = judged(session(calibration_text=text), ("other.yaml", other))
     assert [f.level for f in found if "extrapolated" in str(f)] == [PROBLEM]
-    assert [f.level for f in found if "another one than other.yaml" in str(f)] == [NOTE]
+    assert [f.level for f in found if "another calibration than other.yaml" in str(f)] == [NOTE]
     broken = [f for f in judged(session(calibration_text="{}")) if f.level is PROBLEM]
     only(broken, PROBLEM, "calibration", "topic")
 
@@ -551,8 +554,8 @@ def test_without_ros_it_says_so_and_checks_the_rest(
     assert status == 1
     lines = output.splitlines()
     assert any(line.startswith("ok       Python") for line in lines)
-    assert any(line.startswith("problem  ROS 2: rclpy is not there") for line in lines)
-    assert any(line.startswith("note     topics: not looked at") for line in lines)
+    assert any(line.startswith("problem  ROS 2: rclpy is not installed") for line in lines)
+    assert any(line.startswith("note     topics: not checked") for line in lines)
     status, output = doctor(capsys, "--json")
     told = json.loads(output)
     assert status == told["problems"] == 1

@@ -76,7 +76,7 @@ def test_plot_and_table_of_the_same_drift(blanked, tmp_path, capsys):
     command = ("drift", blanked, "--config", "virtual_sem", "-o", table)
     assert run(*command, "--plot", plot) == 0
     out = capsys.readouterr().out
-    assert "2 frames coasting: image: blank picture" in out
+    assert "2 frames coasting: image: blank" in out
     assert f"plot: {plot}" in out
     image = cv2.imread(str(plot))
     assert image.shape[0] > 600 and image.shape[1] > 1000
@@ -198,7 +198,7 @@ def test_frames_without_drift_are_left_out(blanked, tmp_path, capsys):
     assert run("stack", blanked, "--config", "virtual_sem", "-o", out) == 0
     told = capsys.readouterr().out
     assert f"{FRAMES - 2} of {FRAMES} frames averaged" in told
-    assert "2 frames coasting: image: blank picture" in told
+    assert "2 frames coasting: image: blank" in told
     with_blank = tmp_path / "all.png"
     assert run("stack", blanked, "--no-drift", "-o", with_blank) == 0
     mean, darker = (cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in (out, with_blank))

@@ -149,4 +149,4 @@ def test_a_recording_without_a_cantilever(calibration, tmp_path, capsys):
     blank = {0: np.full((SIZE, SIZE), 90, np.uint8)}
     bag = recorded(tmp_path / "blank", replace(PLAN, frames=PLAN.frames[:1]), blank, (0,))
     command = ("measure", "cantilever", bag, "--calibration", calibration, *LENGTH)
-    assert "no strip in the picture" in refused(capsys, *command, "-o", tmp_path / "d.csv")
+    assert "no strip in the image" in refused(capsys, *command, "-o", tmp_path / "d.csv")

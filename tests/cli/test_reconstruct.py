@@ -15,13 +15,17 @@ from semcal_ros.files.meshes import encode_mesh, save_cloud, save_mesh
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.drift import drift_preset
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
+from tests.helpers.made_once import folder_once
 from tests.helpers.semcal_runs import run
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder():
     """A calibration from the grid, and 26 frames of the ball."""
-    base = tmp_path_factory.mktemp("reconstruct")
+    return folder_once("reconstruct", _record_and_calibrate)
+
+
+def _record_and_calibrate(base):
     grid = [x for g in (9000, 9500, 10000) for x in ("--magnification", g)]
     assert run("simulate", base / "grid", "--views", 3, *grid) == 0
     assert run("calibrate", base / "grid", "-o", base / "cal.yaml") == 0
@@ -41,7 +45,6 @@ def folder(tmp_path_factory):
         detector=Detector(electrons=400.0),
     )
     write_simulated(base / "ball", plan.frames, map(plan.render, range(len(plan))), plan.truth())
-    return base
 
 
 @pytest.mark.slow
@@ -69,6 +72,7 @@ def test_the_ball_comes_out(folder, capsys):
     assert b"comment unit nm" in (folder / "c.ply").read_bytes()[:200]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("output", "reason"),
     [("ball.obj", "ball.obj"), ("missing/ball.ply", "no folder")],
@@ -80,6 +84,7 @@ def test_outputs_are_checked_before_any_work(folder, capsys, output, reason):
     assert reason in line
 
 
+@pytest.mark.slow
 def test_a_specimen_that_does_not_turn_is_refused(folder, capsys):
     options = ("--calibration", folder / "cal.yaml", "-o", folder / "flat.ply")
     assert run("reconstruct", folder / "grid", *options) == 2

@@ -13,15 +13,18 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.cli import main
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.reader import open_bag
+from tests.helpers.made_once import folder_once
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def calibration(reference_data, tmp_path_factory):
-    path = tmp_path_factory.mktemp("reference") / "cal.yaml"
-    assert main(["calibrate", str(reference_data / "grid_calibration"), "-o", str(path)]) == 0
-    return path
+def calibration(reference_data):
+    def calibrate(folder):
+        command = ["calibrate", str(reference_data / "grid_calibration")]
+        assert main([*command, "-o", str(folder / "cal.yaml")]) == 0
+
+    return folder_once("reference", calibrate) / "cal.yaml"
 
 
 def _true_cameras(reference_data, recording):

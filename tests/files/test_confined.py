@@ -1,4 +1,4 @@
-"""Files outside of the folder in which a running program may read."""
+"""Files outside the folder in which a running program may read."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_start_is_trusted_with_its_file_and_its_folder(tmp_path: Path) -> No
     # A directory of its own takes the place of that folder, not of the file.
     by_directory = AllowedPaths(str(tmp_path / "other"), [str(start)])
     assert by_directory.resolve(str(start)) == start
-    with pytest.raises(InvalidValueError, match="inside of"):
+    with pytest.raises(InvalidValueError, match="inside"):
         by_directory.resolve(str(tmp_path / "b.yaml"))
     with pytest.raises(InvalidValueError, match="directory"):
         AllowedPaths().resolve(str(start))

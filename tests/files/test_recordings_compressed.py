@@ -116,7 +116,7 @@ def test_a_recording_with_the_other_type_only_is_read_with_a_note(tmp_path: Path
     assert frame.image[0, 0] == 2
     assert notes == (f"the images on /sem/image_raw are {IMAGE_TYPE}, not {COMPRESSED_IMAGE_TYPE}",)
     # A driver that publishes compressed images only may leave out the suffix, or use a name of its own.
-    for number, topic in enumerate(("/sem/image_raw", "/jeol/picture")):
+    for number, topic in enumerate(("/sem/image_raw", "/jeol/image")):
         path = recorded(tmp_path / str(number), (topic, flat(3, "png")))
         (frame,), notes = frames_and_notes(path, RAW)
         assert frame.image[0, 0] == 3
@@ -147,8 +147,8 @@ def test_the_same_images_compressed_are_better_than_others_raw(tmp_path: Path) -
 def test_several_candidates_are_refused(tmp_path: Path) -> None:
     path = recorded(
         tmp_path / "bag",
-        ("/a/picture/compressed", flat(1, "png")),
-        ("/b/picture/compressed", flat(2, "png")),
+        ("/a/image/compressed", flat(1, "png")),
+        ("/b/image/compressed", flat(2, "png")),
     )
     with pytest.raises(BagError, match="several topics could be the image"):
         frames_and_notes(path, RAW)

@@ -1,4 +1,4 @@
-"""SEM images of makers: whatever the bytes, a grey picture with a credible pixel size, or one clear line."""
+"""SEM images of makers: whatever the bytes, a grey image with a credible pixel size, or one clear line."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _packed() -> bytes:
 
 
 def _by_opencv(flag: int) -> bytes:
-    """A compressed picture of OpenCV's own writer, whose directory then gets a maker's tag."""
+    """A compressed image of OpenCV's own writer, whose directory then gets a maker's tag."""
     done, data = cv2.imencode(
         ".tif", np.tile(_PIXELS, (3, 3)), [cv2.IMWRITE_TIFF_COMPRESSION, flag]
     )
@@ -281,7 +281,7 @@ def _odd_files(draw: st.DrawFn) -> bytes:
     return _tiff(entries, strip, order=order)
 
 
-# A small file that declares a large picture, of which no part is there.
+# A small file that declares a large image, of which no part is there.
 _HOLLOW = [
     _tiff(
         [
@@ -339,7 +339,7 @@ def test_odd_directories(place: Path, data: bytes) -> None:
 
 @st.composite
 def _odd_texts(draw: st.DrawFn) -> tuple[bytes, str | None]:
-    """An intact picture with the edited text of a maker."""
+    """An intact image with the edited text of a maker."""
     maker = draw(st.sampled_from(sorted(_TEXTS)))
     text = draw(edited_text([_TEXTS[maker]], _PIECES))
     return _valid(maker, text), text if maker == "jeol" else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import cache
 
 from semcal_ros.core.calibration.calibrate import (
@@ -12,6 +13,7 @@ from semcal_ros.core.calibration.calibrate import (
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
+from tests.helpers.made_once import made_once
 
 NOISE_PX = 0.05
 CALIBRATED = (100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0)
@@ -45,9 +47,13 @@ def calibrated(
 ) -> CalibrationResult:
     """A preset, calibrated from such views."""
     microscope = preset(name)
-    return calibrate_views(
-        seen_views(name, magnifications, views, seed),
-        image_size=microscope.image_size,
-        display_width_m=microscope.display_width_m,
-        options=options,
+    asked = repr((name, options, magnifications, views, seed))
+    return made_once(
+        f"calibrated-{hashlib.sha256(asked.encode()).hexdigest()[:16]}",
+        lambda: calibrate_views(
+            seen_views(name, magnifications, views, seed),
+            image_size=microscope.image_size,
+            display_width_m=microscope.display_width_m,
+            options=options,
+        ),
     )

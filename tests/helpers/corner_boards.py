@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import Rejection
+from tests.helpers.made_once import made_once
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Board:
         return h[:, :2] / h[:, 2:]
 
     def corners(self, margin: float = 6.0) -> tuple[NDArray[np.int64], Array]:
-        """Indices and pixels of the corners at least ``margin`` px inside of the image."""
+        """Indices and pixels of the corners at least ``margin`` px inside the image."""
         frame = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
         corner_uv = self.board_from_image(frame.astype(np.float64))
         low, high = np.floor(corner_uv.min(axis=0)) - 2, np.ceil(corner_uv.max(axis=0)) + 2
@@ -108,7 +110,7 @@ class Board:
         return bright.astype(np.float64)
 
     def clean(self, samples: int = 8) -> Array:
-        """(h, w) noise-free picture with values between ``dark`` and 1, before shading.
+        """(h, w) noise-free image with values between ``dark`` and 1, before shading.
 
         Pixels that an edge may cross are averaged over ``samples`` x ``samples`` points.
         """
@@ -138,7 +140,7 @@ class Board:
     def render(
         self, rng: np.random.Generator, dtype: type = np.uint8, samples: int = 8
     ) -> NDArray[np.generic]:
-        """(h, w) picture with shading and shot noise, quantised."""
+        """(h, w) image with shading and shot noise, quantised."""
         picture = self.clean(samples)
         y, x = np.mgrid[0.0 : self.height, 0.0 : self.width]
         ramp = 1.0 + self.shading * ((x / self.width - 0.5) + 0.7 * (y / self.height - 0.5) ** 2)
@@ -155,7 +157,7 @@ def position_bound(board: Board, ij: NDArray[np.int64]) -> Array:
     """(n, 2, 2) Cramer-Rao bound of the corners ``ij`` from the pixels nearest to each, px^2.
 
     Everything but the position is taken for known. The information is that of Poisson counts, with
-    derivatives of the noise-free picture from rendering the board twice, a little moved; nothing of
+    derivatives of the noise-free image from rendering the board twice, a little moved; nothing of
     the finder is used. For boards without distortion and perspective, where all corners move alike.
     """
     assert board.distortion == 0 and board.perspective == 0 and board.electrons > 0
@@ -198,3 +200,10 @@ def rejected(image: NDArray[Any]) -> Rejection[LatticeStatus]:
     detection = find_lattice(image)
     assert isinstance(detection, Rejection)
     return detection
+
+
+def seen_photograph(path: Path) -> LatticeDetection:
+    """The lattice of a photograph of the reference data, found once in a run."""
+    return made_once(
+        f"photograph-{path.stem}", lambda: detected(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    )

@@ -1,4 +1,4 @@
-"""Pictures whose shift is known exactly, for the tests of drift."""
+"""Images whose shift is known exactly, for the tests of drift."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def make_calibration() -> Calibration:
 
 
 def texture(seed: int = 0, size: int = SIZE) -> NDArray[np.uint8]:
-    """A smooth random picture, whose shifts can be measured."""
+    """A smooth random image, whose shifts can be measured."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.fft2(rng.normal(size=(size, size)))
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,13 @@ NODES: tuple[str, ...] = tuple(PYPROJECT["project"]["entry-points"]["semcal_ros.
 """Names of the ROS executables."""
 
 
-def runtime_imports(path: Path) -> Iterator[str]:
+@cache
+def runtime_imports(path: Path) -> tuple[str, ...]:
     """Full names of all that a module imports at run time, inside functions too."""
+    return tuple(_runtime_imports(path))
+
+
+def _runtime_imports(path: Path) -> Iterator[str]:
     pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -25,9 +26,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
+from tests.helpers.node_template import Copy, Template
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 # Generous: other jobs may run on the same machine. Nothing waits longer than it has to.
 TIMEOUT_S = 30.0
+# Tests wait for what nodes report; once a second, as in earnest, they would do little else.
+REPORT_PERIOD_S = 0.1
+# Fast DDS reads it when a process creates its first participant.
+_PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -38,31 +45,45 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PATIENT = {"qos_overrides./sem/image_raw.subscription.depth": 50}
 
 
+_TEMPLATE = Template()
+
+
 class NodeProcess:
-    """One executable; ``output`` is what it wrote so far."""
+    """One executable; ``output`` is what it wrote so far.
+
+    It is a copy of a process that has done the imports already. With ``cold`` it is started as a user starts it.
+    """
 
     def __init__(
         self,
         name: str,
         parameters: Mapping[str, Any] | None = None,
         arguments: tuple[str, ...] = (),
+        *,
+        cold: bool = False,
     ) -> None:
         self.name = name
-        command = [sys.executable, "-m", f"semcal_ros.nodes.{name}", "--ros-args"]
-        for key, value in (parameters or {}).items():
+        command = ["--ros-args"]
+        given = {"diagnostics_period": REPORT_PERIOD_S, **(parameters or {})}
+        for key, value in given.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-p", f"{key}:={text}"]
+        command += arguments
         environment = dict(os.environ)
         paths = [str(REPOSITORY), environment.get("PYTHONPATH", "")]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
         self._log = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 - lives as long as the process
-        self.process = subprocess.Popen(
-            [*command, *arguments],
-            stdout=self._log,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            env=environment,
-        )
+        self.process: subprocess.Popen[bytes] | Copy
+        if cold:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", f"semcal_ros.nodes.{name}", *command],
+                stdout=self._log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment,
+            )
+        else:
+            self.process = _TEMPLATE.copy(name, command, environment, self._log.fileno())
 
     @property
     def output(self) -> str:
@@ -102,10 +123,13 @@ def ended(name: str, parameters: Mapping[str, Any] | None = None) -> tuple[int, 
 
 @contextmanager
 def running(
-    name: str, parameters: Mapping[str, Any] | None = None, *arguments: str
+    name: str,
+    parameters: Mapping[str, Any] | None = None,
+    *arguments: str,
+    cold: bool = False,
 ) -> Iterator[NodeProcess]:
     """An executable that is stopped at the end."""
-    process = NodeProcess(name, parameters, arguments)
+    process = NodeProcess(name, parameters, arguments, cold=cold)
     try:
         yield process
     finally:
@@ -113,16 +137,26 @@ def running(
         process.close()
 
 
+@contextmanager
+def _quick_discovery() -> Iterator[None]:
+    """What is created within announces itself ten times a second; the nodes under test keep the defaults."""
+    with pytest.MonkeyPatch.context() as patch:
+        if _PROFILE not in os.environ:
+            patch.setenv(_PROFILE, str(REPOSITORY / "tests" / "helpers" / "quick_discovery.xml"))
+        yield
+
+
 class Peer:
     """A node of the test with what it has received, spun only while the test waits."""
 
     def __init__(self, name: str = "peer", namespace: str = "sem") -> None:
         self.context = Context()
-        rclpy.init(context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node(name, context=self.context, namespace=namespace)
+        with _quick_discovery():
+            rclpy.init(context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+            self.node = Node(name, context=self.context, namespace=namespace)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        self._diagnostics = self.collect(DiagnosticArray, "/diagnostics")
+        self.diagnostics = self.collect(DiagnosticArray, "/diagnostics")
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -137,7 +171,7 @@ class Peer:
 
     def state(self, node: str) -> dict[str, str]:
         """Latest diagnostics of a node, by its fully qualified name; ``level`` and ``message`` too."""
-        for array in reversed(self._diagnostics):
+        for array in reversed(self.diagnostics):
             for status in array.status:
                 if status.name == f"{node}: stream":
                     values = {value.key: value.value for value in status.values}

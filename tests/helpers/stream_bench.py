@@ -83,7 +83,7 @@ def pixels(message: Any) -> NDArray[Any]:
 
 
 def noisy(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
-    """The picture as another frame would show it."""
+    """The image as another frame would show it."""
     noise = np.random.default_rng(seed).normal(0.0, NOISE, picture.shape)
     return np.clip(np.round(picture + noise), 0, 255).astype(np.uint8)
 
@@ -156,10 +156,16 @@ class Watch:
     arrays: list[Any] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.arrays = self.peer.collect(DiagnosticArray, "/diagnostics")
+        self._since_ns = 0
+        self.peer.node.create_subscription(DiagnosticArray, "/diagnostics", self._take, RELIABLE)
+
+    def _take(self, array: Any, info: Mapping[str, Any]) -> None:
+        if info["source_timestamp"] >= self._since_ns:
+            self.arrays.append(array)
 
     def forget(self) -> None:
-        """What was said so far is no news."""
+        """What was said so far is no news, nor what has not been handled yet."""
+        self._since_ns = time.time_ns()
         self.arrays.clear()
 
     def states(self, node: str) -> list[dict[str, str]]:
@@ -183,8 +189,6 @@ class Watch:
 
     def wait_fresh(self, node: str) -> dict[str, str]:
         """The second report from now on: the first may have been under way already."""
-        # What piled up while the test waited for something else is older.
-        self.peer.spin(0.3)
         self.forget()
         self.peer.wait_for(lambda: len(self.states(node)) >= 2, f"two reports of {node}")
         return self.latest(node)

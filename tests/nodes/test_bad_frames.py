@@ -167,7 +167,7 @@ def test_pixels_that_are_no_numbers_stay_where_they_are(bench: Bench) -> None:
         bench.send(image_message(image, float(bench.sent), encoding="32FC1"))
         message = bench.expect(bench.sent)
         assert message.encoding == "32FC1"
-    # Nothing of it stays in a picture that the drift is measured against.
+    # Nothing of it stays in an image that the drift is measured against.
     message = bench.exchange(texture(3))
     np.testing.assert_array_equal(pixels(message), bench.kind.right(texture(3), MAGNIFICATION))
 
@@ -199,7 +199,9 @@ def test_an_absurd_magnification_is_refused_and_the_old_one_not_used_on(bench: B
     assert state["magnification"] == "unknown"
     assert state["level"] == "1"
     assert "waiting for magnification" in state["message"]
-    assert "last rejection: a magnification of" in state["message"]
+    # In one of the reports since each; this one may only have counted the last frame.
+    said = [earlier["message"] for earlier in bench.watch.states(bench.kind.full_name)]
+    assert any("last rejection: a magnification of" in text for text in said)
     assert len(bench.images) == 1
     bench.set_magnification(3000.0)
     message = bench.exchange(texture(50))
@@ -210,7 +212,7 @@ def test_an_absurd_magnification_is_refused_and_the_old_one_not_used_on(bench: B
 
 
 def test_the_ends_of_the_magnifications_that_are_possible_give_an_answer(bench: Bench) -> None:
-    """Far outside of the calibrated range: an image with a warning, or a reason, and then all is well again."""
+    """Far outside the calibrated range: an image with a warning, or a reason, and then all is well again."""
     for done, magnification in enumerate((1.0, 1e8), 1):
         bench.set_magnification(magnification)
         bench.send(texture())
@@ -237,26 +239,23 @@ def test_neither_memory_nor_the_log_grows_with_bad_messages(bench: Bench) -> Non
 
     def flood(first: int, last: int) -> int:
         for index in range(first, last):
-            message = _frame(SIZE, SIZE, SIZE + index, 10 * index)()
+            message = _frame(SIZE, SIZE, SIZE + index, 40 * index)()
             message.encoding = f"encoding {index}" if index % 2 else "mono8"
             bench.send(message)
-            bench.set_magnification(-float(index))
-            if index % 20 == 0:
-                # Not faster than they can be refused: all shall be.
-                bench.peer.spin(0.02)
-        sent = bench.sent
-        bench.peer.wait_for(
-            lambda: bench.count("received") + bench.count("dropped") == sent, f"frame {sent}"
-        )
+            bench.magnification.publish(magnification_message(-float(index)))
+            if index % 40 == 0 or index == last - 1:
+                # Not faster than they can be refused, of which 50 may wait: all shall be.
+                bench.wait_counts(received=bench.sent, dropped=0)
         return bench.resident_kib()
 
     start = time.monotonic()
-    first = flood(1, 400)
-    # What the allocator and the log handlers reserve is reserved by now. 800 more frames of 8 kB on average are
-    # 6 MB and their reasons 0.3 MB, of which nothing may stay: a page here and there is left for the allocator.
-    grown_kib = flood(400, 1200) - first
+    first = flood(1, 200)
+    # What the allocator and the log handlers reserve is reserved by now. 400 more frames of 16 kB on average are
+    # 6 MB, of which nothing may stay: a page here and there is left for the allocator.
+    grown_kib = flood(200, 600) - first
     assert grown_kib < 2 * 1024
-    assert bench.count("rejected") > 300
+    # The value of a magnification may be overtaken by the next.
+    assert bench.count("rejected") >= 599
     lines = [line for line in bench.node.output.splitlines() if "[WARN]" in line]
     assert lines
     # A hundred reasons in ten seconds are enough for who reads them.

@@ -15,6 +15,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
+from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.core.rectification.rectifier import Rectifier
 from tests.helpers.node_scenes import (
     RANGE,
@@ -149,7 +150,7 @@ def test_a_magnification_out_of_the_calibrated_range_is_answered_and_said(bench:
     bench.peer.wait_for(lambda: bench.images, "the frame")
     state = bench.peer.wait_for(
         lambda: (
-            "outside of the calibrated range" in bench.state().get("message", "") and bench.state()
+            "outside the calibrated range" in bench.state().get("message", "") and bench.state()
         ),
         "the warning",
     )
@@ -242,6 +243,14 @@ def test_a_topic_of_another_type_is_reported(peer: Peer) -> None:
         assert node.process.poll() is None
 
 
+def test_reports_come_at_the_period_that_was_asked_for(peer: Peer) -> None:
+    with running("parameter_server", {"diagnostics_period": 0.3}):
+        peer.wait_for(lambda: len(peer.diagnostics) >= 6, "six reports")
+    sent_s = [stamp_ns_from_msg(report) * 1e-9 for report in peer.diagnostics[:6]]
+    # A busy machine delays single ones; the default is 1 s.
+    assert 4.0 * 0.3 < sent_s[-1] - sent_s[0] < 5.0 * 0.9
+
+
 def test_a_microscope_that_publishes_its_pixel_size_in_another_message(
     peer: Peer, calibration_file: Path
 ) -> None:
@@ -272,6 +281,7 @@ def test_a_microscope_that_publishes_its_pixel_size_in_another_message(
         ("rectifier", {"calibration": "/no/such/file.yaml"}, "/no/such/file.yaml"),
         ("rectifier", {"interpolation": "nearest"}, "one of linear, cubic, lanczos4"),
         ("stream_corrector", {"max_jump": 7.0}, "max_jump"),
+        ("parameter_server", {"diagnostics_period": 0.0}, "diagnostics_period"),
         ("bag_player", {}, "the parameter bag"),
         ("bag_player", {"bag": "/no/such/bag"}, "/no/such/bag"),
         ("virtual_sem", {"preset": "toaster"}, "toaster"),
@@ -321,7 +331,8 @@ def test_images_too_large_for_the_transport_are_told(
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     publisher = peer.node.create_publisher(Image, "image_raw", RELIABLE)
-    with running("rectifier"):
+    # The allocator reads its variables when a process starts.
+    with running("rectifier", cold=True):
         peer.wait_for(lambda: publisher.get_subscription_count() == 1, "the subscription")
         for count, size in enumerate((SIZE, 1100), 1):
             publisher.publish(image_message(np.zeros((size, size), np.uint8)))

@@ -42,7 +42,7 @@ SERVER = "/sem/parameter_server"
 
 
 def _other_calibration() -> Calibration:
-    """One that is 10 % off: no picture and no camera of it can be mixed up with the first."""
+    """One that is 10 % off: no image and no camera of it can be mixed up with the first."""
     scale = CALIBRATION.functions["scale"]
     larger = dataclasses.replace(scale, coefficients=scale.coefficients * 1.1)
     return dataclasses.replace(CALIBRATION, functions={**CALIBRATION.functions, "scale": larger})

@@ -83,7 +83,10 @@ def test_a_magnification_that_changes_during_a_scan(
         start_s = now_s(peer)
         peer.spin(0.2)
         after = send(start_s)
-        peer.wait_for(lambda: images and stamp_of(images[-1]) == after, "the frame after")
+        peer.wait_for(
+            lambda: images and stamp_of(images[-1]) == stamp_of(infos[-1]) == after,
+            "the frame after",
+        )
         peer.wait_for(
             lambda: peer.state(f"/sem/{node}").get("frames_mixed") == "1",
             f"the count: {peer.state(f'/sem/{node}')}",

@@ -1,4 +1,4 @@
-"""DDS security: the shipped policy, refusal instead of running open, and what who is outside of a policy gets."""
+"""DDS security: the shipped policy, refusal instead of running open, and what who is outside a policy gets."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_only_the_operator_may_call_the_whole_suite_and_only_it_has_wildcards() 
     calls = {name: {t for t in g.publish if t[:2] == "rq"} for name, g in GRANTED.items()}
     wild = {name for name, g in GRANTED.items() if any("*" in t for t in g.all)}
     assert wild == {"/sem/operator"}
-    # The servo lets the corrector begin anew where its picture has left the field.
+    # The servo lets the corrector begin anew where its image has left the field.
     assert calls.pop("/sem/visual_servo") == {"rq/sem/stream_corrector/resetRequest"}
     assert {name for name, called in calls.items() if called} == {"/sem/operator"}
 
@@ -121,7 +121,8 @@ def names(found: list[tuple[str, list[str]]]) -> list[str]:
 def test_the_policy_grants_a_node_what_it_uses_and_no_more(node: str, tmp_path: Path) -> None:
     granted = GRANTED[f"/sem/{node}"]
     needed = granted.all - SOMETIMES
-    with peer("peer", {}) as observer, running(node, parameters_of(node, tmp_path)):
+    # Each executable is started here as a user starts it.
+    with peer("peer", {}) as observer, running(node, parameters_of(node, tmp_path), cold=True):
         # Its last entity is made before it reports.
         observer.wait_for(lambda: observer.state(f"/sem/{node}"), f"{node} to report")
         known = observer.node.get_node_names_and_namespaces

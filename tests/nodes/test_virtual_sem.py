@@ -58,9 +58,20 @@ def test_frames_follow_magnification_and_depth(peer: Peer) -> None:
         assert not peer.set_parameter(SEM, "tilt_deg", steep).successful
 
 
+def _pairs(raw: list[Any], held: list[Any]) -> list[tuple[Any, Any]]:
+    """Frames as they came from the microscope and as they came from the compensator."""
+    by_stamp = {stamp_of(m): m for m in raw}
+    return [(by_stamp[stamp_of(m)], m) for m in held if stamp_of(m) in by_stamp]
+
+
+def _change(first: Any, last: Any, margin_px: int) -> float:
+    inner = (slice(margin_px, -margin_px),) * 2
+    return float(np.std(pixels(first)[inner].astype(float) - pixels(last)[inner]))
+
+
 @pytest.mark.parametrize("tracking", ["every_frame", "forecast"])
 def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: str) -> None:
-    """The stage moves at a known speed; the compensator finds that drift and holds the picture."""
+    """The stage moves at a known speed; the compensator finds that drift and holds the image."""
     speed_px_s = np.array([6.0, -3.0])
     raw = peer.collect(Image, "image_raw")
     held = peer.collect(Image, "image_stabilized")
@@ -71,13 +82,30 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: s
     with running("drift_compensator", config), running("virtual_sem", SETTINGS):
         outputs = ("image_stabilized", "drift", "drift_velocity")
         peer.wait_heard("/sem/drift_compensator", *outputs)
-        peer.wait_for(lambda: raw and len(held) >= 2, "frames of the resting stage")
+        peer.wait_for(lambda: len(_pairs(raw, held)) >= 2, "frames of the resting stage")
+
+        def is_measured() -> bool:
+            return drifts[-1].pose.pose.position.x != 0.0
+
+        # With a forecast, the process that measures beside the stream has to start first. What moved meanwhile would
+        # be too far away by then to be the same place.
+        peer.wait_for(is_measured, "drift other than the zero of the first frame", timeout_s=60.0)
+        at_rest = _pairs(raw, held)[-1]
         peer.wait_for(lambda: stage.get_subscription_count() == 1, "the stage")
         twist = Twist()
         twist.linear.x, twist.linear.y = (speed_px_s * PIXEL_M).tolist()
         stage.publish(twist)
         start = len(held)
         peer.wait_for(lambda: min(map(len, (held, drifts, rates))) >= start + 12, "moving frames")
+
+        def is_held(way_px: float) -> bool:
+            """Whether the newest picture is that of before, which without compensation it is not."""
+            # What has left the field meanwhile cannot be in it.
+            margin_px = max(48, int(way_px) + 8)
+            assert margin_px < SIZE // 2 - 16, "nothing is left to compare"
+            pairs = zip(at_rest, _pairs(raw, held)[-1], strict=True)
+            raw_change, held_change = (_change(*pair, margin_px) for pair in pairs)
+            return held_change < 0.5 * raw_change
 
         # A tenth of a px, and three per cent of the way: the scale of the display width is no better. A forecast
         # comes from a registration some frames back.
@@ -96,11 +124,11 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: s
                 found_px_s == pytest.approx(speed_px_s, abs=0.5)
                 and np.linalg.norm(way_px) > 20.0
                 and 0.0 < sigma_px < base_px + 0.031 * abs(last.x) / PIXEL_M
+                and is_held(np.abs(way_px).max())
             )
 
-        # With a forecast, the process that measures beside the stream has to start and to catch up first.
-        peer.wait_for(is_settled, "the velocity, a long way and a small 1-sigma", timeout_s=60.0)
-        end = min(map(len, (held, drifts, rates))) - 1
+        what = "the velocity, a long way, a small 1-sigma and a picture at rest"
+        peer.wait_for(is_settled, what, timeout_s=60.0)
         twist.linear.x = twist.linear.y = 0.0
         stage.publish(twist)
         counted = peer.wait_for(
@@ -108,17 +136,8 @@ def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: s
         )
         # All but the first one.
         assert (int(counted) > 10) == (tracking == "forecast")
-    by_stamp = {stamp_of(m): m for m in raw}
+    by_stamp = {stamp_of(m) for m in raw}
     # This side may have found the SEM later than the compensator did.
     heard = {stamp_of(m) for m in held if stamp_of(m) >= min(by_stamp)}
     assert heard
-    assert heard <= set(by_stamp)
-
-    def change(first: Any, last: Any) -> float:
-        inner = (slice(48, -48), slice(48, -48))
-        return float(np.std(pixels(first)[inner].astype(float) - pixels(last)[inner]))
-
-    first, last = held[start], held[end]
-    held_change = change(first, last)
-    raw_change = change(by_stamp[stamp_of(first)], by_stamp[stamp_of(last)])
-    assert held_change < 0.5 * raw_change
+    assert heard <= by_stamp

@@ -162,7 +162,7 @@ def test_a_lost_target_a_missing_camera_and_a_turned_knob_stop_it(peer: Peer) ->
         stopped("without a camera")
         microscope.camera = SCOPE.camera_at(G)
         goes()
-        # A camera that is consistent in itself, and of another magnification than the picture.
+        # A camera that is consistent in itself, and of another magnification than the image.
         microscope.camera = SCOPE.camera_at(1.3 * G)
         microscope.tell_camera(1.3 * G)
         # No further frame is needed for that.

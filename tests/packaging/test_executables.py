@@ -75,8 +75,17 @@ def _wait_for(observer: Node, name: str, process: subprocess.Popen[str]) -> None
     raise AssertionError(f"{name} did not appear in the ROS graph within {START_S} s")
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["sigint", "sigterm"])
-@pytest.mark.parametrize("name", NODES)
+# Both signals end in one handler of run_node, so each node gets one of them in turn; both where a node has
+# processes of its own or must end its publishing itself.
+STOPS = [
+    (name, stop)
+    for k, name in enumerate(NODES)
+    for j, stop in enumerate((signal.SIGINT, signal.SIGTERM))
+    if k % 2 == j or name in ("bag_player", "calibration_server")
+]
+
+
+@pytest.mark.parametrize(("name", "stop"), STOPS, ids=[f"{n}-{s.name.lower()}" for n, s in STOPS])
 def test_an_executable_starts_and_stops(
     name: str, stop: signal.Signals, observer: Node, arguments: dict[str, list[str]]
 ) -> None:

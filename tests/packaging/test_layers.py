@@ -30,7 +30,9 @@ MAY_IMPORT = {
     "report": {"core", "applications", "files"},
     # What programs hold: it has a file, and it can be drawn.
     "calibration": {"core", "files", "report"},
-    "workflows": {"core", "applications", "config", "bridge", "files", "calibration"},
+    "workflows": {
+        *("core", "applications", "synthetic", "config", "bridge", "files", "calibration"),
+    },
     "nodes": {
         *("core", "applications", "synthetic", "config", "middleware"),
         *("bridge", "files", "calibration", "workflows"),

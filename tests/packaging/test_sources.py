@@ -53,6 +53,7 @@ def test_public_modules_say_what_they_offer() -> None:
     assert [str(p.relative_to(ROOT)) for p in public if not _says_what_it_offers(p)] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["benchmarks", "examples"])
 def test_scripts_find_what_they_import(folder: str) -> None:
     """Benchmarks are not run here, so that a name that has moved would be noticed late."""

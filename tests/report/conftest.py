@@ -9,6 +9,7 @@ import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
 from semcal_ros.report import write_calibration_report
+from tests.helpers.made_once import folder_once, made_once
 from tests.helpers.report_samples import (
     DISPLAY_M,
     HOSTILE,
@@ -27,12 +28,19 @@ def result() -> CalibrationResult:
         for g in (100.0, 400.0, 1500.0, 5000.0)
         for k, tilt in enumerate((2.0, 25.0, 32.0, 28.0))
     ]
-    return calibrate_views(views, image_size=(SIZE, SIZE), display_width_m=DISPLAY_M)
+    return made_once(
+        "report",
+        lambda: calibrate_views(views, image_size=(SIZE, SIZE), display_width_m=DISPLAY_M),
+    )
 
 
 @pytest.fixture(scope="session")
-def page_path(result: CalibrationResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("report") / "report.html"
+def page_path(result: CalibrationResult) -> Path:
+    return folder_once("report-page", lambda folder: _write(result, folder)) / "report.html"
+
+
+def _write(result: CalibrationResult, folder: Path) -> None:
+    path = folder / "report.html"
     path.write_text("an older report")
     written = write_calibration_report(
         result,
@@ -47,4 +55,3 @@ def page_path(result: CalibrationResult, tmp_path_factory: pytest.TempPathFactor
         title=f"Microscope {HOSTILE}",
     )
     assert written == path
-    return path

@@ -21,12 +21,12 @@ from semcal_ros.report.drift_figures import plot_drift, write_drift_figure
 from tests.helpers.drift_scenes import make_drift_update
 
 REASONS = (
-    "image: blank picture (all pixels at 20)",
-    "image: blank picture (all pixels at 255)",
+    "image: blank (all pixels at 20)",
+    "image: blank (all pixels at 255)",
     "no shift stands out: featureless, or another place",
-    "ambiguous: shifts (1.0, -2.0) and (-30.0, 4.0) px explain the picture equally well",
+    "ambiguous: shifts (1.0, -2.0) and (-30.0, 4.0) px explain the image equally well",
     "shift is 529 deviations from the prediction",
-    "pictures differ (noise-corrected correlation 0.31)",
+    "images differ (noise-corrected correlation 0.31)",
     "jump of (200, 3) px: a move of the stage with $\\frac{ in its text",
 )
 
@@ -135,7 +135,7 @@ def test_frames_that_were_not_used_are_counted_by_reason_and_marked_in_each_plot
     figure = plot_drift(path)
     key = key_of(figure)
     assert key[0] == "33 of 40 frames tracked, 1 of them as keyframe"
-    assert key[1] == "2 not used: image: blank picture (all pixels at …)"
+    assert key[1] == "2 not used: image: blank (all pixels at …)"
     assert key[-1] == "3 not used: other reasons"
     assert sum(int(text.split()[0]) for text in key[1:]) == len(REASONS)
     coasting = np.flatnonzero(~path.accepted)

@@ -81,7 +81,10 @@ def long_words_text() -> str:
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("kind", ["calibration", "long words", "correction"])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param("calibration", marks=pytest.mark.slow), "long words", "correction"],
+)
 def test_page_fits_the_window_without_console_errors(
     tmp_path: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:

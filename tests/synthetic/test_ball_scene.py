@@ -1,4 +1,4 @@
-"""The virtual ball: its rays, its picture, its truth."""
+"""The virtual ball: its rays, its image, its truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from semcal_ros.synthetic import NOISE_FREE
 from semcal_ros.synthetic.drift import Drift
 from semcal_ros.synthetic.specimens.ball import BallOnTip, Turning, ball_microscope, ball_plan
 
-# The same pixel size as 2048 px at 9000x, in a smaller picture.
+# The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
 G = 36000.0
 STILL = Turning(10.0, roll_rad=0.0, yaw_rad=0.0, travel_m=(0, 0, 0), centre_m=(0, 0, 0))
@@ -105,7 +105,7 @@ def test_drift_shears_the_picture():
         middle = (weight[rows] @ columns) / weight[rows].sum(axis=1)
         centres.append(np.polyfit(rows, middle, 1)[0])
     pixel_m = SMALL.camera_at(G).pixel_size_m[0]
-    # Up to the true camera's skew, which both pictures have.
+    # Up to the true camera's skew, which both images have.
     assert centres[1] - centres[0] == pytest.approx(2e-6 * 0.1 / 192 / pixel_m, rel=0.05)
 
 

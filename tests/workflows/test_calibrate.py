@@ -132,7 +132,7 @@ def test_a_size_that_is_named_wrongly_is_recognised(found):
         r.reason for r in done.collected.rejected if r.reason != "" and "squares" in r.reason
     ]
     assert len(reasons) == counts[rarest]
-    told_um = [float(re.search(r"squares ([\d.]+) um", r).group(1)) for r in reasons]
+    told_um = [float(re.search(r"squares are ([\d.]+) um", r).group(1)) for r in reasons]
     # Spacings of single views scatter by some percent.
     assert told_um == pytest.approx([1e6 * rarest] * len(reasons), rel=0.06)
 

@@ -95,7 +95,7 @@ def follow_background(
     on_frame
         Called after each frame.
     """
-    pictures = [np.asarray(image, dtype=np.float32) for image in images]
+    grey = [np.asarray(image, dtype=np.float32) for image in images]
     along, across = axis.coordinates(plane.x_m, plane.y_m)
     first, last = axis.visible_m
     beam = (np.abs(across) < axis.half_width_m + margin_m) & (along > first - margin_m)
@@ -103,19 +103,19 @@ def follow_background(
     if axis.base_seen:
         # The holder stands still.
         beam &= along > first - 0.2 * axis.half_width_m
-    rough_px = _estimate_rough_drift(pictures, beam)
-    moving = _find_changes(pictures, rough_px, beam)
+    rough_px = _estimate_rough_drift(grey, beam)
+    moving = _find_changes(grey, rough_px, beam)
     weight = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
     tracker = DriftTracker(history=history)
-    for picture, time_s, shift in zip(pictures, times_s, rough_px, strict=True):
+    for image, time_s, shift in zip(grey, times_s, rough_px, strict=True):
         shifted = _shift_image(weight, shift)
-        tracker.update(_cover(picture, shifted), time_s, plane.camera, plane.timing)
+        tracker.update(_cover(image, shifted), time_s, plane.camera, plane.timing)
         on_frame()
     return Background(history.smooth(), weight)
 
 
-def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
+def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
     """Estimate the shift of each image against the first one, (n, 2) px, to about 0.1 px.
 
     The shift is the median over the tiles: a pusher moves or covers only some of them.
@@ -130,7 +130,7 @@ def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
                 ),
                 dtype=np.float32,
             )
-            for p in pictures
+            for p in images
         ]
         reduced = beam[: size[1] * shrink : shrink, : size[0] * shrink : shrink]
         return np.asarray(shrink * _estimate_rough_drift(small, reduced))
@@ -141,11 +141,11 @@ def _estimate_rough_drift(pictures: Sequence[Image], beam: Mask) -> Array:
         for left in np.linspace(0, width - side, max(width // side, 1)).astype(int):
             part = slice(top, top + side), slice(left, left + side)
             if beam[part].mean() < _MOSTLY:
-                tiles.append((part, prepare_reference(_cover(pictures[0], _soften(beam))[part])))
+                tiles.append((part, prepare_reference(_cover(images[0], _soften(beam))[part])))
     shift, shifts = np.zeros(2), [np.zeros(2)]
     spread = np.eye(2) * (0.2 * side) ** 2
-    for picture in pictures[1:]:
-        covered = _cover(picture, _shift_image(_soften(beam), shift))
+    for image in images[1:]:
+        covered = _cover(image, _shift_image(_soften(beam), shift))
         found = [
             register(reference, covered[part], guess_px=shift, guess_covariance=spread)
             for part, reference in tiles
@@ -172,13 +172,13 @@ def _shift_image(image: Image, shift: Array) -> Image:
     return np.asarray(moved, dtype=np.float32)
 
 
-def _find_changes(pictures: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
+def _find_changes(images: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
     """Find where the image changes on its own."""
-    if len(pictures) < 2:
+    if len(images) < 2:
         return np.zeros_like(beam)
     cells = []
-    for picture, shift in zip(pictures, shifts, strict=True):
-        cells.append(_average_cells(_shift_image(picture, -shift)))
+    for image, shift in zip(images, shifts, strict=True):
+        cells.append(_average_cells(_shift_image(image, -shift)))
     stack = np.stack(cells)
     change = stack.max(axis=0) - stack.min(axis=0)
     middle = np.median(stack, axis=0)
@@ -217,19 +217,19 @@ def _enlarge(cells: Mask, shape: tuple[int, ...]) -> Mask:
     return np.pad(large, ((0, rows), (0, cols)), mode="edge")
 
 
-def _average_cells(picture: Image) -> Array:
-    rows, cols = (n // _CELL_PX for n in picture.shape)
-    cut = picture[: rows * _CELL_PX, : cols * _CELL_PX]
+def _average_cells(image: Image) -> Array:
+    rows, cols = (n // _CELL_PX for n in image.shape)
+    cut = image[: rows * _CELL_PX, : cols * _CELL_PX]
     return np.asarray(
         cut.reshape(rows, _CELL_PX, cols, _CELL_PX).mean(axis=(1, 3)), dtype=np.float64
     )
 
 
-def _cover(picture: Image, weight: Image) -> Image:
+def _cover(image: Image, weight: Image) -> Image:
     """Replace moving areas by the smooth level of the static background around them."""
     known = np.asarray(cv2.GaussianBlur(weight, (0, 0), _FILL_PX), dtype=np.float32)
-    level = np.asarray(cv2.GaussianBlur(picture * weight, (0, 0), _FILL_PX), dtype=np.float32)
-    mean = float((picture * weight).sum() / max(float(weight.sum()), 1.0))
+    level = np.asarray(cv2.GaussianBlur(image * weight, (0, 0), _FILL_PX), dtype=np.float32)
+    mean = float((image * weight).sum() / max(float(weight.sum()), 1.0))
     share = known / (known + np.float32(0.02))
     fill = share * level / np.maximum(known, np.float32(1e-6)) + (1.0 - share) * np.float32(mean)
-    return np.asarray(weight * picture + (1.0 - weight) * fill, dtype=np.float32)
+    return np.asarray(weight * image + (1.0 - weight) * fill, dtype=np.float32)

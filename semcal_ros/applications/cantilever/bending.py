@@ -44,7 +44,7 @@ _TINY = 1e-30
 # Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
 # doi:10.1080/03610927708827533).
 _TUKEY = 4.685
-# Rounds of reweighting. It settles long before that, and a linear fit costs little.
+# Rounds of reweighting. It converges long before that, and a linear fit costs little.
 _ROUNDS = 12
 # Unknowns of a fit with a free shape: r0, r1, and the factors of u^2 and u^3.
 _TERMS = 4

@@ -106,7 +106,7 @@ def find_strip(
         If there is no strip, or its base and free end cannot be told apart.
     """
     if (base_px is None) != (tip_px is None):
-        raise InvalidValueError("one end of the cantilever", expected="both or none")
+        raise InvalidValueError("only one end of the cantilever", expected="both or none")
     shrink = max(1, int(np.ceil(max(image.shape) / _SEARCHED_PX)))
     grey = np.asarray(image, dtype=np.float32)
     if shrink > 1:
@@ -175,7 +175,7 @@ def _search_strip(smooth: Array) -> Strip:
         if strength > best:
             best, angle, offset = strength, float(turn), 0.5 * (low + up) + first
     if best <= 0.0:
-        raise InvalidValueError("no strip in the picture", expected="a cantilever", do=_GIVE_CLICKS)
+        raise InvalidValueError("no strip in the image", expected="a cantilever", do=_GIVE_CLICKS)
     across = np.array([-np.sin(angle), np.cos(angle)])
     middle = 0.5 * (np.array(size) - 1.0)
     point = middle + (offset - float(across @ middle)) * across
@@ -237,7 +237,7 @@ def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Arr
     )
     if inside.size < 2:
         raise InvalidValueError(
-            "base and tip between which nothing is in view", expected="a beam in the picture"
+            "a beam that is out of view between base and tip", expected="a beam in the image"
         )
     return points[inside[0]], points[inside[-1]]
 
@@ -250,11 +250,11 @@ def _is_inside(point: Array, shape: tuple[int, ...]) -> bool:
     )
 
 
-def _sample(picture: Array, points: Array) -> Array:
+def _sample(image: Array, points: Array) -> Array:
     """Interpolate grey levels at (n, 2) pixels; NaN outside the image."""
     maps = [np.ascontiguousarray(points[None, :, k], dtype=np.float32) for k in (0, 1)]
     out = cv2.remap(
-        picture.astype(np.float32),
+        image.astype(np.float32),
         maps[0],
         maps[1],
         cv2.INTER_LINEAR,
@@ -287,7 +287,7 @@ def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip
     side = min(smooth.shape)
     if run is None or strong <= 0.0 or run[1] - run[0] < _LEAST_LENGTH * side:
         raise InvalidValueError(
-            "no strip that is long enough in the picture", expected="a cantilever", do=_GIVE_CLICKS
+            "no long enough strip in the image", expected="a cantilever", do=_GIVE_CLICKS
         )
     ends = [offset * across + steps[k] * along for k in run]
     seen = [
@@ -319,7 +319,7 @@ def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
 
 
 def _measure_freedom(
-    picture: Array, end: Array, outwards: Array, across: Array, half: float
+    image: Array, end: Array, outwards: Array, across: Array, half: float
 ) -> float:
     """Measure how dark it is beyond an end: 1 as beside the strip, 0 as on it, NaN out of view."""
     spread = np.linspace(-0.5 * half, 0.5 * half, 5)
@@ -327,7 +327,7 @@ def _measure_freedom(
 
     def level(steps: Array, offsets: Array) -> float:
         points = end + steps[:, None, None] * outwards + offsets[None, :, None] * across
-        values = _sample(picture, points.reshape(-1, 2))
+        values = _sample(image, points.reshape(-1, 2))
         return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
 
     inside = level(-beyond, spread)
@@ -342,7 +342,7 @@ def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: f
     is_base = [s and f <= 0.5 for s, f in zip(seen, free, strict=True)]
     if is_tip[0] == is_tip[1] and is_base[0] == is_base[1]:
         raise InvalidValueError(
-            "a strip of which base and free end cannot be told apart",
+            "a strip whose base and free end cannot be told apart",
             expected="a cantilever with at least one of its ends in view",
             do=_GIVE_CLICKS,
         )

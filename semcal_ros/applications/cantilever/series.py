@@ -203,14 +203,14 @@ def measure_series(
 def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequence[int]) -> None:
     if not images or len(images) != len(times_s):
         raise InvalidValueError(
-            f"{len(images)} pictures at {len(times_s)} times", expected="one time for each"
+            f"{len(images)} images at {len(times_s)} times", expected="one time for each"
         )
     shapes = sorted({image.shape for image in images})
     if len(shapes) > 1 or len(shapes[0]) != 2:
-        raise InvalidValueError(f"pictures of shapes {shapes}", expected="grey ones of one size")
+        raise InvalidValueError(f"images of shapes {shapes}", expected="grey images of one size")
     if not reference or not all(0 <= k < len(images) for k in reference):
         raise InvalidValueError(
-            f"reference frames {list(reference)}", expected=f"some of 0 to {len(images) - 1}"
+            f"reference frames {list(reference)}", expected=f"indices from 0 to {len(images) - 1}"
         )
 
 
@@ -239,7 +239,7 @@ def _collect_notes(
         notes.append(f"no drift in {lost} of {len(path)} frames: they rest on the base alone")
     if abs(undeformed.length_m / settings.length_m - 1.0) > _WRONG_LENGTH:
         notes.append(
-            f"by the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long and not "
+            f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
         )
     return tuple(notes)

@@ -102,7 +102,7 @@ def measure_undeformed_beam(
     if int(np.isfinite(sigma).all(axis=1).sum()) < _LEAST_BLOCKS:
         raise InvalidValueError(
             "a strip whose edges cannot be measured",
-            expected="a beam that is brighter than what lies beside it",
+            expected="a beam brighter than its surroundings",
             do="give base and tip, or check focus and contrast",
         )
     return UndeformedBeam(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))

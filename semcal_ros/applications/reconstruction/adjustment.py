@@ -228,9 +228,9 @@ def adjust(
         state, taken, converged = _descend(problem, state, sigma, free, max_iterations, tolerance)
         iterations += taken
         better = _estimate_scale(problem, state)
-        settled = abs(better - sigma) < 0.02 * sigma
+        scale_converged = abs(better - sigma) < 0.02 * sigma
         sigma = better
-        if settled:
+        if scale_converged:
             break
     return _finish(problem, state, sigma, free, unit_m, iterations, converged)
 

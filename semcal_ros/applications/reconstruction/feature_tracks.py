@@ -122,7 +122,7 @@ def _project_from_plane(camera: ScanCamera, xy_m: Array) -> Array:
 class _Reference:
     """The last keyframe while frames are tracked against it."""
 
-    picture: NDArray[np.uint8]
+    grey: NDArray[np.uint8]
     frame: TrackKeyframe
     latest_m: Array
     alive: Mask
@@ -173,16 +173,16 @@ class SequenceTracker:
                 expected="frames in the order of their times",
             )
         seen = self._prepare_frame(image, camera)
-        picture = convert_for_tracking(seen)
+        grey = convert_for_tracking(seen)
         index, self.frames = self.frames, self.frames + 1
         previous_s, self._last_time_s = self._last_time_s, time_s
         reference = self._reference
         if reference is None:
             ids, xy = self._detect(seen, np.empty((0, 2)))
-            self._keep(index, time_s, image, camera, picture, ids, xy, None)
+            self._keep(index, time_s, image, camera, grey, ids, xy, None)
             return True
         start = reference.latest_m
-        raw, found = self._track(reference, picture, camera)
+        raw, found = self._track(reference, grey, camera)
         now_m = project_to_plane(camera, raw)
         found &= np.all(np.isfinite(now_m), axis=1)
         motion = _fit_affine_motion(start[found], now_m[found], time_s - previous_s)
@@ -202,7 +202,7 @@ class SequenceTracker:
             time_s,
             image,
             camera,
-            picture,
+            grey,
             np.concatenate([kept_ids, ids]),
             np.concatenate([kept, xy]),
             motion,
@@ -236,7 +236,7 @@ class SequenceTracker:
         return _make_box(raw, camera, self.settings.room_px)[0]
 
     def _track(
-        self, reference: _Reference, picture: NDArray[np.uint8], camera: ScanCamera
+        self, reference: _Reference, grey: NDArray[np.uint8], camera: ScanCamera
     ) -> tuple[Array, Mask]:
         """Track the reference's features: raw positions (n, 2), and which were found."""
         if not len(reference.frame.xy):
@@ -253,8 +253,8 @@ class SequenceTracker:
         # Pyramids only of the part of the image that contains the features.
         box, corner = _make_box(np.concatenate([at, guess]), camera, s.room_px)
         first, second = (
-            np.ascontiguousarray(reference.picture[box]),
-            np.ascontiguousarray(picture[box]),
+            np.ascontiguousarray(reference.grey[box]),
+            np.ascontiguousarray(grey[box]),
         )
         at, guess = at - corner, guess - corner
         forward, ok, _ = cv2.calcOpticalFlowPyrLK(first, second, at, guess.copy(), **options)
@@ -324,7 +324,7 @@ class SequenceTracker:
         time_s: float,
         image: NDArray[Any],
         camera: ScanCamera,
-        picture: NDArray[np.uint8],
+        grey: NDArray[np.uint8],
         ids: Indices,
         xy: Array,
         motion: Array | None,
@@ -334,7 +334,7 @@ class SequenceTracker:
         self.keyframes.append(frame)
         latest = project_to_plane(camera, xy)
         self._reference = _Reference(
-            picture, frame, latest, np.ones(len(ids), dtype=bool), motion, None
+            grey, frame, latest, np.ones(len(ids), dtype=bool), motion, None
         )
 
     def _finish_motions(self) -> None:

@@ -71,7 +71,7 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
     cameras = affine.cameras[placed]
     if len(cameras) < 3:
         raise StructureError(
-            f"{len(cameras)} views", expected="at least 3: two leave the relief open"
+            f"{len(cameras)} views", expected="at least 3, since two leave the relief undetermined"
         )
     # Whiten the points, so that Q is near a multiple of the identity and its condition means
     # something.
@@ -85,7 +85,7 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
     if rank < 6 or condition < 1e-7:
         raise StructureError(
             f"{len(cameras)} views from nearly one direction",
-            expected="views that are turned against each other about an axis across the beam",
+            expected="views that are rotated about an axis across the beam",
         )
     q = np.zeros((3, 3))
     for value, (i, j) in zip(solution, _PAIRS, strict=True):

@@ -236,8 +236,8 @@ def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
         stack = patches[at, point].astype(np.float64)
         template = _average_template(stack)
         others = (template[None] * len(at) - stack) / (len(at) - 1)
-        picture = template.reshape(side, side)
-        slope_v, slope_u = np.gradient(picture)
+        image = template.reshape(side, side)
+        slope_v, slope_u = np.gradient(image)
         slope = np.stack([slope_u.ravel(), slope_v.ravel()], axis=1)
         normal = (slope * window[:, None]).T @ slope
         if np.linalg.cond(normal) > 100.0:

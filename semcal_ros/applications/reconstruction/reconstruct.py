@@ -47,7 +47,7 @@ class StructureSettings:
         Comparison of patches.
     most_passes
         Largest number of times that patches are measured and adjusted.
-    settled_sigma
+    converged_sigma
         The passes end when one moves the points by less than this many of their 1-sigma (RMS).
     smoothing_px
         Sigma of the smoothing of patches.
@@ -65,7 +65,7 @@ class StructureSettings:
 
     patches: PatchSettings = field(default_factory=PatchSettings)
     most_passes: int = 10
-    settled_sigma: float = 0.5
+    converged_sigma: float = 0.5
     smoothing_px: float = 1.3
     least_track: int = 4
     least_views: int = 6
@@ -107,8 +107,8 @@ class Structure:
         near 0 it cannot decide, and negative values speak against the choice.
     patch_sigma_m
         Sigma of the window in which a patch is compared, m: closer points share pixels and noise.
-    passes, settled
-        Number of passes, and whether the last one moved the points by less than ``settled_sigma``.
+    passes, converged
+        Number of passes, and whether the last one moved the points by less than ``converged_sigma``.
     """
 
     points_m: Array
@@ -126,7 +126,7 @@ class Structure:
     mirror_sigma: float
     patch_sigma_m: float
     passes: int
-    settled: bool
+    converged: bool
 
     @property
     def normal_sigma_m(self) -> Array:
@@ -189,7 +189,7 @@ def reconstruct(
         prepare_appearance(frame.image, smoothing_px=chosen.smoothing_px)
         for frame in work.keyframes
     ]
-    while not work.settled and work.passes < chosen.most_passes:
+    while not work.converged and work.passes < chosen.most_passes:
         on_step(f"measuring, pass {work.passes + 1}")
         work.refine()
     on_step("uncertainty")
@@ -247,7 +247,7 @@ class _Refinement:
         self.looks: list[Appearance] = []
         self.adjusted: Adjustment | None = None
         self.ids = np.arange(len(points))
-        self.passes, self.settled = 0, False
+        self.passes, self.converged = 0, False
         self.pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in cameras]))
 
     def adjust_tracks(self) -> None:
@@ -279,8 +279,8 @@ class _Refinement:
         self.seen = self.seen.select(self.adjusted.weights > 0.25)
         self._prune(self.settings.least_views, worst_px=self.settings.worst_sigma_px)
         self.passes += 1
-        self.settled = self._measure_change_in_sigma(before[np.isin(ids, self.ids)]) < (
-            self.settings.settled_sigma
+        self.converged = self._measure_change_in_sigma(before[np.isin(ids, self.ids)]) < (
+            self.settings.converged_sigma
         )
 
     def _measure_change_in_sigma(self, before: Array) -> float:
@@ -330,7 +330,7 @@ class _Refinement:
         if np.count_nonzero(points) < 12 or np.count_nonzero(views) < 3:
             raise StructureError(
                 f"{np.count_nonzero(points)} points in {np.count_nonzero(views)} views that agree",
-                expected="at least 12 in 3",
+                expected="at least 12 points in 3 views",
                 do="record more texture, slower movements or larger turns",
             )
         use = points[self.seen.point] & views[self.seen.view]
@@ -402,5 +402,5 @@ class _Refinement:
             mirror_sigma=float(np.sign(preference) * np.sqrt(2.0 * abs(preference))),
             patch_sigma_m=WINDOW * self.settings.patches.half_px * self.pixel_m,
             passes=self.passes,
-            settled=self.settled,
+            converged=self.converged,
         )

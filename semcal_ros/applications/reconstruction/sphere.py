@@ -87,7 +87,7 @@ def fit_sphere(
     # scipy.optimize.least_squares with a Cauchy loss gives the same radius (0.31 nm RMS of 450 nm
     # with 30 % foreign points, 0.30 nm here). But the covariance, the gradient of the radius and
     # the jackknife of a ball are those of plain least squares over a set of inliers, which is
-    # settled here.
+    # chosen here.
     weight = np.ones(len(points)) if sigma_m is None else _compute_weights(sigma_m)
     centre, radius, inliers = _search_sphere(points, tolerance, seed)
     converged, iterations = False, 0

@@ -89,17 +89,17 @@ def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
         If the image is not a two-dimensional array of at least 32 x 32 px.
     """
     grey = check_image(image, channels=(1,), least_side=32)
-    picture = np.ascontiguousarray(grey, dtype=np.float32)
-    if not np.all(np.isfinite(picture)):
-        return _reject("image: holds values that are not finite")
-    factor = -(-max(picture.shape) // _SEARCHED_PX)
-    stretched = _stretch(picture, factor)
+    pixels = np.ascontiguousarray(grey, dtype=np.float32)
+    if not np.all(np.isfinite(pixels)):
+        return _reject("the image has values that are not finite")
+    factor = -(-max(pixels.shape) // _SEARCHED_PX)
+    stretched = _stretch(pixels, factor)
     if stretched is None:
         return _reject("image: blank")
     ids, corners = _search_markers(stretched, factor, target)
     if len(ids) == 0:
         return _reject("no marker of the target in view")
-    refined = refine_quads(picture, corners)
+    refined = refine_quads(pixels, corners)
     if not np.any(refined.good):
         return _reject("no marker of the target with four straight sides")
     good = refined.good
@@ -118,12 +118,12 @@ def _reject(reason: str) -> TargetView:
     )
 
 
-def _stretch(picture: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
+def _stretch(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | None:
     """Convert to 8 bits with less noise for the search; return None for a blank image."""
-    small = picture
+    small = image
     if factor > 1:
-        height, width = (side // factor for side in picture.shape)
-        cut = picture[: height * factor, : width * factor]
+        height, width = (side // factor for side in image.shape)
+        cut = image[: height * factor, : width * factor]
         small = cut.reshape(height, factor, width, factor).mean(axis=(1, 3), dtype=np.float32)
     smooth = cv2.GaussianBlur(small, (0, 0), _NOISE_BLUR_PX)
     # Pixels that were not scanned are 0 in a rectified image and say nothing about the contrast.
@@ -150,10 +150,10 @@ def _create_detector() -> cv2.aruco.ArucoDetector:
 
 
 def _search_markers(
-    picture: NDArray[np.uint8], factor: int, target: NestedTarget
+    image: NDArray[np.uint8], factor: int, target: NestedTarget
 ) -> tuple[NDArray[np.int64], Array]:
     """Find numbers (n,) and rough corners (n, 4, 2) of readable markers, px of the whole image."""
-    found, numbers, _ = _create_detector().detectMarkers(picture)
+    found, numbers, _ = _create_detector().detectMarkers(image)
     if numbers is None or len(found) == 0:
         return np.empty(0, np.int64), np.empty((0, 4, 2))
     ids = np.asarray(numbers, dtype=np.int64).reshape(-1)

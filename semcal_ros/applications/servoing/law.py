@@ -234,7 +234,7 @@ class Servo:
         if abs(fit.scale - 1.0) > limits.scale_tolerance + 3.0 * fit.scale_sigma:
             return Rejection(
                 ServoStatus.WRONG_SCALE,
-                f"the target is {fit.scale:.3f} times as large as the camera of the frame says",
+                f"the target is {fit.scale:.3f} times as large as the camera of the frame implies",
             )
         sigma_px = _compute_origin_sigma(fit, camera)[1]
         if not sigma_px <= limits.max_sigma_px:

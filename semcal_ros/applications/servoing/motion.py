@@ -144,6 +144,6 @@ class StageMonitor:
         if _LEAST <= share <= _MOST:
             return ""
         return (
-            f"the picture does not follow the stage: it moved by {share:.2f} of the commanded way; check axes, topic"
+            f"the image does not follow the stage: it moved by {share:.2f} of the commanded distance; check axes, topic"
             " and that the drift of each frame is added again"
         )

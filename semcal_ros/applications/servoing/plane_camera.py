@@ -133,7 +133,7 @@ def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
         if np.allclose(matrix[:, :3], expected, rtol=_SAME, atol=_SAME * abs(matrix[2, 2])):
             return matrix
     raise InvalidValueError(
-        f"no projection of the magnification of this frame among the latest {len(known)}",
+        f"none of the latest {len(known)} projections has the magnification of this frame",
         expected="one whose first columns are rho times K of the frame",
         do="start parameter_server with the same calibration",
     )

@@ -20,7 +20,7 @@ __all__ = ["PlanePose", "PoseFit", "compute_interaction_matrix", "fit_pose"]
 # Gauss-Newton steps, at most: from the similarity they converge quadratically or not at all.
 _MOST_STEPS = 12
 # Movement of the corners in the last step, px: far below their errors.
-_SETTLED_PX = 1e-6
+_CONVERGED_PX = 1e-6
 # A marker further from its expected position than this part of its side was misread.
 _MISREAD = 0.25
 
@@ -168,7 +168,7 @@ def _compute_residual(
 
 def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: float) -> PoseFit:
     whitening = _form_whitening(view)
-    pose, settled = start, False
+    pose, converged = start, False
     design, residual = np.empty((0, 3)), np.empty(0)
     own = view.target_xy_m.reshape(-1, 2)
     for _ in range(_MOST_STEPS):
@@ -180,8 +180,8 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
         size = np.linalg.norm(design, axis=0)
         step = np.linalg.lstsq(design / size, residual, rcond=None)[0] / size
         pose = pose.displace(*(float(v) for v in step))
-        if float(np.max(np.abs(slope @ step))) < _SETTLED_PX:
-            settled = True
+        if float(np.max(np.abs(slope @ step))) < _CONVERGED_PX:
+            converged = True
             break
     left = _compute_residual(view, camera, pose)
     residual = _whiten(whitening, left)
@@ -192,7 +192,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     covariance = np.linalg.inv(normal) / np.outer(size, size) * factor
     rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
     pose = PlanePose(pose.x_m, pose.y_m, math.remainder(pose.angle_rad, 2.0 * math.pi))
-    reason = "" if settled else f"the pose did not settle in {_MOST_STEPS} steps"
+    reason = "" if converged else f"the pose did not converge in {_MOST_STEPS} steps"
     return PoseFit(pose, covariance, scale, _compute_scale_sigma(view), rms_px, view, reason)
 
 

@@ -28,7 +28,7 @@ _WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
 # The windows are laid over the corners found last, at most this often.
 _ROUNDS = 4
 # Movement of the corners after which that ends: what they are uncertain by at best.
-_SETTLED_PX = 0.02
+_CONVERGED_PX = 0.02
 # Largest number of places along a side at which its step is measured: more of them cost time, and
 # neighbours that are closer than a pixel share their noise.
 _MOST_PLACES = 96
@@ -98,7 +98,7 @@ def _refine_quad(image: Image, quad: Array) -> tuple[Array, Array] | None:
         quad, covariance = _intersect_lines(quad, lines)
         if not np.all(np.isfinite(quad)):
             return None
-        if float(np.max(np.abs(quad - before))) < _SETTLED_PX:
+        if float(np.max(np.abs(quad - before))) < _CONVERGED_PX:
             break
     return quad, covariance
 

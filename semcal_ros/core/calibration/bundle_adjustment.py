@@ -136,14 +136,18 @@ def _step(problem: Problem, state: State, normal: NormalEquations, damping: floa
     change = solve_scaled(matrix, right, damping)
     camera, visits, pose = reduced.back(problem, change)
     new = retract(problem, state, change, pose, visits)
-    parts = [camera, pose] if problem.effects is None else [camera, visits[problem.effects.visit], pose]
+    parts = (
+        [camera, pose] if problem.effects is None else [camera, visits[problem.effects.visit], pose]
+    )
     whole = np.concatenate(parts, axis=1)
     bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
     precision = problem.prior_sigma**-2.0
     prior = (problem.prior_mean - state.theta) * precision * change - 0.5 * change**2 * precision
     gain = float(prior.sum())
     if problem.effects is not None:
-        gain += float(np.sum((-state.visits * visits - 0.5 * visits**2) / visit_sigmas(problem) ** 2))
+        gain += float(
+            np.sum((-state.visits * visits - 0.5 * visits**2) / visit_sigmas(problem) ** 2)
+        )
     return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), gain)
 
 
@@ -239,7 +243,10 @@ def _refine_poses(
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
     damping = np.full(len(costs), _FIRST_DAMPING)
-    first, diagonal = problem.shared_columns + problem.visit_columns, np.arange(problem.pose_columns)
+    first, diagonal = (
+        problem.shared_columns + problem.visit_columns,
+        np.arange(problem.pose_columns),
+    )
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
@@ -300,9 +307,7 @@ def _make_result(
     )
 
 
-def _posterior(
-    problem: Problem, reduced: Eliminated, covariance: Array
-) -> tuple[Array, Array]:
+def _posterior(problem: Problem, reduced: Eliminated, covariance: Array) -> tuple[Array, Array]:
     """Return the (J, w) variances of the visits, and the (V, P, P) covariances of the views.
 
     The unknowns of a view are those of its magnification, of its visit and its pose.

@@ -255,7 +255,7 @@ def calibrate_views(
     CalibrationError
         If the views do not allow a calibration.
     InvalidValueError
-        For breakpoints outside of the magnifications of the views.
+        For breakpoints outside the magnifications of the views.
     """
     options = options or CalibrationOptions()
     ordered = _check_views(views)
@@ -385,8 +385,8 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
             f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range there, "
             "calibrate with this breakpoint"
         )
-    if not adjustment.settled:
-        warnings.append("the choice of the number of coefficients did not settle")
+    if not adjustment.converged:
+        warnings.append("the choice of the number of coefficients did not converge")
     details = {
         "iterations": result.iterations,
         "converged": result.converged,

@@ -93,7 +93,7 @@ def _fit_one(setup: Setup, tau_px: float | None) -> tuple[DistortionCentre, Prob
         middle = {"xi_r": 0.0, "ex": float(setup.centre_px[0]), "ey": float(setup.centre_px[1])}
         problem = _hold(problem, middle)
         return centre, problem, adjust(problem, _with(pinhole.state, middle))
-    # A centre outside of the image is noise; the adjustment then starts from the middle.
+    # A centre outside the image is noise; the adjustment then starts from the middle.
     inside = np.all((centre.centre_px > 0) & (centre.centre_px < np.array(setup.image_size)))
     ex, ey = centre.centre_px if inside else setup.centre_px
     return (

@@ -106,7 +106,7 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     known = np.all(np.isfinite(ideal), axis=1)
     if known.sum() < 4:
         raise CalibrationError(
-            f"view {view.name}, of which the calibration can undistort {known.sum()} corners",
+            f"view {view.name}, in which the calibration can undistort only {known.sum()} corners",
             expected="images of the microscope that was calibrated",
             do="check the magnification and the display width",
         )

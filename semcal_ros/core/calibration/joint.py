@@ -70,7 +70,7 @@ __all__ = [
 
 RESIDUAL_MODES = ("auto", "off", "on")
 _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
-# Rounds of choosing the numbers of coefficients. A choice that alternates never settles; the
+# Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
@@ -89,7 +89,7 @@ _COARSE = 1e-6
 _MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
 # RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
 # the noise of good corners.
-_FIELD_SETTLED_PX = 1e-3
+_FIELD_CONVERGED_PX = 1e-3
 # Largest start of rho, 1/m. The depth gradient of weakly tilted views is noisy, and a pivot nearer
 # than 5 mm would be noise.
 _MAX_START_RHO = 200.0
@@ -107,14 +107,14 @@ class FittedField:
         Its strength, and the result of cross-validation.
     system
         The reduced system at the solution, from which magnifications can be left out.
-    settled
+    converged
         Whether camera and field stopped changing.
     """
 
     field: ResidualField
     choice: FieldChoice
     system: FieldSystem
-    settled: bool
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Adjustment:
         Its variance components.
     rounds
         Number of times that the numbers of coefficients were chosen.
-    settled
+    converged
         Whether the last choice was the same as that of the round before.
     """
 
@@ -156,7 +156,7 @@ class Adjustment:
     result: BundleResult
     spread: VarianceComponents
     rounds: int
-    settled: bool
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -328,9 +328,7 @@ def _pattern_covariance(
     """
     problem = build_problem(setup, padded, setup.views, adjustment.spread)
     state = adjustment.result.state
-    result = refine(
-        problem, replace(state, theta=_theta(setup, padded, state)), max_iterations=0
-    )
+    result = refine(problem, replace(state, theta=_theta(setup, padded, state)), max_iterations=0)
     system = field_system(setup, problem, result, blank_field(setup), of_grid=True)
     size = len(result.state.theta) - len(setup.shared)
     free = system.covariance(pattern.choice.prior)[:size, :size]
@@ -349,12 +347,12 @@ def _select_and_adjust(
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
     result = refine(problem, state, tolerance=_COARSE)
-    settled, rounds = len(setup.magnifications) < 3, 0
-    while rounds < _MAX_ROUNDS and not settled:
+    converged, rounds = len(setup.magnifications) < 3, 0
+    while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
         chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
-        settled = chosen == sizes
-        if settled:
+        converged = chosen == sizes
+        if converged:
             break
         sizes = chosen
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
@@ -363,7 +361,7 @@ def _select_and_adjust(
         state = replace(result.state, theta=_theta(setup, functions, result.state))
         result = refine(problem, state, tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)
-    return Adjustment(functions, problem, result, spread, rounds, settled)
+    return Adjustment(functions, problem, result, spread, rounds, converged)
 
 
 def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
@@ -387,17 +385,13 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     problem = build_problem(setup, functions, setup.views, spread)
     result = refine(problem, state)
     functions = with_coefficients(functions, result.state.theta)
-    return replace(
-        adjustment, functions=functions, problem=problem, result=result, spread=spread
-    )
+    return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
 
 
 def _largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
     """Return the largest relative change of the variance components."""
     a, b = (
-        np.concatenate(
-            [[c.scale.sigma, c.visit_height.sigma], c.height_sigma_m, c.drift_sigma_px]
-        )
+        np.concatenate([[c.scale.sigma, c.visit_height.sigma], c.height_sigma_m, c.drift_sigma_px])
         for c in (before, after)
     )
     return float(np.max(np.abs(np.log(b / a))))
@@ -436,7 +430,7 @@ def _add_field(
         pairs = zip(before.views, after.views, strict=True)
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
         before = after
-        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_SETTLED_PX:
+        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_CONVERGED_PX:
             return adjustment, FittedField(field, choice, system, True), None
     return adjustment, FittedField(field, choice, system, False), None
 
@@ -452,9 +446,7 @@ def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: b
     spread = update_components(setup, adjustment.problem, adjustment.result)
     state = replace(adjustment.result.state, theta=theta)
     if choosing:
-        return _select_and_adjust(
-            setup, functions, state, spread, _current_sizes(adjustment)
-        )
+        return _select_and_adjust(setup, functions, state, spread, _current_sizes(adjustment))
     problem = build_problem(setup, functions, setup.views, spread)
     result = refine(problem, state, tolerance=_COARSE)
     functions = with_coefficients(functions, result.state.theta)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import nnls
 
-from semcal_ros.core.arrays import Array, solve_scaled
+from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
@@ -72,10 +72,10 @@ def _views(problem: Problem) -> Iterator[slice]:
         yield slice(int(first), int(last))
 
 
-def _lines(problem: Problem, part: slice) -> Array:
+def _lines(problem: Problem, part: slice) -> Indices:
     """Return the line of each corner of a view, from 0."""
-    line = np.floor(problem.observed_px[part, 1]).astype(int)
-    return line - line.min()
+    line = np.floor(problem.observed_px[part, 1]).astype(np.intp)
+    return np.asarray(line - line.min(), dtype=np.intp)
 
 
 def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:

@@ -241,9 +241,15 @@ def _shaped_grid(problem: Problem, theta: Array) -> Array:
     size = np.zeros(len(x))
     for k, column in _square_columns(problem):
         assert problem.square_class is not None
-        size += (problem.square_class == k)[problem.view_of_point] * theta[column - 10 - len(problem.shared)]
+        size += (problem.square_class == k)[problem.view_of_point] * theta[
+            column - 10 - len(problem.shared)
+        ]
     grid = np.stack(
-        [x * (1.0 + 0.5 * stretch) + shear * y, y * (1.0 - 0.5 * stretch), 0.5 * curvature * (x * x + y * y)],
+        [
+            x * (1.0 + 0.5 * stretch) + shear * y,
+            y * (1.0 - 0.5 * stretch),
+            0.5 * curvature * (x * x + y * y),
+        ],
         axis=1,
     )
     return grid * (1.0 + size[:, None])
@@ -370,7 +376,12 @@ def whitened_rows(problem: Problem, state: State) -> WhitenedRows:
     pose = first + problem.visit_columns
     end = pose + problem.pose_columns
     grid = _grid_columns(problem)
-    columns = [*range(10), *grid, *range(first, first + problem.visit_columns // 2), *range(pose, end + 1)]
+    columns = [
+        *range(10),
+        *grid,
+        *range(first, first + problem.visit_columns // 2),
+        *range(pose, end + 1),
+    ]
     rows = np.empty((2, len(columns), len(points)))
     rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
     at = 10
@@ -530,7 +541,9 @@ def schur_complement(
     first = problem.shared_columns
     outer = first + problem.visit_columns
     pose_inverse = _damped_inverse(normal.matrix[:, outer:, outer:], damping)
-    right = np.concatenate([normal.matrix[:, outer:, :outer], normal.right[:, outer:, None]], axis=2)
+    right = np.concatenate(
+        [normal.matrix[:, outer:, :outer], normal.right[:, outer:, None]], axis=2
+    )
     solved = pose_inverse @ right
     cross = normal.matrix[:, :outer, outer:]
     own = normal.matrix[:, :outer, :outer] - cross @ solved[:, :, :outer]

@@ -163,6 +163,6 @@ def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Reject
                 ViewStatus.OUTLIER,
                 f"does not agree with the other views at its magnification: {1e6 * offset[v]:.0f} um of height, where "
                 f"{1e6 * spread:.0f} um are usual, and residuals {misfit[v]:.1f} times the usual; wrong magnification, "
-                "or a square named wrongly",
+                "or a wrong square size",
             )
     return outliers

@@ -89,7 +89,7 @@ def pda_functions(
     Raises
     ------
     InvalidValueError
-        For an order outside of 1 to 4 or a negative degree.
+        For an order outside 1 to 4 or a negative degree.
     CalibrationError
         If there are too few magnifications for the order, or a solution diverges.
     """

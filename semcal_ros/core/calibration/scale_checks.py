@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
     effects = fit.adjustment.result.state.visits[:, 0]
     upward: dict[int, list[float]] = {}
     downward: dict[int, list[float]] = {}
-    for before, own in zip(order[:-1], order[1:], strict=True):
+    for before, own in pairwise(order):
         if groups[before] != groups[own]:
             kind = upward if groups[own] > groups[before] else downward
             kind.setdefault(int(groups[own]), []).append(float(effects[own]))
@@ -80,7 +81,9 @@ def _stage_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> lis
     """List what the readings of the stage and the images do not agree on."""
     out: list[str] = []
     means, sigmas = setup.shared_priors()
-    values = fit.adjustment.result.state.theta[len(fit.adjustment.result.state.theta) - len(means) :]
+    values = fit.adjustment.result.state.theta[
+        len(fit.adjustment.result.state.theta) - len(means) :
+    ]
     for name, label in (("stage_tilt", "tilt"), ("stage_axis", "direction of the tilt axis")):
         if name not in setup.shared:
             return out

@@ -27,7 +27,7 @@ def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
         "held_out_gain": choice.gain,
         "held_out_gain_sigma": choice.gain_sigma,
         "worthwhile": choice.worthwhile,
-        "converged": fitted.settled,
+        "converged": fitted.converged,
     }
 
 

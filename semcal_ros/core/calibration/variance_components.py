@@ -96,9 +96,7 @@ def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Sp
     return Spread(float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined)
 
 
-def update_components(
-    setup: Setup, problem: Problem, result: BundleResult
-) -> VarianceComponents:
+def update_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
     """Update all spreads from an adjustment with the ones before.
 
     Views without tilt have a spread of heights of their own: tilting moves the specimen, while
@@ -111,9 +109,14 @@ def update_components(
     height = problem.height_sigma_m.copy()
     for own in (flat, ~flat):
         if np.any(own):
-            residuals = result.prior_residuals[own, 0] * problem.height_sigma_m[own] / height[own][0]
+            residuals = (
+                result.prior_residuals[own, 0] * problem.height_sigma_m[own] / height[own][0]
+            )
             spread = _update(
-                float(height[own][0]), priors.height_sigma_m, residuals, result.prior_variance[own, 0]
+                float(height[own][0]),
+                priors.height_sigma_m,
+                residuals,
+                result.prior_variance[own, 0],
             )
             height[own] = spread.sigma
     effects = problem.effects

@@ -15,7 +15,13 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["FUNCTION_NAMES", "CalibrationModel", "ScaleSigma", "checked_magnification", "design_matrix"]
+__all__ = [
+    "FUNCTION_NAMES",
+    "CalibrationModel",
+    "ScaleSigma",
+    "checked_magnification",
+    "design_matrix",
+]
 
 
 # The scale is kept relative to the nominal one, width g / display width, so that it is a number
@@ -160,7 +166,7 @@ class CalibrationModel:
     def at(self, magnification: float) -> ScanCamera:
         """Return the camera at a magnification.
 
-        Outside of :attr:`magnification_range` the functions continue along their tangents in log g,
+        Outside :attr:`magnification_range` the functions continue along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range. The
         covariance is that of the next time that this magnification is set: it contains
         :attr:`scale_sigma`.

@@ -1,7 +1,7 @@
 """Continuous functions of the magnification.
 
 Every kind is linear in its coefficients, ``f(g) = basis(g) @ coefficients``, so that one covariance
-matrix of all coefficients propagates exactly to any magnification. Outside of the range in which it
+matrix of all coefficients propagates exactly to any magnification. Outside the range in which it
 was determined a function continues along its tangent in log g; the caller flags that and widens the
 uncertainty.
 """
@@ -60,7 +60,7 @@ def _chebyshev_row(value: float, size: int) -> Array:
 
 
 def basis_row(kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array) -> Array:
-    """Return (size,) values of the basis functions at a magnification inside of ``g_range``."""
+    """Return (size,) values of the basis functions at a magnification inside ``g_range``."""
     low, high = g_range
     if kind == "chebyshev_log":
         u = _unit_interval(np.log(g), np.log(low), np.log(high))

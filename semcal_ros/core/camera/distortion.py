@@ -38,7 +38,7 @@ class Undistortion:
     q
         (n, 2) normalised ideal coordinates; NaN where ``converged`` is false.
     converged
-        (n,) bool. False outside of the model's domain, or where Newton's method did not converge.
+        (n,) bool. False outside the model's domain, or where Newton's method did not converge.
     iterations
         Number of Newton steps that were taken.
     residual
@@ -135,9 +135,9 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
         error[active] = np.hypot(miss[:, 0], miss[:, 1])
         q[active] = q[active] + step
         size = np.hypot(step[:, 0], step[:, 1])
-        settled = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
-        done[active[settled]] = True
-        active = active[good & ~settled & np.isfinite(size)]
+        reached = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
+        done[active[reached]] = True
+        active = active[good & ~reached & np.isfinite(size)]
     # Rounding may keep the last step just above the tolerance; a point that maps back is converged.
     done |= error <= 1e-12
     q[~done] = np.nan

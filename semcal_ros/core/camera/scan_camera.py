@@ -71,7 +71,7 @@ class ScanCamera:
         (10, 10) covariance of the parameters in the order of
         :data:`semcal_ros.core.camera.projection.PARAMETER_NAMES`, or None where it is not known.
     in_range
-        False when ``magnification`` lies outside of the calibrated range.
+        False when ``magnification`` lies outside the calibrated range.
     residual
         Distortion that the parameters do not describe (see
         :mod:`semcal_ros.core.camera.residual_field`), or None.

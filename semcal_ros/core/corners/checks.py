@@ -76,7 +76,7 @@ def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
     return bool(np.median(miss / allowed) < 1.0)
 
 
-# Corners nearer to the frame than this are not fitted: up to half of their window is outside of the
+# Corners nearer to the frame than this are not fitted: up to half of their window is outside the
 # image.
 MARGIN_PX = 2.0
 # Least contrast relative to the median of the image. Saddle points are kept down to about the same
@@ -155,17 +155,17 @@ def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array3
     moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
     signed = fit.contrast * contrast_signs(cells)
     limit = np.array([image.shape[1], image.shape[0]]) - 1 - MARGIN_PX
-    settled = (
+    plausible = (
         np.all((fit.xy >= MARGIN_PX) & (fit.xy <= limit), axis=1)
         & (fit.coverage > COVERAGE_MIN)
         & (moved < 0.25 * spacing)
         & (turn < ANGLE_MAX)
         & (fit.shift_px < 0.05 + 0.01 * spacing + 0.15 * fit.blur_px)
     )
-    if not np.any(settled):
+    if not np.any(plausible):
         return np.zeros(len(cells), dtype=np.bool_)
-    typical = float(np.median(signed[settled]))
-    judged = settled & (signed * np.sign(typical) > CONTRAST_MIN * abs(typical))
+    typical = float(np.median(signed[plausible]))
+    judged = plausible & (signed * np.sign(typical) > CONTRAST_MIN * abs(typical))
     if not np.any(judged):
         return np.zeros(len(cells), dtype=np.bool_)
     usual = CHI2_MAX * float(np.median(fit.chi2[judged]))

@@ -8,7 +8,7 @@ with ``d1`` and ``d2`` the distances from the edges along i and j, ``h`` the dis
 parallel edge, ``w`` the blur and ``n`` the derivative of the blurred step. The edges bend as the
 local lattice map does, except for a small correction that large squares can determine; a plane and
 a gradient of the contrast describe shading. ``g / a0`` is the distance by which the edges lie
-outside of the bright squares, because of a slope of the specimen or the bright rim that an electron
+outside the bright squares, because of a slope of the specimen or the bright rim that an electron
 microscope shows at every step. It moves the two halves of an edge to opposite sides and matters
 where only one half is in view.
 """

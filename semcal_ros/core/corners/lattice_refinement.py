@@ -69,7 +69,7 @@ class RefinedCorners:
     blur_px
         Median blur.
     quality
-        Part of the corners expected well inside of the image that passed.
+        Part of the corners expected well inside the image that passed.
     rejected_xy
         (k, 2) expected positions of lattice points in the image that did not pass, px.
     foreign
@@ -152,7 +152,7 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
 
 
 def _quality(fitted: FittedCorners, image: Array32) -> float:
-    """Return the part that passed of the corners expected well inside of the image."""
+    """Return the part that passed of the corners expected well inside the image."""
     size = np.array([image.shape[1], image.shape[0]])
     slack = MARGIN_PX + RIM_PART * np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)[:, None]
     expected = np.all((fitted.maps.xy >= slack) & (fitted.maps.xy <= size - 1 - slack), axis=1)

@@ -132,7 +132,7 @@ def fit_local_maps(
 def _solve(solver: Array, which: Indices, xy: Array, member: Indices) -> Array:
     """Return (n, terms, 2) coefficients: ``solver[which]`` times the positions of the neighbours.
 
-    Inside of a lattice all cells share one solver, so that one large product replaces many small
+    Inside a lattice all cells share one solver, so that one large product replaces many small
     ones.
     """
     common = int(np.argmax(np.bincount(which)))

@@ -9,10 +9,10 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
     "apparent_zoom_shift",
-    "carry_covariance",
     "centre_covariance",
     "relative_scale_sigma",
     "scale_covariance",
+    "zoom_covariance",
 ]
 
 
@@ -68,7 +68,7 @@ def apparent_zoom_shift(before: ScanCamera, after: ScanCamera) -> Array:
     )
 
 
-def carry_covariance(before: ScanCamera, after: ScanCamera) -> Array:
+def zoom_covariance(before: ScanCamera, after: ScanCamera) -> Array:
     """(2, 2) covariance in m^2 of the step that a change of magnification seems to make because of
     errors of the two scales.
 

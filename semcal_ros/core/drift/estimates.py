@@ -48,7 +48,7 @@ class DriftSettings:
     registration
         Limits of a single registration.
     rekey_overlap
-        The keyframe is replaced when less than this fraction of the picture still overlaps with it.
+        The keyframe is replaced when less than this fraction of the image still overlaps with it.
     max_jump
         A shift between frames beyond this fraction of the field is a move of the stage, not
         drift.
@@ -64,7 +64,7 @@ class DriftSettings:
     average
         Whether frames are added to their keyframe, so that its noise does not limit what follows.
     max_keyframes, max_keyframe_bytes
-        Number of pictures that are kept to come back to, and their memory.
+        Number of images that are kept to come back to, and their memory.
     interpolation
         Interpolation of the rectification before registration.
     """
@@ -119,7 +119,7 @@ class DriftEstimate:
         (2,) drift since the first frame in the sem frame, its rate, and the rate of that. In px,
         px/s and px/s^2 of the raw image where there is no camera.
     covariance
-        (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all pictures on the way and
+        (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all images on the way and
         from the covariance of the camera's scale.
     """
 
@@ -146,13 +146,13 @@ class DriftUpdate(DriftEstimate):
     status
         What the drift rests on.
     rejection
-        Why the frame's own picture was not used; None where it was.
+        Why the frame's own image was not used; None where it was.
     residual
         RMS grey levels that the shift does not explain; NaN where nothing was registered.
     px_from_unit
         (2, 2) ideal pixels of this frame per unit of the drift.
     overlap
-        Fraction of the picture that was compared with the keyframe.
+        Fraction of the image that was compared with the keyframe.
     calibrated
         False where no camera was given.
     restarted
@@ -182,7 +182,7 @@ class DriftUpdate(DriftEstimate):
 
     @property
     def accepted(self) -> bool:
-        """Whether the drift rests on this frame's own picture."""
+        """Whether the drift rests on this frame's own image."""
         return self.rejection is None
 
     @property
@@ -308,7 +308,7 @@ class DriftPath:
 
     @cached_property
     def accepted(self) -> Mask:
-        """(n,) bool: whether the drift rests on the frame's own picture."""
+        """(n,) bool: whether the drift rests on the frame's own image."""
         return np.array([u.accepted for u in self.updates], dtype=bool)
 
     @cached_property

@@ -25,7 +25,7 @@ __all__ = ["MotionCorrector", "ScanFrame", "resampleable"]
 _NEGLIGIBLE_PX = 1e-3
 # Cameras whose scanned region is remembered; a zoom passes through more, and comes back to few.
 _MAX_REGIONS = 16
-# Pixels along a side by whose noise a repeated picture is recognised.
+# Pixels along a side by whose noise a repeated image is recognised.
 _SAMPLES = 96
 # Points along each edge of a region at which it is checked; distortion is smooth between them.
 _EDGE_POINTS = 17
@@ -42,13 +42,13 @@ class ScanFrame:
     Attributes
     ----------
     image
-        The picture.
+        The image.
     camera
         Its camera at the image's size, or None.
     timing
         Its raster timing, or None for an instant.
     rectified
-        Whether the picture already is in the camera's ideal pixels.
+        Whether the image already is in the camera's ideal pixels.
     """
 
     image: AnyImage
@@ -63,7 +63,7 @@ class ScanFrame:
 
     @property
     def sample(self) -> bytes:
-        """Some of its pixels, by which a picture that comes again is recognised."""
+        """Some of its pixels, by which an image that comes again is recognised."""
         rows, cols = (max(1, n // _SAMPLES) for n in self.image.shape[:2])
         return np.ascontiguousarray(self.image[::rows, ::cols]).tobytes()
 
@@ -99,7 +99,7 @@ class MotionCorrector:
         self._regions: LruCache[tuple[object, ...], Region] = LruCache(_MAX_REGIONS)
 
     def corrected_image(self, frame: ScanFrame, motion: Array) -> tuple[AnyImage, Region]:
-        """The picture without a motion, and the rectangle of it that was scanned.
+        """The image without a motion, and the rectangle of it that was scanned.
 
         ``motion`` (4,) is the drift velocity (unit per s) and acceleration (unit per s^2).
         """
@@ -120,8 +120,8 @@ class MotionCorrector:
             x, y = (int(np.ceil(d)) for d in displaced)
             left, right = min(left + x, width // 3), max(right - x, 2 * width // 3)
             top, bottom = min(top + y, height // 3), max(bottom - y, 2 * height // 3)
-        picture = self._rectifier.rectify(frame.image, camera, drift, frame.timing)
-        return picture, (left, top, right, bottom)
+        image = self._rectifier.rectify(frame.image, camera, drift, frame.timing)
+        return image, (left, top, right, bottom)
 
 
 def _max_displacement_px(frame: ScanFrame, motion: Array) -> Array:
@@ -132,7 +132,7 @@ def _max_displacement_px(frame: ScanFrame, motion: Array) -> Array:
 
 
 def _find_scanned_region(size: tuple[int, int], camera: ScanCamera | None) -> Region:
-    """Rectangle of output pixels that all come from inside of the raw frame."""
+    """Rectangle of output pixels that all come from inside the raw frame."""
     width, height = size
     left, top, right, bottom = 0, 0, width, height
     for _ in range(_MAX_SHRINKS):
@@ -171,7 +171,7 @@ def resampleable(image: AnyImage) -> AnyImage:
     Raises
     ------
     InvalidValueError
-        If it is not a picture.
+        If it is not an image.
     """
     pixels = check_image(image)
     return pixels if pixels.dtype.name in RESAMPLED_TYPES else pixels.astype(np.float32)

@@ -7,7 +7,7 @@ much more it is sheared than its keyframe:
     shear = T (v - v_key) + B (p - p_key) + c_key + noise
 
 with the velocities v and positions p of the smoothed drift. B is the shear that a shift causes in
-pictures whose distortion was not removed, (2, 2) with a prior; c_key is the noise of the keyframe's
+images whose distortion was not removed, (2, 2) with a prior; c_key is the noise of the keyframe's
 own shear, which all frames that were compared with it share. T follows by weighted least squares where the
 velocity changes; a steady drift shears all frames alike and tells nothing.
 
@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 
-#: Shear per shift, 1-sigma, in pictures with their distortion, and where a calibration removed it: a
+#: Shear per shift, 1-sigma, in images with their distortion, and where a calibration removed it: a
 #: distortion of 1 % at the edge of the field, and what is left of it.
 SHEAR_OF_SHIFT_DISTORTED, SHEAR_OF_SHIFT_RECTIFIED = 0.01, 0.001
 
@@ -92,7 +92,7 @@ class FrameTimeEstimate:
     chi2_per_dof
         Robust mean square of the normalised residuals; near 1 where all is as stated.
     converged
-        Whether the iterated weights settled.
+        Whether the iterated weights converged.
     observable
         Whether the estimate can be relied on.
     reason
@@ -249,7 +249,7 @@ def _observe(path: DriftPath, update: DriftUpdate, mean: _KeyframeMean) -> tuple
 
 @dataclass(frozen=True)
 class _Fit:
-    """T and its 1-sigma, s; the robust mean square of the residuals; whether the weights settled."""
+    """T and its 1-sigma, s; the robust mean square of the residuals; whether the weights converged."""
 
     time_s: float
     sigma_s: float
@@ -335,7 +335,7 @@ def _assess(fit: _Fit, frames: int, interval_s: float) -> FrameTimeEstimate:
     time_s, sigma = fit.time_s, fit.sigma_s
     reason = ""
     if not fit.converged:
-        reason = f"the weights did not settle in {_MAX_ITERATIONS} steps"
+        reason = f"the weights did not converge in {_MAX_ITERATIONS} steps"
     elif not abs(time_s) > _MIN_RATIO * sigma:
         reason = f"{time_s:.3g} +- {sigma:.2g} s: the velocity of the drift changes too little"
     elif time_s < 0.0:

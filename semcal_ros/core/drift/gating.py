@@ -116,7 +116,7 @@ def inflate_when_lost(px_from_unit: Array, reach_px: float, speed_px_s: float) -
 def inflate_if_contradicted(
     state: DriftState, key: int | None, nearest: Array, since_s: float
 ) -> Inflate | None:
-    """Where all shifts that a picture allows are far from the prediction; None where one is near.
+    """Where all shifts that an image allows are far from the prediction; None where one is near.
 
     Parameters
     ----------

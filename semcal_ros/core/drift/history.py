@@ -44,7 +44,9 @@ class DriftHistory:
             If there was no frame.
         """
         if not self._cameras:
-            raise InvalidValueError("no frames", expected="at least one", do="track some first")
+            raise InvalidValueError(
+                "no frames", expected="at least one", do="track at least one first"
+            )
         updates: list[DriftUpdate] = []
         for drift_filter, stretch in self._stretches:
             process_noise = drift_filter.process_noise

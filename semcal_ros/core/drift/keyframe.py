@@ -1,4 +1,4 @@
-"""The pictures that drift is measured against.
+"""The images that drift is measured against.
 
 The noise of a reference limits every registration against it. Each frame that was registered well
 is therefore added to its keyframe, shifted to where the keyframe lies, until the noise of the mean
@@ -28,14 +28,14 @@ __all__ = [
 
 # Fewer common rows or columns are not added to a mean.
 _MIN_COMMON_PX = 8
-# A picture that shrinks by more than this must be blurred first, or it would alias: by a Gaussian
-# that widens 0.45 px, the width of a pixel, to that of a pixel of the new picture.
+# An image that shrinks by more than this must be blurred first, or it would alias: by a Gaussian
+# that widens 0.45 px, the width of a pixel, to that of a pixel of the new image.
 _BLUR_BELOW, _PIXEL_SIGMA_PX = 0.95, 0.45
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A reference picture.
+    """A reference image.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Keyframe:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its pictures."""
+        """Memory of its images."""
         return self.mean.nbytes + self.frame.image.nbytes
 
     def prepare_reference(self, settings: RegistrationSettings) -> Reference:
@@ -71,14 +71,14 @@ class Keyframe:
             self.mean, region=self.region, settings=settings, averaged=float(self.averaged)
         )
 
-    def with_frame(self, picture: AnyImage, region: Region, registration: Registration) -> Keyframe:
+    def with_frame(self, image: AnyImage, region: Region, registration: Registration) -> Keyframe:
         """The keyframe with another frame in its mean, where the two overlap."""
-        gray = np.asarray(to_gray(picture), dtype=np.float32)
+        gray = np.asarray(to_gray(image), dtype=np.float32)
         shift = registration.shift_px
         whole = np.floor(shift).astype(int)
         spans = []
         for axis in (0, 1):
-            # What the interpolation reaches beyond the region was not scanned; beyond the picture it
+            # What the interpolation reaches beyond the region was not scanned; beyond the image it
             # is mirrored.
             edges = 0, gray.shape[1 - axis]
             low = FINE.reach if region[axis] > edges[0] else 0
@@ -103,11 +103,11 @@ class Keyframe:
 
 
 def make_keyframe(
-    frame: ScanFrame, removed: Array, picture: AnyImage, region: Region, time_s: float
+    frame: ScanFrame, removed: Array, image: AnyImage, region: Region, time_s: float
 ) -> Keyframe:
-    """A keyframe from a frame and its picture without the motion ``removed`` (4,)."""
+    """A keyframe from a frame and its image without the motion ``removed`` (4,)."""
     return Keyframe(
-        frame, removed.copy(), np.array(to_gray(picture), dtype=np.float32), region, time_s
+        frame, removed.copy(), np.array(to_gray(image), dtype=np.float32), region, time_s
     )
 
 
@@ -146,7 +146,7 @@ def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
 
 
 def _map_region(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:
-    """Upright rectangle inside of the affine image of a rectangle and inside of the picture."""
+    """Upright rectangle inside the affine image of a rectangle and inside the image."""
     left, top, right, bottom = region[0] + 2, region[1] + 2, region[2] - 3, region[3] - 3
     corners = np.array(
         [[left, top], [right, top], [left, bottom], [right, bottom]], dtype=np.float64

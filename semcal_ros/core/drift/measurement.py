@@ -9,8 +9,8 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
-    carry_covariance,
     relative_scale_sigma,
+    zoom_covariance,
 )
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.operations import CloneKeyframe, Measure
@@ -109,7 +109,7 @@ def add_zoom_uncertainty(measure: Measure, before: ScanFrame, now: ScanFrame) ->
     if before.camera is None or now.camera is None:
         return measure
     covariance = measure.covariance.copy()
-    covariance[:2, :2] += carry_covariance(before.camera, now.camera)
+    covariance[:2, :2] += zoom_covariance(before.camera, now.camera)
     return replace(
         measure, covariance=covariance, zoom=apparent_zoom_shift(before.camera, now.camera)
     )

@@ -120,11 +120,11 @@ class AddKeyframe(Operation):
     key
         Number of the keyframe.
     removed
-        (4,) velocity and acceleration that were taken out of its picture.
+        (4,) velocity and acceleration that were taken out of its image.
     acceleration_term_s2
         b of :mod:`semcal_ros.core.drift.state`.
     noise
-        (4, 4) noise of the position and the shear of its picture.
+        (4, 4) noise of the position and the shear of its image.
     scan_s
         Time that the frame took, s.
     """

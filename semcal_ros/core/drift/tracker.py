@@ -1,7 +1,7 @@
 """Live drift: registration against keyframes, filtered, in metres.
 
 Every frame is registered against a keyframe, so that errors do not add up from frame to frame. The
-keyframe is replaced before its overlap with the picture is lost, and an old one is used again when
+keyframe is replaced before its overlap with the image is lost, and an old one is used again when
 its place comes back into view. One Kalman filter holds the drift, its velocity and the positions of
 the keyframes (:mod:`semcal_ros.core.drift.state`); it predicts each shift, gates it and bridges
 frames that cannot be used.
@@ -19,9 +19,9 @@ from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
-    carry_covariance,
     centre_covariance,
     scale_covariance,
+    zoom_covariance,
 )
 from semcal_ros.core.drift.estimates import (
     DriftPredictor,
@@ -83,7 +83,7 @@ _PAUSE = 10.0
 _CANDIDATES = 2
 # Registrations of one frame; each removes the shear that the one before it measured.
 _MAX_REGISTRATIONS = 4
-# Part of the picture's height by which drift may shear it.
+# Part of the image's height by which drift may shear it.
 _MAX_SHEAR = 0.1
 # Divisions by intervals stay finite.
 _MIN_INTERVAL_S = 1e-9
@@ -116,7 +116,7 @@ class _Match:
         The keyframe.
     registration
         Shift in px.
-    picture, region
+    image, region
         The frame as it was compared, and the part of it that was scanned.
     removed
         (4,) drift velocity and acceleration that were removed from it.
@@ -128,7 +128,7 @@ class _Match:
 
     candidate: Candidate
     registration: Registration
-    picture: AnyImage
+    image: AnyImage
     region: Region
     removed: Array
     measure: Measure
@@ -182,7 +182,9 @@ class DriftTracker:
         """
         track = self._track
         if track is None:
-            raise InvalidValueError("a forecast before the first frame", expected="a frame before")
+            raise InvalidValueError(
+                "a forecast before the first frame", expected="at least one frame"
+            )
         state = track.filter.state.without_keyframes()
         return DriftPredictor(state, track.filter.process_noise, track.camera)
 
@@ -200,7 +202,7 @@ class DriftTracker:
         Parameters
         ----------
         image
-            (h, w) or (h, w, 3) picture of integers or floats.
+            (h, w) or (h, w, 3) image of integers or floats.
         time_s
             Start of its acquisition. A time before that of the last frame resets the tracker.
         camera
@@ -209,19 +211,19 @@ class DriftTracker:
         timing
             Raster timing; None takes the frame as an instant at ``time_s``.
         rectified
-            Whether the picture already is in ideal pixels of ``camera``.
+            Whether the image already is in ideal pixels of ``camera``.
 
         Raises
         ------
         InvalidValueError
-            If the time is not finite or the picture has another shape or type.
+            If the time is not finite or the image has another shape or type.
         """
         if not np.isfinite(time_s):
             raise InvalidValueError(f"frame time {time_s} s", expected="a finite number")
-        picture = resampleable(image)
-        height, width = picture.shape[:2]
+        pixels = resampleable(image)
+        height, width = pixels.shape[:2]
         fitted = None if camera is None else camera.resized(width, height)
-        frame = ScanFrame(picture, fitted, timing, rectified)
+        frame = ScanFrame(pixels, fitted, timing, rectified)
         centre_s = time_s + (timing.centre_offset_s if timing is not None else 0.0)
         track = self._track
         if track is not None and (
@@ -256,7 +258,7 @@ class DriftTracker:
         track = _Track(drift_filter, store, frame.camera, centre_s, frame.sample)
         rejection = self._add_keyframe(track, frame, np.zeros(4))
         if rejection is not None:
-            # Nothing can be measured against such a picture: wait for a better one.
+            # Nothing can be measured against such an image: wait for a better one.
             return track, _make_update(start, frame, DriftStatus.COASTING, rejection)
         state = track.filter.state
         return track, _make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0)
@@ -265,8 +267,8 @@ class DriftTracker:
         self, track: _Track, frame: ScanFrame, removed: Array
     ) -> Rejection[MatchFailure] | None:
         """Make this frame a keyframe that was not measured; why it cannot be one, or None."""
-        picture, region = self._corrector.corrected_image(frame, removed)
-        keyframe = make_keyframe(frame, removed, picture, region, track.filter.state.time_s)
+        image, region = self._corrector.corrected_image(frame, removed)
+        keyframe = make_keyframe(frame, removed, image, region, track.filter.state.time_s)
         reference = keyframe.prepare_reference(self.settings.registration)
         if reference.defect:
             return Rejection(MatchFailure.UNUSABLE_IMAGE, reference.defect)
@@ -309,14 +311,14 @@ class DriftTracker:
             ratio = track.store.smallest_scale_ratio(frame)
             reason = f"scale changed by a factor of {ratio:.2f}"
             return self._restart(track, frame, Rejection(MatchFailure.SCALE_CHANGE, reason))
-        # Where nothing matched before, the picture may be that of any of them.
+        # Where nothing matched before, the image may be that of any of them.
         is_steady = track.rejected == 0 and track.filter.pending is None
         rejected: list[_RejectedMatch] = []
         for candidate in candidates[: _CANDIDATES if is_steady else 2 * _CANDIDATES]:
             match = self._match(track, frame, candidate)
             if isinstance(match, _Match) and is_repeated:
                 # Noise never comes twice: the scan is paused, or the driver sent the frame again.
-                reason = "image: the same picture as the frame before"
+                reason = "image: the same as the previous frame"
                 repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
                 match = _RejectedMatch(repeated, match.registration)
             if isinstance(match, _Match):
@@ -360,7 +362,7 @@ class DriftTracker:
     ) -> _Match | _RejectedMatch:
         """Register a frame that is corrected for a motion."""
         store, key = track.store, candidate.key
-        picture, region = self._corrector.corrected_image(frame, motion)
+        image, region = self._corrector.corrected_image(frame, motion)
         reference = (
             store.resampled_reference(key, frame) if candidate.rescaled else store.reference(key)
         )
@@ -368,7 +370,7 @@ class DriftTracker:
         px_from_unit = frame.px_from_unit
         registration = register(
             reference,
-            picture,
+            image,
             guess_px=px_from_unit @ shift,
             guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
             image_region=region,
@@ -381,7 +383,7 @@ class DriftTracker:
         measure = make_measurement(key, keyframe.frame, frame, registration, motion, averaged)
         if track.filter.pending == key:
             track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
-        return _Match(candidate, registration, picture, region, motion, measure, keyframe.time_s)
+        return _Match(candidate, registration, image, region, motion, measure, keyframe.time_s)
 
     def _correct_keyframe(self, track: _Track, candidate: Candidate, state: DriftState) -> bool:
         """Take the shear out of a keyframe; whether there was any. Only a single frame has one."""
@@ -395,8 +397,8 @@ class DriftTracker:
         ):
             return False
         removed = keyframe.removed + remaining
-        picture, region = self._corrector.corrected_image(keyframe.frame, removed)
-        corrected = make_keyframe(keyframe.frame, removed, picture, region, keyframe.time_s)
+        image, region = self._corrector.corrected_image(keyframe.frame, removed)
+        corrected = make_keyframe(keyframe.frame, removed, image, region, keyframe.time_s)
         track.store.replace(candidate.key, corrected)
         term_s2 = keyframe.frame.acceleration_term_s2
         track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
@@ -458,7 +460,7 @@ class DriftTracker:
         """
         before, now = track.store[measure.key].frame.camera, frame.camera
         assert before is not None and now is not None
-        noise = carry_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
+        noise = zoom_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
         key = _rekey(track, frame, match, measure, noise)
         return measure_itself(key, measure, match.removed)
 
@@ -489,7 +491,7 @@ class DriftTracker:
                 status = DriftStatus.KEYFRAME
         elif self.settings.average and _is_mergeable(match, store):
             keyframe = store[candidate.key]
-            mean = keyframe.with_frame(match.picture, match.region, registration)
+            mean = keyframe.with_frame(match.image, match.region, registration)
             store.replace(candidate.key, mean)
             merged = True
         update = _make_update(track.filter.state, frame, status, registration=registration)
@@ -498,7 +500,7 @@ class DriftTracker:
     def _coast(
         self, track: _Track, frame: ScanFrame, rejected: list[_RejectedMatch], rescaled: bool
     ) -> DriftUpdate:
-        """Keep the prediction, with a larger covariance where the picture contradicts it; start
+        """Keep the prediction, with a larger covariance where the image contradicts it; start
         again from it where the frame or its scale is lost.
         """
         # The first one is that of the best keyframe.
@@ -582,7 +584,7 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
 def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noise: Array) -> int:
     """Make this frame a keyframe, as it was measured against the one before; its number."""
     state = track.filter.state
-    keyframe = make_keyframe(frame, match.removed, match.picture, match.region, state.time_s)
+    keyframe = make_keyframe(frame, match.removed, match.image, match.region, state.time_s)
     key, forgotten = track.store.add(keyframe)
     track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
     for old in forgotten:

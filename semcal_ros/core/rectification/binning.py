@@ -1,4 +1,4 @@
-"""Pictures averaged down by whole factors."""
+"""Images averaged down by whole factors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["bin_image"]
 
 
 def bin_image(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyImage, ScanCamera]:
-    """A picture with no side longer than ``largest_px``, and the camera that takes it.
+    """An image with no side longer than ``largest_px``, and the camera that takes it.
 
     Square blocks of pixels are averaged. Rows and columns at the bottom and on the right that do not
     fill a block are left out.
@@ -50,7 +50,7 @@ def bin_image(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[Any
         return image, fitted
     kept = small[0] * factor, small[1] * factor
     blocks = cast("NDArray[np.uint8]", image[: kept[1], : kept[0]])
-    picture = cv2.resize(blocks, small, interpolation=cv2.INTER_AREA)
+    binned = cv2.resize(blocks, small, interpolation=cv2.INTER_AREA)
     # What is left out at the far ends moves no other pixel.
     cropped = replace(fitted, width=kept[0], height=kept[1])
-    return np.asarray(picture), cropped.resized(*small)
+    return np.asarray(binned), cropped.resized(*small)

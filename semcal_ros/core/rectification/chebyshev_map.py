@@ -28,7 +28,7 @@ _DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 _MAX_MAP_ERROR_PX = 0.001
 # Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
 _MAX_KEPT = 16
-# A raw position outside of every frame, for output pixels without one: they come out as 0.
+# A raw position outside every frame, for output pixels without one: they come out as 0.
 _OUTSIDE_PX = -1e4
 
 

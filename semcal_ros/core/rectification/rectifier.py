@@ -1,7 +1,7 @@
 """Undo distortion and drift of a frame in one interpolation.
 
 The raw position of every output pixel (:mod:`semcal_ros.core.rectification.raw_positions`) is computed in bands of
-rows that stay in the processor's cache while the picture is resampled at them
+rows that stay in the processor's cache while the image is resampled at them
 (:mod:`semcal_ros.core.rectification.chebyshev_map`); a map that is needed a second time is kept as a whole.
 """
 
@@ -139,17 +139,15 @@ class Rectifier:
         return self._whole_maps(key, fitted, drift, timing)
 
     def remapped(self, image: AnyImage, map_x: Array32, map_y: Array32) -> AnyImage:
-        """The image at raw positions as :meth:`maps` gives them; 0 outside of it."""
+        """The image at raw positions as :meth:`maps` gives them; 0 outside it."""
         return self._remap(image, map_x, map_y, None)
 
     def _remap(
         self, image: AnyImage, map_x: Array32, map_y: Array32, out: AnyImage | None
     ) -> AnyImage:
-        picture, output = cast("NDArray[np.float32]", image), cast("NDArray[np.float32]", out)
+        raw, output = cast("NDArray[np.float32]", image), cast("NDArray[np.float32]", out)
         border = cv2.BORDER_CONSTANT
-        warped = cv2.remap(
-            picture, map_x, map_y, self._flag, output, borderMode=border, borderValue=0
-        )
+        warped = cv2.remap(raw, map_x, map_y, self._flag, output, borderMode=border, borderValue=0)
         return np.asarray(warped)
 
     # -- maps -------------------------------------------------------------------------------------

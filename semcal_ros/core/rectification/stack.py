@@ -109,19 +109,19 @@ class Stack:
         InvalidValueError
             If the image has another size than the stack or is not grey, or the drift is not usable.
         """
-        picture = _check_grey(image, self._size)
+        grey = _check_grey(image, self._size)
         map_x, map_y = self._rectifier.maps(self._size, camera, drift, timing)
-        rectified = self._rectifier.remapped(picture, map_x, map_y)
+        rectified = self._rectifier.remapped(grey, map_x, map_y)
         return np.asarray(rectified, dtype=np.float32), find_scanned(
             map_x, map_y, self._size, self._reach
         )
 
-    def add(self, picture: NDArray[np.float32], valid: Mask) -> None:
-        """Add a rectified picture.
+    def add(self, image: NDArray[np.float32], valid: Mask) -> None:
+        """Add a rectified image.
 
         Parameters
         ----------
-        picture
+        image
             (h, w) float32 grey levels; values that are not finite do not count.
         valid
             (h, w) bool: the pixels that were scanned.
@@ -129,17 +129,17 @@ class Stack:
         Raises
         ------
         InvalidValueError
-            If picture or mask have another shape than the stack.
+            If image or mask have another shape than the stack.
         """
         width, height = self._size
-        if picture.shape != (height, width) or valid.shape != (height, width):
+        if image.shape != (height, width) or valid.shape != (height, width):
             raise InvalidValueError(
-                f"a picture of shape {picture.shape} with a mask of shape {valid.shape}",
+                f"an image of shape {image.shape} with a mask of shape {valid.shape}",
                 expected=f"({height}, {width})",
             )
-        finite = np.isfinite(picture)
+        finite = np.isfinite(image)
         used = valid & finite
-        values = picture.astype(np.float32) if finite.all() else np.where(finite, picture, 0.0)
+        values = image.astype(np.float32) if finite.all() else np.where(finite, image, 0.0)
         values = np.ascontiguousarray(values, dtype=np.float32)
         mask = used.astype(np.uint8)
         cv2.accumulate(values, self._sum, mask)

@@ -1,4 +1,4 @@
-"""Peak disambiguation: which of several shifts that explain a picture about equally well to use.
+"""Peak disambiguation: which of several shifts that explain an image about equally well to use.
 
 On a lattice every period gives a peak. Competing peaks are refined and compared tile by tile at
 full resolution; what the tiles cannot tell apart, a prediction may decide.
@@ -28,7 +28,7 @@ NOTHING_TO_COMPARE = "nothing to compare: featureless in one direction, or too l
 # Part of the residual by which two shifts must differ to be told apart: below it, the error of the
 # interpolation, which depends on the fraction of the shift, decides instead of the specimen.
 _MIN_RESIDUAL_DIFFERENCE = 0.05
-# The same for a picture to contradict a prediction: sharp lattices look a little different wherever
+# The same for an image to contradict a prediction: sharp lattices look a little different wherever
 # their pixels fall.
 _MIN_CONTRADICTION = 0.3
 # Peaks that were refined to within this distance of each other are the same shift.
@@ -51,7 +51,7 @@ def choose_peak(
     Parameters
     ----------
     reference, pyramid
-        The two pictures.
+        The two images.
     peaks
         Peaks of their correlation, the highest first; at least one.
     guess, guess_covariance
@@ -60,11 +60,11 @@ def choose_peak(
     Returns
     -------
     The peak with its alignment, which is None where there was no need to refine it; or a rejection
-    where the picture does not tell which one.
+    where the image does not tell which one.
 
     Notes
     -----
-    Peaks are compared at full resolution: reduced pictures differ by how their pixels happen to
+    Peaks are compared at full resolution: reduced images differ by how their pixels happen to
     fall.
     """
     limits, level = reference.settings, reference.levels[-1]
@@ -73,7 +73,7 @@ def choose_peak(
     if len(competitors) > 1 and guess_covariance is not None:
         predicted = [p for p in competitors if _is_predicted(p, guess, guess_covariance)]
         if predicted and competitors[0] not in predicted:
-            # The prediction decides between equals; it does not override the picture.
+            # The prediction decides between equals; it does not override the image.
             return _prefer_prediction(reference, pyramid, predicted[0], competitors[0])
         competitors = predicted or competitors
     if len(competitors) == 1:
@@ -95,7 +95,7 @@ def choose_peak(
             return Rejection(
                 MatchFailure.AMBIGUOUS,
                 f"ambiguous: shifts ({shift[0]:.1f}, {shift[1]:.1f}) and"
-                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the picture equally well",
+                f" ({other[0]:.1f}, {other[1]:.1f}) px explain the image equally well",
             )
         if deviations < 0.0:
             best = peak, alignment, energies
@@ -107,7 +107,7 @@ def choose_peak(
 def _prefer_prediction(
     reference: Reference, pyramid: Pyramid, predicted: CoarsePeak, highest: CoarsePeak
 ) -> tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]:
-    """The predicted peak, unless the highest one explains the picture clearly better."""
+    """The predicted peak, unless the highest one explains the image clearly better."""
     alignments = [
         align(reference.levels, pyramid, np.array(p.shift_px)) for p in (predicted, highest)
     ]
@@ -122,7 +122,7 @@ def _prefer_prediction(
         x, y = highest.shift_px
         return Rejection(
             MatchFailure.AMBIGUOUS,
-            f"ambiguous: the picture says ({x:.1f}, {y:.1f}) px, far from the prediction",
+            f"ambiguous: the image shows a shift of ({x:.1f}, {y:.1f}) px, far from the prediction",
         )
     return predicted, alignments[0]
 

@@ -1,4 +1,4 @@
-"""Kinds of reasons for not using a picture, for registration and drift alike."""
+"""Kinds of reasons for not using an image, for registration and drift alike."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class MatchFailure(Enum):
     NO_PEAK = "no peak"
     #: Several shifts explain the image equally well, or another one than was predicted does.
     AMBIGUOUS = "ambiguous"
-    #: The gradient of the pictures leaves a direction of the shift open, or too little overlaps.
+    #: The gradient of the images leaves a direction of the shift open, or too little overlaps.
     UNDETERMINED = "undetermined"
     #: The refinement did not converge.
     NOT_CONVERGED = "not converged"
@@ -28,7 +28,7 @@ class MatchFailure(Enum):
     STAGES_DISAGREE = "stages disagree"
     #: The halves of the overlap are shifted differently.
     HALVES_DISAGREE = "halves disagree"
-    #: The pictures have too little of their structure in common.
+    #: The images have too little of their structure in common.
     DISSIMILAR = "dissimilar"
     #: The shift is so large that the stage must have moved.
     STAGE_MOVE = "stage move"

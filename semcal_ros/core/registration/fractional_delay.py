@@ -1,7 +1,7 @@
 """Band-limited sub-pixel shifts and derivatives as short separable filters.
 
 A pure translation needs no general remap: the same few weights serve every pixel of a row. The
-weights minimise the squared error over the band in which a blurred picture has its power
+weights minimise the squared error over the band in which a blurred image has its power
 (least-squares fractional delay, Laakso et al. 1996, doi:10.1109/79.482137), so the interpolation
 error stays below the noise and does not depend on the fraction. OpenCV's remap is no substitute:
 version 4 rounds float maps to 1/32 px.
@@ -23,10 +23,10 @@ __all__ = ["FINE", "SHARP", "Band", "gradients", "sample_shifted"]
 
 # Frequencies at which a filter of up to 16 taps is fitted: four times as many.
 _SAMPLES = 64
-# Of the diagonal of the normal matrix, added to it: what lies outside of the band is left free, and
+# Of the diagonal of the normal matrix, added to it: what lies outside the band is left free, and
 # this keeps the weights small there.
 _RIDGE = 1e-9
-# Squared frequency, (rad/px)^2, below which the power of a picture is taken as constant.
+# Squared frequency, (rad/px)^2, below which the power of an image is taken as constant.
 _FLAT_BELOW = 0.05
 
 
@@ -62,11 +62,11 @@ class Band:
 
     @property
     def weights(self) -> Array:
-        """(64,) their weights: pictures have most of their power at low frequencies."""
+        """(64,) their weights: images have most of their power at low frequencies."""
         return np.asarray(1.0 / (_FLAT_BELOW + self.frequencies**2))
 
 
-#: For pictures that are smooth, and for sharp ones with little noise.
+#: For images that are smooth, and for sharp ones with little noise.
 FINE, SHARP = Band(0.72 * np.pi, 12), Band(0.8 * np.pi, 16)
 
 
@@ -126,7 +126,7 @@ def sample_shifted(
     image
         (h, w) of uint8, uint16 or float32.
     corner, size
-        (left, top) and (width, height) of the patch, which must lie inside of the image.
+        (left, top) and (width, height) of the patch, which must lie inside the image.
     fraction
         (2,) sub-pixel shift (x, y), each in [-1, 1].
     smoothing

@@ -1,4 +1,4 @@
-"""Fine alignment of two pictures by inverse-compositional least squares, coarse to fine.
+"""Fine alignment of two images by inverse-compositional least squares, coarse to fine.
 
 With the model
 
@@ -44,15 +44,15 @@ from semcal_ros.core.registration.tiles import (
 __all__ = ["Alignment", "align", "tile_residual_energies", "unmeasured_alignment"]
 
 
-# A start that needs more steps than these is outside of the range of convergence.
+# A start that needs more steps than these is outside the range of convergence.
 _MAX_PASSES = 12
 _MAX_COARSE_PASSES = 4
-# The gradient extrapolates over a pixel or two of a sharp picture; longer steps may overshoot.
+# The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot.
 _MAX_STEP_PX = 1.5
 # A coarse level is left when its step is this short (px of the level), less than half a pixel of
 # the next one.
 _COARSE_STEP_PX = 0.2
-# What remains after a step is at most this part of it, and its square over the pictures' finest
+# What remains after a step is at most this part of it, and its square over the images' finest
 # structure.
 _CONTRACTION = 0.06
 _CURVATURE = 0.5
@@ -61,7 +61,7 @@ _CURVATURE = 0.5
 _TOLERATED_SIGMAS = 0.12
 _MIN_TOLERANCE_PX = 5e-4
 # Scores of tiles that are nearer than this to each other share smoothed noise: a Gaussian of sigma,
-# applied to both pictures, correlates over some 4 sigma to either side; blocks are three times as
+# applied to both images, correlates over some 4 sigma to either side; blocks are three times as
 # large, so that little of their sums is shared.
 _BLOCK_SIGMAS = 14.0
 # The scatter of 36 blocks tells a sigma to 1 / sqrt(2 * 36) = 12 %.
@@ -75,13 +75,13 @@ _MAX_CONDITION = 1e6
 _MIN_NOISE_ROWS = 10
 _ROWS_RATIO = 2.0
 # By how many standard deviations the common information must exceed what chance gives: once in a
-# million pictures of noise.
+# million images of noise.
 _CHANCE = 5.0
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Outcome of :func:`align`, whose shifts are those of the cropped pictures that went in.
+    """Outcome of :func:`align`, whose shifts are those of the cropped images that went in.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Alignment:
     reference_variance, image_variance, common_covariance
         Second moments over the overlap.
     overlap
-        Fraction of the smaller picture that both show.
+        Fraction of the smaller image that both show.
     converged, iterations
         Whether the last step left nothing that matters, and the number of steps.
     """
@@ -127,7 +127,7 @@ class Alignment:
 
 
 def unmeasured_alignment() -> Alignment:
-    """The alignment of pictures between which nothing could be measured."""
+    """The alignment of images between which nothing could be measured."""
     nan = float("nan")
     return Alignment(
         shift_px=np.full(2, np.nan),
@@ -230,13 +230,13 @@ def _compare(
 ) -> _Comparison | None:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
     comparison, None to compute it."""
-    picture = image.at(level.factor)
-    size = picture.shape[1], picture.shape[0]
+    pixels = image.at(level.factor)
+    size = pixels.shape[1], pixels.shape[0]
     window = tile_window(level, size, shift)
     if window is None:
         return None
     geometry = prepare_geometry(level, window)
-    sums = tile_sums(level, window, picture, shift, mean, hessian)
+    sums = tile_sums(level, window, pixels, shift, mean, hessian)
     fit = solve_step(geometry, sums)
     return (
         None if fit is None else _Comparison(level, window, geometry, sums, fit, shift, size, mean)
@@ -244,7 +244,7 @@ def _compare(
 
 
 def _has_common_gradient(comparison: _Comparison) -> bool:
-    """Whether the pictures have more gradient in common than chance gives, in every direction."""
+    """Whether the images have more gradient in common than chance gives, in every direction."""
     level, geometry, fit = comparison.level, comparison.geometry, comparison.fit
     energy = geometry.normal_matrices.sum(axis=0)[:2, :2] * np.outer(
         geometry.gradient_share, geometry.gradient_share
@@ -412,7 +412,7 @@ def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array)
     """(rows, cols) mean squared residual of each tile of the reference at a shift; NaN where they
     do not overlap with the image.
 
-    For comparing competing shifts of the same two pictures: a paired test over tiles tells whether one
+    For comparing competing shifts of the same two images: a paired test over tiles tells whether one
     explains the image better than chance and model error allow.
     """
     mean = float(image.at(level.factor).mean(dtype=np.float64))

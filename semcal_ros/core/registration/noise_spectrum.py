@@ -1,12 +1,12 @@
-"""Noise level of a picture, and the smoothing that makes its shift best determined.
+"""Noise level of an image, and the smoothing that makes its shift best determined.
 
-For two pictures with the same signal spectrum S and white noise N and M, the variance of a shift
+For two images with the same signal spectrum S and white noise N and M, the variance of a shift
 estimated through the power weighting ``psi`` is (Knapp and Carter 1976,
 doi:10.1109/TASSP.1976.1162830)
 
     var(psi)  ~  integral w^2 psi^2 (S (N + M) + N M)  /  (integral w^2 psi S)^2
 
-A Gaussian of width sigma applied to both pictures is ``psi = exp(-w^2 sigma^2)``; the best sigma is
+A Gaussian of width sigma applied to both images is ``psi = exp(-w^2 sigma^2)``; the best sigma is
 looked up on the radial spectrum.
 """
 
@@ -22,15 +22,15 @@ import scipy.fft
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 
 __all__ = [
-    "PictureStatistics",
+    "ImageStatistics",
     "estimate_noise_variance",
     "gaussian_taps",
-    "measure_picture",
+    "measure_image",
     "smooth",
 ]
 
 
-# Parts of the picture, from its middle, whose spectrum is measured. 256 px tell the smoothing; the
+# Parts of the image, from its middle, whose spectrum is measured. 256 px tell the smoothing; the
 # corners of the spectrum of 64 px have some 300 coefficients, which tell the noise to 8 %.
 _CROP_PX = 256
 _NOISE_CROP_PX = 64
@@ -47,8 +47,8 @@ _REACH_SIGMAS = 3.5
 
 
 @dataclass(frozen=True)
-class PictureStatistics:
-    """What a picture's radial spectrum says.
+class ImageStatistics:
+    """What an image's radial spectrum says.
 
     Attributes
     ----------
@@ -101,13 +101,13 @@ def estimate_noise_variance(image: AnyImage) -> float:
     return _noise_floor(*_radial_spectrum(image, _NOISE_CROP_PX))
 
 
-def measure_picture(image: AnyImage, averaged: float = 1.0) -> PictureStatistics:
+def measure_image(image: AnyImage, averaged: float = 1.0) -> ImageStatistics:
     """Noise, signal and the best smoothing of ``image`` (at least 16 x 16 px).
 
-    ``averaged`` is the number of pictures that ``image`` is the mean of: a single picture has this
+    ``averaged`` is the number of images that ``image`` is the mean of: a single image has this
     many times its noise variance.
 
-    The noise is read from the corners of the spectrum beyond 0.45 cycles per px; a picture with
+    The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
     w, power, count = _radial_spectrum(image, _CROP_PX)
@@ -117,13 +117,13 @@ def measure_picture(image: AnyImage, averaged: float = 1.0) -> PictureStatistics
     signal = np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
     signal_variance = float(np.sum(signal * count) / np.sum(count))
     if signal_variance <= 0.0 or noise <= 0.0:
-        return PictureStatistics(noise, signal_variance, 0.0)
+        return ImageStatistics(noise, signal_variance, 0.0)
     psi = np.exp(-np.outer(_SIGMAS_PX**2, w**2))
     single = noise * averaged
     numerator = psi**2 @ (count * w**2 * ((noise + single) * signal + noise * single))
     denominator = psi @ (count * w**2 * signal)
     best = int(np.argmin(numerator / denominator**2))
-    return PictureStatistics(noise, signal_variance, float(_SIGMAS_PX[best]))
+    return ImageStatistics(noise, signal_variance, float(_SIGMAS_PX[best]))
 
 
 def gaussian_taps(sigma_px: float) -> Array:

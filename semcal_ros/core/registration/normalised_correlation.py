@@ -23,10 +23,10 @@ from semcal_ros.core.registration.tiles import Pyramid
 __all__ = ["CoarsePeak", "CoarseReference", "find_coarse_peaks"]
 
 
-# Longest sides to which the pictures are reduced, tried one after the other: each step costs four
+# Longest sides to which the images are reduced, tried one after the other: each step costs four
 # times as much, and textures with little structure left at one size may have it at the next.
 _LEVELS_PX = (128, 256, 512)
-# A maximum over some 10^4 shifts of unrelated pictures stays below about 5 robust deviations.
+# A maximum over some 10^4 shifts of unrelated images stays below about 5 robust deviations.
 _SIGNIFICANT = 7.0
 # On a lattice the whole surface oscillates, so that its spread says nothing; its height does.
 _MIN_CORRELATION = 0.5
@@ -66,13 +66,13 @@ class CoarsePeak:
 
     @property
     def significant(self) -> bool:
-        """Whether unrelated pictures are unlikely to give such a peak."""
+        """Whether unrelated images are unlikely to give such a peak."""
         return self.significance >= _SIGNIFICANT or self.correlation >= _MIN_CORRELATION
 
 
 @dataclass(frozen=True)
 class _SurfacePart:
-    """What one picture contributes to the surface of a pair of sizes."""
+    """What one image contributes to the surface of a pair of sizes."""
 
     reduced: Image
     spectrum: NDArray[np.complex64]
@@ -102,14 +102,14 @@ class _SurfaceGeometry:
 
 @dataclass(frozen=True)
 class CoarseReference:
-    """A reference picture for :func:`find_coarse_peaks`.
+    """A reference image for :func:`find_coarse_peaks`.
 
     Parameters
     ----------
     pyramid
-        The grey picture.
+        The grey image.
     min_overlap
-        Shifts are searched whose overlap is at least this fraction of the smaller picture, per axis
+        Shifts are searched whose overlap is at least this fraction of the smaller image, per axis
         and in area.
     """
 
@@ -143,11 +143,11 @@ def find_coarse_peaks(
     Parameters
     ----------
     reference, image
-        Pictures of the same scale; sizes may differ.
+        Images of the same scale; sizes may differ.
     guess_px
         (2,) predicted shift, near which peaks are listed even if many others are higher.
     finest
-        Search at the finest resolution at once, for textures of which reduced pictures show little.
+        Search at the finest resolution at once, for textures of which reduced images show little.
 
     Returns
     -------
@@ -166,9 +166,9 @@ def find_coarse_peaks(
     return best if best and best[0].significant else []
 
 
-def _remove_shading(picture: AnyImage) -> Image:
+def _remove_shading(image: AnyImage) -> Image:
     """Shading removed: only structure below an eighth of the field is compared."""
-    small = np.asarray(picture, dtype=np.float32)
+    small = np.asarray(image, dtype=np.float32)
     sigma = max(small.shape) / _SHADING_PARTS
     # The shading is smooth: a sixteenth of the pixels tell it.
     tiny = cv2.resize(small, (0, 0), fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
@@ -274,20 +274,20 @@ def _plan_surface(
 
 
 def _prepare_part(
-    picture: Image,
+    image: Image,
     geometry: _SurfaceGeometry,
     rows: tuple[Indices, ...],
     cols: tuple[Indices, ...],
 ) -> _SurfacePart:
-    table, squares = cv2.integral2(picture, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    table, squares = cv2.integral2(image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     # Shading was removed, so that single precision is enough for differences of the sums.
     sums = _sum_boxes(np.asarray(table, dtype=np.float32), rows, cols)
     energies = _sum_boxes(np.asarray(squares, dtype=np.float32), rows, cols)
     variance = energies - sums**2 / geometry.count
     floor = 1e-9 * max(float(variance.max()), 1e-30)
     return _SurfacePart(
-        picture,
-        scipy.fft.rfft2(picture, geometry.size),
+        image,
+        scipy.fft.rfft2(image, geometry.size),
         sums,
         np.sqrt(np.maximum(variance, np.float32(floor))),
     )

@@ -1,4 +1,4 @@
-"""A reference picture prepared for registration, and the limits of what is accepted against it."""
+"""A reference image prepared for registration, and the limits of what is accepted against it."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ class RegistrationSettings:
     Attributes
     ----------
     min_overlap
-        Least fraction of the smaller picture that must overlap. Shifts beyond it are not searched.
+        Least fraction of the smaller image that must overlap. Shifts beyond it are not searched.
     max_sigma_px
         Largest acceptable 1-sigma of the shift in its worst direction.
     min_correlation
-        Least correlation of the two pictures after their noise has been accounted for.
+        Least correlation of the two images after their noise has been accounted for.
     max_saturated
         Largest fraction of pixels at either end of the grey scale.
     min_competing_height
         Correlation peaks higher than this fraction of the highest compete with it.
     min_deviations
-        By how many standard errors a peak must explain the picture better than its competitors.
+        By how many standard errors a peak must explain the image better than its competitors.
     """
 
     min_overlap: float = 0.3
@@ -43,14 +43,14 @@ class RegistrationSettings:
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference picture with everything about it that does not depend on the image.
+    """A reference image with everything about it that does not depend on the other image.
 
     Made by :func:`~semcal_ros.core.registration.register.prepare_reference`.
 
     Attributes
     ----------
     region
-        The part of the picture that is compared.
+        The part of the image that is compared.
     coarse
         Its side of the search over all shifts.
     levels

@@ -1,12 +1,12 @@
-"""Shift between two pictures of the same specimen, with a covariance, or a rejection with a reason.
+"""Shift between two images of the same specimen, with a covariance, or a rejection with a reason.
 
 A coarse search over all shifts by :mod:`.normalised_correlation` is followed by least squares at
 full resolution (:mod:`.inverse_compositional`). A wrong shift is worse than none. A result is
-therefore accepted only if the two stages agree, the halves of the overlap agree, the pictures have
+therefore accepted only if the two stages agree, the halves of the overlap agree, the images have
 most of their structure in common, and no competing shift explains the image as well.
 
-It fails, and says so, on pictures without structure in some direction, on periodic specimens
-without a prediction that is good to half a period, and on pictures whose scales differ by more than
+It fails, and says so, on images without structure in some direction, on periodic specimens
+without a prediction that is good to half a period, and on images whose scales differ by more than
 about 1 %.
 """
 
@@ -29,7 +29,7 @@ from semcal_ros.core.registration.inverse_compositional import (
 from semcal_ros.core.registration.noise_spectrum import (
     estimate_noise_variance,
     gaussian_taps,
-    measure_picture,
+    measure_image,
 )
 from semcal_ros.core.registration.normalised_correlation import (
     CoarsePeak,
@@ -58,15 +58,15 @@ _MIN_SIDE_PX = 48
 _MIN_LEVEL_PX = 160
 # Saturation is counted in some 256 x 256 pixels, which tell its share to 0.2 %.
 _SATURATION_SAMPLES = 256
-# Variance of the structure over that of the noise; chance makes less of pictures of 96 px and more.
+# Variance of the structure over that of the noise; chance makes less of images of 96 px and more.
 _MIN_SIGNAL = 0.06
 # The variance of the structure is at least this part of the whole, however large the noise is
 # estimated: the correlation stays finite.
 _MIN_SIGNAL_SHARE = 0.02
 # The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
-# textures whose reduced pictures alias.
+# textures whose reduced images alias.
 _STAGE_TOLERANCE_PX = 1.0
-# The two halves may differ by chance, and by what distortion is left in the pictures: 0.3 px is a
+# The two halves may differ by chance, and by what distortion is left in the images: 0.3 px is a
 # change of scale of 1 part in 1000 over the 300 px between the middles of halves of 600 px.
 _HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
 
@@ -82,7 +82,7 @@ class Registration:
         reference is seen at ``x + shift_px`` in the image. NaN and infinite where nothing could be
         measured.
     correlation
-        Correlation of the two pictures over the overlap after their noise has been accounted for,
+        Correlation of the two images over the overlap after their noise has been accounted for,
         at most 1; NaN where nothing could be measured.
     rejection
         Why the shift must not be used; None where it may.
@@ -123,12 +123,12 @@ def to_gray(image: ArrayLike) -> AnyImage:
     Raises
     ------
     InvalidValueError
-        If it is not a picture.
+        If it is not an image.
     """
-    picture = check_image(image)
-    if picture.ndim == 3:
-        return picture.mean(axis=2, dtype=np.float32)
-    return picture if picture.dtype.name in RESAMPLED_TYPES else picture.astype(np.float32)
+    pixels = check_image(image)
+    if pixels.ndim == 3:
+        return pixels.mean(axis=2, dtype=np.float32)
+    return pixels if pixels.dtype.name in RESAMPLED_TYPES else pixels.astype(np.float32)
 
 
 def _crop(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
@@ -140,26 +140,26 @@ def _crop(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
         raise InvalidValueError(
             f"region {region} of an image of {width} x {height} px",
-            expected="(left, top, right, bottom) inside of the image",
+            expected="(left, top, right, bottom) inside the image",
         )
     return gray[top:bottom, left:right], region
 
 
 def _find_defect(gray: AnyImage, settings: RegistrationSettings) -> str:
-    """Why a picture alone cannot be registered, or an empty string."""
+    """Why an image alone cannot be registered, or an empty string."""
     if min(gray.shape) < _MIN_SIDE_PX:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
-        return "picture holds values that are not finite"
+        return "values that are not finite"
     stride = max(1, min(gray.shape) // _SATURATION_SAMPLES)
     some = np.ascontiguousarray(gray[::stride, ::stride])
     lowest, highest = some.min(), some.max()
     if lowest == highest:
-        return f"blank picture (all pixels at {highest:g})"
+        return f"blank (all pixels at {highest:g})"
     for end in (lowest, highest):
         share = float(np.count_nonzero(some == end)) / some.size
         if share > settings.max_saturated:
-            return f"saturated picture ({100.0 * share:.0f} % of the pixels at {end:g})"
+            return f"saturated ({100.0 * share:.0f} % of the pixels at {end:g})"
     return ""
 
 
@@ -175,18 +175,18 @@ def prepare_reference(
     Parameters
     ----------
     image
-        (h, w) or (h, w, 3) picture.
+        (h, w) or (h, w, 3) image.
     region
         Its valid rectangle; None for all of it.
     settings
         Limits of acceptance.
     averaged
-        Number of pictures that ``image`` is the mean of, at least 1.
+        Number of images that ``image`` is the mean of, at least 1.
 
     Raises
     ------
     InvalidValueError
-        If the image is not a picture, or the region does not lie in it.
+        If the shape or type is not that of an image, or the region does not lie in it.
     """
     limits = settings or RegistrationSettings()
     gray, inside = _crop(image, region)
@@ -195,9 +195,9 @@ def prepare_reference(
     defect = _find_defect(gray, limits)
     if defect:
         return Reference(inside, coarse, (), 0.0, defect, limits)
-    statistics = measure_picture(gray, averaged)
+    statistics = measure_image(gray, averaged)
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
-        return Reference(inside, coarse, (), 0.0, "featureless picture (noise only)", limits)
+        return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
     levels = []
     for factor in _reduction_factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
@@ -227,12 +227,12 @@ def register_pair(
     image_region: Region | None = None,
     settings: RegistrationSettings | None = None,
 ) -> Registration:
-    """Measure the shift of ``image`` against a picture that is used once.
+    """Measure the shift of ``image`` against an image that is used once.
 
     Parameters
     ----------
     reference
-        (h, w) or (h, w, 3) picture.
+        (h, w) or (h, w, 3) image.
     reference_region
         Its valid rectangle; None for all of it.
     settings
@@ -243,7 +243,7 @@ def register_pair(
     Raises
     ------
     InvalidValueError
-        If an argument is not a picture, or a region does not lie in it.
+        If the shape or type of an argument is not that of an image, or a region does not lie in it.
     """
     return register(
         prepare_reference(reference, region=reference_region, settings=settings),
@@ -270,15 +270,15 @@ def register(
     reference
         Made by :func:`prepare_reference`; its settings are the limits of acceptance.
     image
-        (h, w) or (h, w, 3) picture at the same scale; its size may differ.
+        (h, w) or (h, w, 3) image at the same scale; its size may differ.
     guess_px, guess_covariance
         Predicted shift (2,) and its covariance (2, 2). They only decide between competing peaks on
-        periodic specimens; without a covariance a picture with competing peaks is rejected.
+        periodic specimens; without a covariance an image with competing peaks is rejected.
     image_region
         Valid rectangle of the image; None for all of it.
     max_shear_px
         Largest shear that may be due to drift during the scan. Up to it the upper and the lower
-        half of the picture may disagree in proportion.
+        half of the image may disagree in proportion.
 
     Returns
     -------
@@ -288,7 +288,7 @@ def register(
     Raises
     ------
     InvalidValueError
-        If the image is not a picture, or the region does not lie in it.
+        If the shape or type is not that of an image, or the region does not lie in it.
     """
     gray, inside = _crop(image, image_region)
     if reference.defect:
@@ -335,7 +335,7 @@ def _reject(failure: MatchFailure, reason: str) -> Registration:
 
 
 def _correct_correlation(reference: Reference, gray: AnyImage, alignment: Alignment) -> float:
-    """Correlation that the noise-free pictures would have."""
+    """Correlation that the noise-free images would have."""
     passed = float(np.sum(gaussian_taps(reference.levels[-1].sigma_px) ** 2)) ** 2
     noise = reference.noise_variance * passed
     image_noise = estimate_noise_variance(gray) * passed
@@ -361,7 +361,7 @@ def _check(
     if not alignment.converged:
         return Rejection(
             MatchFailure.NOT_CONVERGED,
-            f"refinement did not settle in {alignment.iterations} steps",
+            f"refinement did not converge in {alignment.iterations} steps",
         )
     apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
     if apart > peak.step_px + _STAGE_TOLERANCE_PX:
@@ -371,7 +371,7 @@ def _check(
     if correlation < limits.min_correlation:
         return Rejection(
             MatchFailure.DISSIMILAR,
-            f"pictures differ (noise-corrected correlation {correlation:.2f})",
+            f"images differ (noise-corrected correlation {correlation:.2f})",
         )
     allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
     shear = np.abs(alignment.joint_px[2:])
@@ -381,6 +381,6 @@ def _check(
     if np.any(np.abs(alignment.half_difference_px) > allowed):
         apart = float(np.max(np.abs(alignment.half_difference_px)))
         return Rejection(
-            MatchFailure.HALVES_DISAGREE, f"halves of the picture disagree by {apart:.1f} px"
+            MatchFailure.HALVES_DISAGREE, f"halves of the image disagree by {apart:.1f} px"
         )
     return None

@@ -2,7 +2,7 @@
 
 Everything that least squares needs of an image are its products with the reference's gradients,
 summed over tiles of some twenty pixels a side: gain and offset may then vary from tile to tile,
-halves of the picture can be compared and the scatter of the tiles tells the noise, all without
+halves of the image can be compared and the scatter of the tiles tells the noise, all without
 touching the pixels again. What does not depend on the image is computed once per reference.
 """
 
@@ -48,7 +48,7 @@ _MIN_TILES = 3
 HESSIAN_PIXELS = 12_000
 # They lie in bands at the top, in the middle and at the bottom of the overlap.
 _HESSIAN_BANDS = 3
-# Pictures that are smooth by less have structure beyond the band of the shorter filters.
+# Images that are smooth by less have structure beyond the band of the shorter filters.
 _SHARP_PX = 0.3
 
 
@@ -61,7 +61,7 @@ class PyramidLevel:
     factor
         Full-resolution pixels per pixel of this level.
     sigma_px
-        Width of the smoothing of both pictures, in px of this level.
+        Width of the smoothing of both images, in px of this level.
     size
         (width, height) of the level.
     origin, side
@@ -148,19 +148,19 @@ def _tile_side(length: int) -> int:
 
 
 def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel | None:
-    """Prepare one resolution of a picture, or None where it is too small for tiles.
+    """Prepare one resolution of an image, or None where it is too small for tiles.
 
     ``sigma_px`` is the smoothing in px of the level.
     """
-    picture = np.asarray(pyramid.at(factor), dtype=np.float32)
+    image = np.asarray(pyramid.at(factor), dtype=np.float32)
     margin = _margin(sigma_px)
-    height, width = picture.shape
+    height, width = image.shape
     inside = (width - 2 * margin, height - 2 * margin)
     if min(inside) < _MIN_TILES * 6:
         return None
     side_x, side_y = (_tile_side(n) for n in inside)
     cols, rows = inside[0] // side_x, inside[1] // side_y
-    smoothed = smooth(picture, sigma_px)
+    smoothed = smooth(image, sigma_px)
     mean = float(smoothed.mean(dtype=np.float64))
     planes = np.stack([*gradients(smoothed, _band(sigma_px)), smoothed - np.float32(mean)])
     left = margin + (inside[0] - cols * side_x) // 2
@@ -187,10 +187,10 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
 
 
 class Pyramid:
-    """A grey picture of any type at the resolutions that are asked for."""
+    """A grey image of any type at the resolutions that are asked for."""
 
-    def __init__(self, picture: AnyImage) -> None:
-        self._levels: dict[int, AnyImage] = {1: picture}
+    def __init__(self, image: AnyImage) -> None:
+        self._levels: dict[int, AnyImage] = {1: image}
 
     def at(self, factor: int) -> AnyImage:
         """Averaged over squares of ``factor`` px, a power of two; what does not fill a square is
@@ -209,7 +209,7 @@ class Pyramid:
 
     @property
     def full(self) -> AnyImage:
-        """The picture itself."""
+        """The image itself."""
         return self._levels[1]
 
 
@@ -256,7 +256,7 @@ def tile_sums(
     """Sums over the window's tiles of ``image`` sample_shifted at the reference's pixels plus ``shift``.
 
     ``image`` is at the resolution of the level; ``mean`` is subtracted from it. ``hessian`` is
-    that of an earlier shift of the same pictures, None to compute it.
+    that of an earlier shift of the same images, None to compute it.
     """
     left, top, width, height = _window_rectangle(level, window)
     side_x, side_y = level.side
@@ -278,15 +278,15 @@ def tile_sums(
     )
 
 
-def _split_into_tiles(picture: Image, side: tuple[int, int]) -> Image:
+def _split_into_tiles(image: Image, side: tuple[int, int]) -> Image:
     """(rows, cols, n) the pixels of each tile."""
-    rows, cols = picture.shape[0] // side[1], picture.shape[1] // side[0]
-    cut = picture.reshape(rows, side[1], cols, side[0]).transpose(0, 2, 1, 3)
+    rows, cols = image.shape[0] // side[1], image.shape[1] // side[0]
+    cut = image.reshape(rows, side[1], cols, side[0]).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(cut).reshape(rows, cols, side[0] * side[1])
 
 
 def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image) -> Array:
-    """Products of both pictures' gradients, scaled from enough rows of tiles to all of them."""
+    """Products of both images' gradients, scaled from enough rows of tiles to all of them."""
     side, band = level.side[1], _band(level.sigma_px)
     rows = len(window.y)
     wanted = max(1, -(-HESSIAN_PIXELS // (sampled.shape[1] * side * _HESSIAN_BANDS)))

@@ -39,7 +39,7 @@ class SimulatedFrame(Protocol):
 def write_simulated(
     folder: Path,
     frames: Iterable[SimulatedFrame],
-    pictures: Iterable[NDArray[Any]],
+    images: Iterable[NDArray[Any]],
     truth: Any,
     *,
     delay_s: float = 0.0,
@@ -51,7 +51,7 @@ def write_simulated(
     ----------
     folder
         The bag.
-    frames, pictures
+    frames, images
         The same number of both; images of 8 or 16 bit, rendered while they are written.
     truth
         Plain data in SI units.
@@ -68,7 +68,7 @@ def write_simulated(
     magnification = None
     with BagWriter(folder, overwrite=overwrite) as writer:
         writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
-        for frame, pixels in zip(frames, pictures, strict=True):
+        for frame, pixels in zip(frames, images, strict=True):
             stamp_ns = SIMULATED_START_NS + round(frame.start_time_s * 1e9)
             if frame.magnification != magnification:
                 magnification = frame.magnification

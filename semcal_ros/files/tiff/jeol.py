@@ -52,7 +52,7 @@ def jeol_pairs(data: bytes) -> dict[str, str]:
     return pairs if any(key.startswith(("CM_", "SM_")) for key in pairs) else {}
 
 
-def _scan_size(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> tuple[int, int]:
+def _read_scan_size(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> tuple[int, int]:
     """Return the columns and rows of the scan; a databar may follow it in the file."""
     for key in ("CM_FULL_SIZE", "CM_IMAGE_SIZE"):
         numbers = [plain_number(word) for word in pairs.get(key, "").split()]
@@ -69,13 +69,13 @@ def _scan_size(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -> t
     return size_px
 
 
-def _from_micron_bar(pairs: dict[str, str]) -> float | None:
+def _read_micron_bar(pairs: dict[str, str]) -> float | None:
     bar_px = positive(plain_number(pairs.get("SM_MICRON_BAR", "")))
     bar_m = positive(quantity(pairs.get("SM_MICRON_MARKER", ""), "m"))
     return None if bar_px is None or bar_m is None else bar_m / bar_px
 
 
-def _pixel_size(
+def _read_pixel_size(
     path: Path, pairs: dict[str, str], columns: int
 ) -> tuple[float, bool, tuple[str, ...]]:
     """Return the pixel size in m, whether it rests on an assumed display width, and notes."""
@@ -84,7 +84,7 @@ def _pixel_size(
     if field_m is not None:
         return check_pixel_size(path, field_m / columns, "$CM_FIELD_OF_VIEW", words[0]), False, ()
     shown = positive(plain_number(pairs.get("CM_MAG", "")))
-    from_bar = _from_micron_bar(pairs)
+    from_bar = _read_micron_bar(pairs)
     if shown is None:
         if from_bar is None:
             raise TiffError(
@@ -133,8 +133,8 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
         There is neither a field of view, nor a magnification, nor a micron bar; or the sizes
         contradict each other.
     """
-    columns, rows = _scan_size(path, pairs, size_px)
-    pixel_m, assumed, notes = _pixel_size(path, pairs, columns)
+    columns, rows = _read_scan_size(path, pairs, size_px)
+    pixel_m, assumed, notes = _read_pixel_size(path, pairs, columns)
     distance_mm = plain_number(pairs.get("SM_WD", ""))
     rotation = plain_number(pairs.get("SM_SCAN_ROTATION", ""))
     tilt, turn, left_out = _stage_angles(pairs)

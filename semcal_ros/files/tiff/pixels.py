@@ -11,7 +11,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.picture_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
+from semcal_ros.bridge.codec_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
 from semcal_ros.core.errors import TiffError
 
 __all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
@@ -115,7 +115,7 @@ def _decode_by_opencv(path: Path) -> NDArray[Any]:
     data = np.fromfile(path, dtype=np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise ValueError("the compressed picture cannot be decoded")
+        raise ValueError("the compressed image cannot be decoded")
     return np.asarray(image)
 
 
@@ -133,5 +133,5 @@ def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
     else:
         image = _decode_by_opencv(path)
     if image.shape != size or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"decoded picture is {image.dtype} {image.shape}")
+        raise ValueError(f"the decoded image is {image.dtype} {image.shape}")
     return np.ascontiguousarray(image)

@@ -68,7 +68,7 @@ class SemImage:
     image
         (h, w) uint8 or uint16, grey.
     full_size_px
-        (width, height) of the stored picture, databar included.
+        (width, height) of the stored image, databar included.
     databar_rows
         Rows that were cut off at the bottom.
     settings

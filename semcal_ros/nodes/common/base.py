@@ -20,7 +20,12 @@ from semcal_ros.bridge.diagnostics import (
 )
 from semcal_ros.config.config import load_config
 from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import CONFIG, ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.parameters import (
+    CONFIG,
+    DIAGNOSTICS_PERIOD,
+    ParameterDeclaration,
+    Parameters,
+)
 from semcal_ros.nodes.common.reporter import Reporter
 
 __all__ = ["DEFAULT_NAMESPACE", "SemNode"]
@@ -31,7 +36,7 @@ find each other in one namespace; `-r __ns:=/lab/sem` or the argument `namespace
 
 
 class SemNode(Node):
-    """A node with the parameter ``config``, and a report on ``/diagnostics`` once a second.
+    """A node with the parameter ``config``, and a report on ``/diagnostics``, usually once a second.
 
     Parameters
     ----------
@@ -61,13 +66,13 @@ class SemNode(Node):
         # First: the middleware may destroy a node whose constructor is still running.
         self.closing = ExitStack()
         super().__init__(name, namespace=DEFAULT_NAMESPACE)
-        self.parameters = Parameters(self, (CONFIG, *declarations))
+        self.parameters = Parameters(self, (CONFIG, DIAGNOSTICS_PERIOD, *declarations))
         self.config = load_config(self.parameters["config"])
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._report_timer = self.create_timer(
-            1.0,
+            self.parameters["diagnostics_period"],
             self._report,
             callback_group=MutuallyExclusiveCallbackGroup(),
             # A simulated clock may stand still; the report must not.

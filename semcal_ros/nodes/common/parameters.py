@@ -23,6 +23,7 @@ from semcal_ros.files.confined import AllowedPaths
 __all__ = [
     "CALIBRATION",
     "CONFIG",
+    "DIAGNOSTICS_PERIOD",
     "DIRECTORY",
     "INTERPOLATION",
     "ParameterDeclaration",
@@ -115,6 +116,15 @@ CONFIG = ParameterDeclaration(
     "config",
     "generic",
     "Description of the microscope's topics: a msg_configs file or the name of one that is shipped.",
+    fixed=True,
+)
+DIAGNOSTICS_PERIOD = ParameterDeclaration(
+    "diagnostics_period",
+    1.0,
+    "Time between two reports on /diagnostics.",
+    unit="s",
+    low=0.05,
+    high=60.0,
     fixed=True,
 )
 DIRECTORY = ParameterDeclaration(

@@ -205,7 +205,7 @@ class AdaptiveSubscription:
             self._subscription = self._subscribe()
             self._node.get_logger().warning(
                 f"a publisher on {self.topic} does not offer the requested {refused.name.lower()};"
-                f" subscribed again without ({self.downgraded})"
+                f" subscribed again without it ({self.downgraded})"
             )
 
     def check_publishers(self) -> None:

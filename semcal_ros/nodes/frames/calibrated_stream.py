@@ -67,5 +67,5 @@ class CalibratedStreamNode(StreamNode):
         if self.calibration.current is None:
             found.append("uncalibrated")
         elif self._out_of_range:
-            found.append("magnification outside of the calibrated range")
+            found.append("magnification outside the calibrated range")
         return found

@@ -29,7 +29,7 @@ _RESTARTING = (
     ParameterDeclaration(
         "keyframe_overlap",
         0.6,
-        "A new keyframe is taken when less than this fraction of the picture overlaps with the last one."
+        "A new keyframe is taken when less than this fraction of the image overlaps with the last one."
         " A change restarts the tracking.",
         low=0.1,
         high=0.95,
@@ -46,7 +46,7 @@ _RESTARTING = (
 _DETAIL = ParameterDeclaration(
     "drift_detail",
     1536,
-    "Pictures with a longer side than this are averaged down by a whole factor before their drift is"
+    "Images with a longer side than this are averaged down by a whole factor before their drift is"
     " measured: 4096 x 4096 takes ten times as long, and its finest detail is mostly noise. What is"
     " published keeps all pixels. A change restarts the tracking.",
     unit="px",

@@ -12,7 +12,7 @@ __all__ = ["LoadMonitor"]
 # and hides a single slow one.
 _WEIGHT = 0.1
 # Number of intervals after which their mean counts; the first interval may include the publisher's start.
-_SETTLED = 2
+_LEAST_INTERVALS = 2
 # Fractions of the interval: rectifying and publishing need the rest. Above the first, not every frame is measured any
 # more; below the second, every frame is again. The gap keeps a stream at the limit from switching with every frame.
 _TOO_MUCH, _LITTLE_ENOUGH = 0.6, 0.4
@@ -74,7 +74,7 @@ class LoadMonitor:
         self._decide()
 
     def _decide(self) -> None:
-        if self._interval_s is None or self._cost_s is None or self._frames < _SETTLED:
+        if self._interval_s is None or self._cost_s is None or self._frames < _LEAST_INTERVALS:
             return
         share = _LITTLE_ENOUGH if not self._keeps_up else _TOO_MUCH
         self._keeps_up = self._cost_s <= share * self._interval_s

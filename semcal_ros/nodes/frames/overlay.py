@@ -36,13 +36,13 @@ def corner_overlay(
     low, high = np.percentile(image, (0.5, 99.5))
     scale = 255.0 / max(float(high - low), 1e-12)
     grey = np.clip((image.astype(np.float32) - np.float32(low)) * np.float32(scale), 0, 255)
-    picture = np.ascontiguousarray(np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2))
-    height, width = picture.shape[:2]
+    drawn = np.ascontiguousarray(np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2))
+    height, width = drawn.shape[:2]
     radius = max(3, width // 160)
     for x, y in np.asarray(corners_xy, dtype=np.float64).reshape(-1, 2):
-        cv2.circle(picture, (round(x), round(y)), radius, _FOUND_BGR, 1, cv2.LINE_AA)
+        cv2.circle(drawn, (round(x), round(y)), radius, _FOUND_BGR, 1, cv2.LINE_AA)
     if refused:
-        cv2.rectangle(picture, (0, 0), (width - 1, height - 1), _REFUSED_BGR, 3)
+        cv2.rectangle(drawn, (0, 0), (width - 1, height - 1), _REFUSED_BGR, 3)
         place = (8, height - 12)
-        cv2.putText(picture, refused, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _REFUSED_BGR, 1)
-    return picture
+        cv2.putText(drawn, refused, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _REFUSED_BGR, 1)
+    return drawn

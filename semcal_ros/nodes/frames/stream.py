@@ -27,7 +27,7 @@ from semcal_ros.nodes.common.qos import image_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.publication_times import SourceTimestamps
+from semcal_ros.nodes.frames.source_timestamps import SourceTimestamps
 
 __all__ = ["FrameInput", "StreamFrame", "StreamNode", "is_late", "nominal_camera"]
 
@@ -44,7 +44,7 @@ _AT_ONCE = 8
 _MIXED = ParameterDeclaration(
     "mixed_frames",
     "drop",
-    "What becomes of frames that were being scanned while the magnification changed. flag: published, uncorrected for"
+    "What happens to frames that were being scanned while the magnification changed. flag: published, uncorrected for"
     " drift, with a camera_info that says uncalibrated.",
     choices=("drop", "flag"),
 )

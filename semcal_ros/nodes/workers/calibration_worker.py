@@ -209,5 +209,5 @@ def _describe(error: ChildProcessEnded) -> str:
     if error.status == -signal.SIGKILL:
         do = "call again; if nobody ended it, memory ran out: use fewer views, or residual off"
     elif error.status is None or error.status >= 0:
-        do = "look into the log of the node, and call again"
+        do = "see the log of the node, and call again"
     return str(CalibrationError(f"the calibration process {error} without a result", do=do))

@@ -79,11 +79,11 @@ def _mark_size(spacing: float) -> float:
     return float(np.clip(_MARK_OF_SPACING * np.nan_to_num(spacing), *_MARK_LIMITS_PX))
 
 
-def _squares(xy: Array, k: float) -> str:
+def _draw_squares(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y - k:.1f}h{2 * k:.3g}v{2 * k:.3g}h{-2 * k:.3g}z" for x, y in xy)
 
 
-def _crosses(xy: Array, k: float) -> str:
+def _draw_crosses(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
 
 
@@ -104,8 +104,8 @@ def overlay_corners(view: FoundView) -> Overlay:
         src=encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY)),
         width=small.shape[1],
         height=small.shape[0],
-        marks=_crosses(xy, size),
-        refused=_squares(refused_xy, size),
+        marks=_draw_crosses(xy, size),
+        refused=_draw_squares(refused_xy, size),
         alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
         caption=remove_control_characters(
             f"{view.magnification:g}×: {count} corners{dropped}{precision} ({view.name})"

@@ -75,7 +75,7 @@ def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView]
         *_check_predicted_error(result),
     ]
     if not result.fit.converged:
-        found.append("the poses of some views did not settle; their residuals may be too large")
+        found.append("the poses of some views did not converge; their residuals may be too large")
     return [_format_sentence(text) for text in dict.fromkeys(found)]
 
 

@@ -138,7 +138,10 @@ def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:
         ("Method", _METHODS.get(model.method, model.method)),
         ("Image size", f"{width} × {height} px"),
         ("Display width of the magnification", f"{1e3 * model.display_width_m:g} mm"),
-        ("Poses of the report's residuals", "settled" if result.fit.converged else "not settled"),
+        (
+            "Poses of the report's residuals",
+            "converged" if result.fit.converged else "not converged",
+        ),
     ]
     squares = statistics.get("squares_m")
     if squares:

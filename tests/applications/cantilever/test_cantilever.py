@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from semcal_ros.applications.cantilever import (
     group_frames,
     measure_series,
 )
-from semcal_ros.applications.cantilever.bending import fit_bending, locate_end, parse_shape
+from semcal_ros.applications.cantilever.bending import Shape, fit_bending, locate_end, parse_shape
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
@@ -123,6 +124,38 @@ def test_the_second_order_differs_from_a_beam_by_what_theory_says():
         u, moved, np.full(moved.shape, 1e-6), LENGTH, 1e-13, parse_shape("parabola")
     )
     assert found.deflection_m == pytest.approx(1e-7 * 13 / 12, rel=2e-3)
+
+
+def test_an_uncertain_shape_makes_the_deflection_uncertain_by_what_it_would_change():
+    u = np.linspace(0.3, 0.8, 30)
+    moved = np.stack([0.5 * (3 * u**2 - u**3)] * 2, axis=1) * 2e-7
+    sigma = np.full(moved.shape, 0.3e-9)
+    known, vague, other = (
+        fit_bending(u, moved, sigma, LENGTH, 1e-9, Shape(value, spread))
+        for value, spread in ((-0.5, 0.0), (-0.5, 0.02), (-0.48, 0.0))
+    )
+    change = other.deflection_m - known.deflection_m
+    assert abs(change) > known.sigma_m
+    # The deflection is nearly linear in so small a change of the shape.
+    added = np.sqrt(vague.sigma_m**2 - known.sigma_m**2)
+    assert added == pytest.approx(abs(change), rel=0.1, abs=0.0)
+
+
+def test_a_mean_over_frames_keeps_what_they_share():
+    """Four frames of a pose, each with noise of 1 nm and an error of the scale of 1 nm."""
+    frame = SimpleNamespace(
+        deflection_m=5e-9,
+        sigma_m=np.sqrt(2.0) * 1e-9,
+        noise_m=1e-9,
+        by_length_m=5e-9,
+        by_length_sigma_m=1e-9,
+    )
+    series = SimpleNamespace(magnification=5000.0, frames=(frame,) * 8)
+    table = compare_series([series], poses=2)
+    # The scale as a whole; of the noise a fifth is that of the reference, also a mean of four, and
+    # the rest averages out.
+    np.testing.assert_allclose(table.sigma_m, 1e-9 * np.sqrt(1.0 + 0.2 + 0.8 / 4.0))
+    np.testing.assert_allclose(table.by_length_sigma_m, 1e-9 * np.sqrt(0.2 + 0.8 / 4.0))
 
 
 def test_the_end_recedes_as_the_beam_bends():

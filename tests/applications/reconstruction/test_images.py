@@ -17,7 +17,7 @@ from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
 
-# The same pixel size as 2048 px at 9000x, in a smaller picture.
+# The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
 CENTRE_M = (-2e-7, 0.0, 0.0)
 
@@ -64,6 +64,7 @@ def test_points_lie_on_the_true_surface(plan, structure):
     assert high - low < 60e-9
 
 
+@pytest.mark.slow
 def test_the_ball_bulges_towards_the_gun(structure):
     ball = measure_ball(structure, groups=0)
     reference = structure.adjustment.reference
@@ -77,6 +78,7 @@ def test_the_ball_bulges_towards_the_gun(structure):
     assert np.mean(outward[on] > 0.0) > 0.95
 
 
+@pytest.mark.slow
 def test_views_are_turned_as_the_truth_says(plan, structure):
     times = np.array([plan.frames[k].start_time_s for k in structure.frames])
     turned, _ = plan.pose_at(times + plan.microscope.timing.centre_offset_s)

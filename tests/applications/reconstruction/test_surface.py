@@ -26,7 +26,7 @@ def test_sphere_of_exact_points():
     centre = np.array([1e-6, -2e-6, 3e-7])
     fit = fit_sphere(cap(100, 60.0) + centre)
     assert fit.converged
-    assert fit.radius_m == pytest.approx(RADIUS_M, rel=1e-9)
+    assert fit.radius_m == pytest.approx(RADIUS_M, rel=1e-9, abs=0.0)
     assert np.allclose(fit.centre_m, centre, atol=1e-15)
 
 
@@ -58,7 +58,7 @@ def test_radius_gradient_is_the_derivative():
     moved = fit_sphere(points + change)
     assert np.array_equal(moved.inliers, fit.inliers)
     predicted = float(np.sum(fit.radius_gradient * change))
-    assert moved.radius_m - fit.radius_m == pytest.approx(predicted, rel=0.02)
+    assert moved.radius_m - fit.radius_m == pytest.approx(predicted, rel=0.02, abs=0.0)
 
 
 def test_a_plane_is_no_sphere():

@@ -23,6 +23,7 @@ from semcal_ros.applications.servoing import (
     compute_interaction_matrix,
     fit_pose,
 )
+from semcal_ros.applications.servoing.motion import DisturbanceObserver
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 
@@ -71,7 +72,7 @@ def test_the_projection_of_a_frame_is_the_one_that_fits_its_own_k() -> None:
     for g, expected in zip(magnifications, published, strict=True):
         found = choose_projection(SCOPE.camera_at(g).K, published)
         np.testing.assert_array_equal(found, expected)
-    with pytest.raises(InvalidValueError, match="no projection of the magnification"):
+    with pytest.raises(InvalidValueError, match="projections has the magnification"):
         choose_projection(SCOPE.camera_at(1500.0).K, published)
 
 
@@ -188,7 +189,7 @@ class Plant:
     def step(self, g: float, *, foretold: bool = True) -> ServoStep:
         """Frame, latency, command, and the rest of the period."""
         seen_at = self.time_s
-        # As in image_rect: the drift is taken out of the picture, and told.
+        # As in image_rect: the drift is taken out of the image, and told.
         shown = self.pose if self.held else self.in_sem
         view = view_of(shown, camera_at(g), self.rng)
         self._go(LATENCY_S)
@@ -300,7 +301,7 @@ def test_drift_is_commanded_away() -> None:
 
 @pytest.mark.parametrize("frame", ["instrument", "specimen"])
 def test_a_goal_is_held_in_its_frame(frame: str) -> None:
-    """The picture is held still on a drifting specimen: added again, the drift leads to a place under the beam; left
+    """The image is held still on a drifting specimen: added again, the drift leads to a place under the beam; left
     out, to a place on the specimen that goes with it."""
     rate = np.array([25e-9, -14e-9])
     plant = Plant(Servo(GOAL, QUICK), drift_m_s=rate, held=True)
@@ -379,3 +380,47 @@ def test_bad_values_are_refused_with_a_reason() -> None:
     servo, camera = Servo(GOAL), camera_at(500.0)
     with pytest.raises(InvalidValueError, match="interval"):
         servo.update(view_of(GOAL, camera), camera, 0.0, interval_s=0.0)
+
+
+def test_a_turn_about_an_axis_beside_the_target_is_foretold() -> None:
+    """The goal is where the target will be when the command takes effect: nothing is left to do."""
+    camera, centre = camera_at(1000.0), np.array([6e-6, -4e-6])
+    pose, rate, latency_s = PlanePose(2e-6, 1e-6, 0.3), 0.2, 0.5
+
+    def turned(angle: float) -> PlanePose:
+        axis = pose.apply(centre[None])[0]
+        c, s = math.cos(angle), math.sin(angle)
+        origin = axis + np.array([[c, -s], [s, c]]) @ (pose.values[:2] - axis)
+        return PlanePose(float(origin[0]), float(origin[1]), pose.angle_rad + angle)
+
+    servo = Servo(turned(rate * latency_s), rotation_centre_m=(6e-6, -4e-6))
+    servo.record_command(0.0, (0.0, 0.0, rate))
+    step = servo.update(view_of(pose, camera), camera, 3.0, interval_s=0.5, now_s=3.0 + latency_s)
+    assert step.rejection is None
+    # The origin moves by 0.7 um in that time.
+    assert np.hypot(*step.twist[:2]) < 1e-3 * 0.7e-6
+    assert abs(step.twist[2]) < 1e-6
+
+
+def test_a_knock_is_not_drift_unless_it_persists() -> None:
+    observer = DisturbanceObserver(sigma_m_s=1e-8, change_m_s=1e-10)
+    noise = np.full(2, 1e-18)
+    for _ in range(20):
+        observer.update(1.0, np.array([2e-8, -1e-8]), noise)
+    for _ in range(3):
+        observer.update(1.0, np.array([5e-7, 0.0]), noise)
+    np.testing.assert_allclose(observer.velocity_m_s, [2e-8, -1e-8], rtol=0.01)
+    for _ in range(20):
+        observer.update(1.0, np.array([5e-7, 0.0]), noise)
+    np.testing.assert_allclose(observer.velocity_m_s, [5e-7, 0.0], rtol=0.01, atol=1e-10)
+
+
+@pytest.mark.parametrize(("sigmas", "converged"), [(1.5, False), (2.5, True)])
+def test_a_goal_is_only_reached_where_that_is_certain(sigmas: float, converged: bool) -> None:
+    camera, pose = camera_at(1000.0), PlanePose(2e-6, 1e-6, 0.3)
+    view = view_of(pose, camera)
+    sigma_px = Servo(pose).update(view, camera, 0.0, interval_s=0.5).sigma_px
+    servo = Servo(pose, ServoSettings(tolerance_px=sigmas * sigma_px))
+    steps = [servo.update(view, camera, 0.5 * k, interval_s=0.5) for k in range(20)]
+    assert steps[-1].rejection is None
+    assert steps[-1].converged == converged

@@ -42,6 +42,7 @@ def test_joint_predicts_magnifications_that_it_never_saw(name):
     # 28 views of about 100 corners with 0.05 px noise: a smooth camera is determined to a fraction of the noise. What
     # is left is the difference between the microscope's laws and polynomials through 7 magnifications.
     assert _model_error(result, name) < 0.03
+    assert result.outliers == ()
     assert result.model.statistics["fit"]["converged"]
 
 
@@ -109,10 +110,10 @@ def test_discrete_finds_no_distortion_where_there_is_none():
     "options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)]
 )
 def test_pda_and_legendre_run_between_the_magnifications(options):
-    magnifications = [100.0, *(1000.0 * k for k in range(1, 11))]
+    magnifications = [100.0, 1000.0, 2000.0, 3500.0, 5000.0, 7000.0, 8500.0, 10000.0]
     result = _calibrate("jsm820", "pda", options, magnifications, views=3)
     # The paper reports 0.9 to 1.45 px RMS; without its corner and drift noise the method itself is well below.
-    assert _model_error(result, "jsm820", [500.0, 2500.0, 6500.0, 9500.0]) < 0.5
+    assert _model_error(result, "jsm820", [500.0, 2700.0, 6000.0, 9300.0]) < 0.5
     kind = "ode" if options.legendre_degree is None else "legendre"
     assert {f.kind for f in result.model.functions.values()} == {kind}
 
@@ -167,5 +168,5 @@ def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
     views = grid_views(microscope.camera_at, [1000.0], views=2)
     blind = replace(microscope.camera_at(1000.0), xi_r=-50.0, ex=5000.0)
     assert not np.isfinite(blind.undistort(views[0].image_xy)).any()
-    with pytest.raises(CalibrationError, match="can undistort 0 corners"):
+    with pytest.raises(CalibrationError, match="can undistort only 0 corners"):
         fit_poses(views, lambda _: blind)

@@ -36,7 +36,7 @@ def _calibrated(jump=JUMP, **options):
         views,
         image_size=MICROSCOPE.image_size,
         display_width_m=0.12,
-        options=CalibrationOptions(**options),
+        options=CalibrationOptions(residual="off", **options),
     )
 
 

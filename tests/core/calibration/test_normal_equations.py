@@ -42,7 +42,9 @@ MICROSCOPE = preset("strong_perspective")
 def system():
     """The problem, and a state near its optimum, with every effect there is."""
     stage, grid = SimulatedStage(miss_m=(1e-4, -6e-5)), GridFaults(1e-3, -5e-4, 10.0)
-    views = stage_views(MICROSCOPE.camera_at, (200.0, 600.0, 200.0), stage, grid, seed=3, readings=True)
+    views = stage_views(
+        MICROSCOPE.camera_at, (200.0, 600.0, 200.0), stage, grid, seed=3, readings=True
+    )
     views = [replace(v, square_m=1e-5 if v.magnification < 300 else 2e-5) for v in views]
     ordered = tuple(sorted(views, key=lambda v: v.magnification))
     setup = Setup(

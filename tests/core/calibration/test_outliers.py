@@ -34,8 +34,11 @@ def _misnamed(views, index, factor):
     return out
 
 
-@pytest.mark.parametrize("name", ["jsm820", "parallel", "strong_perspective"])
-@pytest.mark.parametrize("factor", [1.06, 0.94])
+# Too large and too small are found from the same residuals: each microscope shows one of them.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "factor"), [("jsm820", 1.06), ("parallel", 0.94), ("strong_perspective", 1.06)]
+)
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor):
     views = seen_views(name)
     result = calibrate_views(_misnamed(views, 14, factor), **OPTIONS)
@@ -49,13 +52,18 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor):
         np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["jsm820", "pincushion", "spiral", "parallel"])
-def test_ordinary_views_stay(name):
-    for seed in range(2):
-        result = calibrated(name, OFF, seed=seed)
-        assert result.outliers == () and len(result.views) == 28
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("jsm820", 0), ("jsm820", 1), ("pincushion", 0), ("spiral", 0), ("parallel", 0)],
+)
+def test_ordinary_views_stay(name, seed):
+    """As they do in the calibrations of test_calibrate and test_residual_field_fit."""
+    result = calibrated(name, OFF, seed=seed)
+    assert result.outliers == () and len(result.views) == 28
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_scale_is_not_a_matter_of_single_views():
     views = [
         replace(v, board_xy_m=v.board_xy_m / 1.03) if v.magnification > 3000.0 else v

@@ -9,7 +9,7 @@ import pytest
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import views_from_detections
-from tests.helpers.corner_boards import detected
+from tests.helpers.corner_boards import seen_photograph
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +23,7 @@ def photographs(reference_data):
     found = {}
     for camera in ("left", "right"):
         paths = sorted(folder.glob(f"{camera}*.jpg"))
-        found[camera] = [detected(cv2.imread(str(p), cv2.IMREAD_GRAYSCALE)) for p in paths]
+        found[camera] = [seen_photograph(p) for p in paths]
     return found
 
 

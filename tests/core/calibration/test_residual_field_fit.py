@@ -16,6 +16,8 @@ from semcal_ros.synthetic.laws import Exponential
 from semcal_ros.synthetic.microscope import Residual
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
+pytestmark = pytest.mark.slow
+
 MICROSCOPES = {
     "spiral": preset("spiral"),
     "scan_nonlinear": preset("scan_nonlinear"),
@@ -146,8 +148,9 @@ def test_predicted_errors_are_as_large_as_the_errors():
     """Differences of projected points, which no gauge changes, against their stated sigma."""
     scores = []
     strong = replace(preset("jsm820"), residual=Residual(spiral=0.003, sine=0.001))
-    for seed in range(3):
+    for seed in range(2):
         result = _calibrate(strong, "on", seed=seed)
+        assert result.outliers == ()
         for g in BETWEEN:
             camera, truth = result.model.at(g), strong.camera_at(g)
             half = 100.0 / truth.m
@@ -159,7 +162,7 @@ def test_predicted_errors_are_as_large_as_the_errors():
             row = jacobian[4] - jacobian[:4].mean(axis=0)
             sigma = np.sqrt(np.einsum("ip,pq,iq->i", row, camera.joint_covariance, row))
             scores.extend(bend / sigma)
-    # 36 scores of 3 calibrations, correlated within each: their RMS is 1 to a factor of about two.
+    # 12 scores of 2 calibrations, correlated within each: their RMS is 1 to a factor of about two.
     assert 0.4 < np.sqrt(np.mean(np.square(scores))) < 2.0
 
 

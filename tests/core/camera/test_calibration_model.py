@@ -1,4 +1,4 @@
-"""A calibration outside of its range, and what camera and residual field have in common."""
+"""A calibration outside its range, and what camera and residual field have in common."""
 
 from __future__ import annotations
 

@@ -170,7 +170,18 @@ def test_sigma_is_the_covariance_through_the_projection():
     # Twice the pixels, twice the error.
     doubled = camera.resized(1024, 1024).project_sigma([[25e-6, 0.0, 0.0]])
     np.testing.assert_allclose(doubled, 2 * sigma[1:], atol=1e-12)
-    assert camera.pixel_size_sigma_m[0] == pytest.approx(0.01 * camera.pixel_size_m[0])
+    assert camera.pixel_size_sigma_m[0] == pytest.approx(0.01 * camera.pixel_size_m[0], abs=0.0)
+
+
+def test_sigma_of_the_pixel_size_knows_how_scale_and_aspect_go_together():
+    # Both are 1 % off, always together: x goes with 1 / (m a), y with a / m.
+    both = np.zeros(10)
+    both[:2] = 0.01 * PLAIN.m, 0.01 * PLAIN.aspect
+    camera = replace(PLAIN, covariance=np.outer(both, both))
+    x, y = np.array(camera.pixel_size_sigma_m) / camera.pixel_size_m
+    assert x == pytest.approx(0.02)
+    # The root of a rounding error.
+    assert y == pytest.approx(0.0, abs=1e-9)
 
 
 def test_sigma_without_covariance_is_refused():

@@ -202,6 +202,20 @@ def test_charging_gradients(square: float) -> None:
     assert np.abs(score).max() < 6.0
 
 
+def test_where_a_part_of_the_image_is_noisier_its_corners_count_as_less_certain() -> None:
+    """Noise is learnt by grey value and not by place: there the misfit of each corner tells it."""
+    board = Board(20.0, turn_deg=20.0, electrons=2000.0, width=300, height=300)
+    picture = 140.0 * board.render(np.random.default_rng(0), np.float64)
+    # Several times the noise of the rest.
+    picture[:, 225:] += np.random.default_rng(1).normal(scale=4.0, size=(300, 75))
+    detection = detected(picture)
+    score = errors(board, detection) / detection.sigma_px[:, None]
+    noisy = detection.xy[:, 0] > 235.0
+    assert noisy.sum() > 30
+    # 60 values and more: the spread is known to 10 %. Stated as elsewhere, it would be 1.7.
+    assert 0.7 < score[noisy].std() < 1.3
+
+
 def test_noise_free_board_is_found_to_a_hundredth() -> None:
     board = Board(40.0, turn_deg=10.0, tilt_deg=20.0, axis_deg=40.0)
     error = errors(board, detect(board, np.float64))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.corners.checks import inflate_variance
+from semcal_ros.core.corners.checks import FittedCorners, inflate_variance
 from semcal_ros.core.corners.corner_fit import CornerFit
+from semcal_ros.core.corners.local_map import fit_local_maps
+from semcal_ros.core.corners.neighbour_consistency import find_consistent
+from semcal_ros.core.corners.window import gather_windows
 
 
 def fits(chi2: Array, freedom: float) -> CornerFit:
@@ -24,3 +27,24 @@ def test_covariances_grow_with_the_common_misfit_and_with_a_far_larger_one() -> 
     keep = np.array([True, True, True, True, False, False, False])
     factors = inflate_variance(fits(chi2, 50.0), keep)
     assert factors == pytest.approx([2.0, 2.0, 2.0, 2.0, 2.0, 3.25, 9.0])
+
+
+def test_a_corner_may_miss_its_neighbours_by_what_its_misfit_explains() -> None:
+    cells = np.stack(np.meshgrid(np.arange(9), np.arange(9)), axis=-1).reshape(-1, 2)
+    xy = 40.0 + 20.0 * cells + 0.02 * np.random.default_rng(0).normal(size=cells.shape)
+    noisy, shifted = (
+        int(np.flatnonzero(np.all(cells == at, axis=1))[0]) for at in ([3, 3], [6, 6])
+    )
+    # Both are seven stated sigmas away; one of them has residuals that are three times the usual.
+    xy[[noisy, shifted]] = 40.0 + 20.0 * cells[[noisy, shifted]] + [0.14, 0.0]
+    chi2 = np.ones(len(cells))
+    chi2[noisy] = 9.0
+    fit = replace(fits(chi2, 50.0), xy=xy, covariance=np.tile(0.02**2 * np.eye(2), (len(xy), 1, 1)))
+    maps = fit_local_maps(cells, cells, xy)
+    windows = gather_windows(np.zeros((260, 260), np.float32), maps.xy, maps.axes, maps.bend, 4.0)
+    corners = FittedCorners(cells, maps, windows, fit, np.ones(len(cells), dtype=np.bool_))
+    consistent = find_consistent(corners)
+    assert consistent[noisy]
+    assert not consistent[shifted]
+    # Noise alone exceeds the limits once in 900.
+    assert consistent.sum() >= len(cells) - 2

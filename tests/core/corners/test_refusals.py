@@ -81,7 +81,7 @@ def test_regular_patterns_that_are_no_chess_board_are_refused() -> None:
 
 
 def joined(first: Board, second: Board) -> NDArray[np.uint8]:
-    """Two boards in one picture, side by side along a slanted line."""
+    """Two boards in one image, side by side along a slanted line."""
     x = np.arange(512)[None, :] + 0.3 * np.arange(512)[:, None]
     picture = np.where(x < 330.0, first.clean(4), second.clean(4))
     return np.random.default_rng(5).poisson(80.0 * picture).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Drift inside of the frame, through a zoom, and over a long way, on recordings with known truth."""
+"""Drift inside the frame, through a zoom, and over a long way, on recordings with known truth."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_drift_within_frames_at_20000x_is_removed_all_over_the_field(timing: Sca
 
     after = of([path[k].raster for k in range(len(path))])
     shifted = of([RasterDrift(u.drift_m, np.zeros(2)) for u in updates])
-    # A shift of the whole picture leaves half of what the drift moves in a pass: 80 nm in 2 s, in
+    # A shift of the whole image leaves half of what the drift moves in a pass: 80 nm in 2 s, in
     # px of 15 nm, or an eighth of it.
     assert float(shifted[1:].max()) > (2.0 if timing.averages == 1 else 0.25)
     assert float(np.sqrt(np.mean(after**2))) < 0.03
@@ -135,7 +135,7 @@ def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
         keyframes += update.status_text == "keyframe"
     assert keyframes >= 5
     error, sigma = np.array(errors), np.array(sigmas)
-    # Single pictures are good to 0.01 px: nothing of the way is left at its end.
+    # Single images are good to 0.01 px: nothing of the way is left at its end.
     assert float(np.max(np.abs(error[-1]))) < 0.05
     assert np.all(sigma[-1] < 0.03)
     # The way adds uncertainty, and says so.

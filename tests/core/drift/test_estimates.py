@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.estimates import DriftPath, DriftPredictor
 from semcal_ros.core.drift.operations import Predict
+from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.state import initial_state
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.errors import InvalidValueError
-from tests.helpers.drift_scenes import Texture, noisy, small_camera
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.registration.failures import MatchFailure
+from tests.helpers.drift_scenes import Texture, make_drift_update, noisy, small_camera
 
 SIZE = 192
 CAMERA = small_camera(1000.0, SIZE)
@@ -62,6 +68,26 @@ def test_a_forecast_is_what_the_filter_itself_would_predict(ahead_s: float) -> N
     np.testing.assert_allclose(forecast.acceleration_m_s2, state.acceleration, rtol=1e-12)
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     np.testing.assert_allclose(forecast.covariance / scale, covariance / scale, atol=1e-12)
+
+
+def test_a_forecast_is_as_uncertain_as_the_scale_of_the_camera() -> None:
+    spread = np.zeros((10, 10))
+    spread[0, 0] = (0.02 * CAMERA.m) ** 2
+    state = initial_state(0.0)
+    state.mean[:4] = 3e-6, -4e-6, 0.1e-6, 0.0
+    predictor = DriftPredictor(state, ProcessNoise(0.0), replace(CAMERA, covariance=spread))
+    forecast = predictor.at(10.0)
+    # 2 % of 3 + 10 x 0.1 and of 4 um; nothing else is uncertain here.
+    sigma = np.sqrt(np.diag(forecast.covariance))
+    np.testing.assert_allclose(sigma, [0.08e-6, 0.08e-6, 0.002e-6, 0.0], rtol=1e-9, atol=1e-20)
+
+
+def test_what_follows_a_restart_is_not_trusted() -> None:
+    lost = Rejection(MatchFailure.NO_PEAK, "lost")
+    updates = [make_drift_update() for _ in range(5)]
+    updates[1] = replace(updates[1], rejection=lost)
+    updates[3] = replace(updates[3], restarted=True)
+    assert DriftPath(updates).trusted.tolist() == [True, False, True, False, False]
 
 
 def test_an_outlook_stays_as_it_was_while_tracking_goes_on() -> None:

@@ -41,7 +41,7 @@ def settling(t: np.ndarray) -> np.ndarray:
 
 class Stream:
     """What a tracker would report of frames that take ``time_s`` each, one per second, without
-    pictures; ``gradient`` is B.
+    images; ``gradient`` is B.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ def test_the_time_is_found_within_what_is_stated(time_s: float, gradient: float)
     times = np.array([e.frame_time_s for e in found])
     sigmas = np.array([e.sigma_s for e in found])
     z = (times - time_s) / sigmas
-    # The part for what one picture's registrations have in common is in sigma, not in this scatter.
+    # The part for what one image's registrations have in common is in sigma, not in this scatter.
     assert np.sqrt(np.mean(z**2)) < 1.1
     assert np.max(np.abs(z)) < 3.5
     # No attenuation by the noise of the velocities.
@@ -198,7 +198,7 @@ def test_bad_arguments_and_short_streams() -> None:
 
 
 def tracked(law_px: Law, timing: ScanTiming, frames: int, seed: int) -> FrameTimeEstimate:
-    """From pictures: a tracker that knows nothing of their raster, one of them per second."""
+    """From images: a tracker that knows nothing of their raster, one of them per second."""
     camera = small_camera(2000.0)
     specimen = DriftingSpecimen(pitch_m=0.1e-6, seed=seed)
     unit = np.linalg.inv(camera.ideal_from_sem_jacobian)

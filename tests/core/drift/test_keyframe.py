@@ -15,10 +15,10 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
-    carry_covariance,
     centre_covariance,
     relative_scale_sigma,
     scale_covariance,
+    zoom_covariance,
 )
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
@@ -106,7 +106,7 @@ def test_a_mean_is_neither_moved_nor_blurred(shift: tuple[float, float]) -> None
     gx, gy = (40.0 * g[INNER] for g in TEXTURE.gradient((0.0, 0.0), SIZE))
     moved = np.linalg.lstsq(np.stack([gx.ravel(), gy.ravel()], axis=1), error.ravel(), rcond=None)
     assert np.max(np.abs(moved[0])) < 1e-3
-    # Nor has the picture lost or gained contrast.
+    # Nor has the image lost or gained contrast.
     contrast = np.cov(key.mean[INNER].ravel(), scene[INNER].ravel())
     assert contrast[0, 1] / contrast[1, 1] == pytest.approx(1.0, abs=1e-3)
 
@@ -229,7 +229,7 @@ def test_nothing_around_a_keyframe_gets_into_the_region_of_a_carried_one(ratio: 
     # The cubic interpolation and the blur before it reach over the edge by less than 1 %.
     np.testing.assert_allclose(other.mean[top:bottom, left:right], 200.0, rtol=0.01)
     # And the region is not much smaller than it has to be: 150 px in the new pixels, or what of
-    # them lies inside of the picture.
+    # them lies inside the image.
     corners = np.array([[20.0, 20.0], [169.0, 169.0]])
     seen = now.project_ideal(small_camera(2000.0).sem_from_ideal(corners))
     seen = np.clip(seen, 0.0, 191.0)
@@ -245,7 +245,7 @@ def test_a_keyframe_is_carried_only_between_cameras() -> None:
     assert scale_ratio(plain.frame, frame) == float("inf")
     assert scale_ratio(frame, plain.frame) == float("inf")
     assert scale_ratio(plain.frame, plain.frame) == 1.0
-    # Pixels of pictures of another size cannot be compared without a camera.
+    # Pixels of images of another size cannot be compared without a camera.
     assert scale_ratio(plain.frame, ScanFrame(np.zeros((50, 60)), None, None)) == float("inf")
     # The ratio is that of the direction in which it is largest, and the same both ways.
     wide = ScanFrame(frame.image, replace(small_camera(2000.0), aspect=1.1), None)
@@ -353,7 +353,7 @@ def test_the_oldest_use_is_forgotten_but_never_the_first_or_the_one_in_use() -> 
 def test_memory_is_bounded_by_bytes() -> None:
     picture = make_picture((0.0, 0.0), 3.0, 0)
     one = keyframe(picture).nbytes
-    # The picture as it came, and its mean: 4 bytes per pixel each.
+    # The image as it came, and its mean: 4 bytes per pixel each.
     assert one == 2 * 4 * SIZE * SIZE
     store = plain_store(max_bytes=int(4.5 * one))
     for _ in range(12):
@@ -385,7 +385,7 @@ def test_a_reference_is_prepared_anew_when_its_mean_has_become_much_better() -> 
         store.reference(key)
         prepared.append(store.averaged(key))
     assert prepared == [2, 2, 4, 4, 4, 4, 8]
-    # Another motion taken out makes another picture.
+    # Another motion taken out makes another image.
     store.replace(key, replace(store[key], removed=np.ones(4)))
     before = store.reference(key)
     store.replace(key, replace(store[key], removed=np.zeros(4)))
@@ -450,7 +450,7 @@ def test_a_camera_that_is_known_exactly_leaves_nothing_open() -> None:
     for exact in (None, camera):
         np.testing.assert_array_equal(scale_covariance(exact, np.ones(2), np.ones(2)), 0.0)
         assert relative_scale_sigma(exact) == 0.0
-    np.testing.assert_array_equal(carry_covariance(camera, small_camera(3000.0)), 0.0)
+    np.testing.assert_array_equal(zoom_covariance(camera, small_camera(3000.0)), 0.0)
 
 
 def test_a_zoom_about_a_wrong_principal_point_is_an_apparent_step() -> None:
@@ -483,7 +483,7 @@ def test_the_principal_point_is_as_uncertain_as_its_camera_says() -> None:
     covariance = np.zeros((10, 10))
     covariance[3:5, 3:5] = [[4.0, 1.2], [1.2, 2.25]]
     pair = [replace(small_camera(g), covariance=covariance) for g in (2000.0, 3400.0)]
-    np.testing.assert_array_equal(carry_covariance(*pair), 0.0)
+    np.testing.assert_array_equal(zoom_covariance(*pair), 0.0)
 
 
 def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() -> None:
@@ -498,4 +498,4 @@ def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() ->
     for camera in cameras:
         way = np.linalg.solve(camera.ideal_from_sem_jacobian, [95.5 - 60.0, 95.5 - 140.0])
         expected += 0.01**2 * np.outer(way, way)
-    np.testing.assert_allclose(carry_covariance(*cameras), expected, rtol=1e-9)
+    np.testing.assert_allclose(zoom_covariance(*cameras), expected, rtol=1e-9)

@@ -161,12 +161,12 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
     keys: list[int] = []
     time_s, following = 0.0, 0
 
-    def settle() -> AddKeyframe:
+    def add() -> AddKeyframe:
         noise = covariance_of(rng, 4, unit)
         removed = unit * rng.standard_normal(4)
         return AddKeyframe(following, removed, 0.1 * rng.uniform(), noise, rng.uniform())
 
-    events += [settle(), Mark()]
+    events += [add(), Mark()]
     keys.append(following)
     following += 1
     for _ in range(count):
@@ -175,11 +175,11 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
             time_s += rng.uniform(0.2, 2.0)
             events.append(Predict(time_s))
         what = rng.choice(
-            ["shift", "both", "carry", "copy", "settle", "drop", "widen", "reshear", "coast"],
+            ["shift", "both", "clone", "copy", "add", "marginalise", "inflate", "shear", "coast"],
             p=[0.25, 0.25, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 0.1],
         )
         key = int(rng.choice(keys))
-        if what in ("shift", "both", "carry", "copy"):
+        if what in ("shift", "both", "clone", "copy"):
             size = 2 if what == "shift" else 4
             shift, noise = unit * rng.standard_normal(size), covariance_of(rng, size, unit)
             ratio, acceleration_term_s2 = rng.uniform(0.5, 2.0), 0.1 * rng.uniform()
@@ -187,24 +187,24 @@ def random_events(rng: np.random.Generator, count: int, unit: float) -> list[Eve
             events.append(
                 Measure(key, shift, noise, ratio, acceleration_term_s2, rng.uniform(), zoom)
             )
-            if what in ("carry", "copy"):
+            if what in ("clone", "copy"):
                 # A copy without noise makes the covariance of the state singular.
-                own = covariance_of(rng, 4, unit) if what == "carry" else np.zeros((4, 4))
+                own = covariance_of(rng, 4, unit) if what == "clone" else np.zeros((4, 4))
                 events.append(
                     CloneKeyframe(following, key, unit * rng.standard_normal(4), ratio, own, zoom)
                 )
                 keys.append(following)
                 following += 1
-        elif what == "settle":
-            events.append(settle())
+        elif what == "add":
+            events.append(add())
             keys.append(following)
             following += 1
-        elif what == "drop" and len(keys) > 1:
+        elif what == "marginalise" and len(keys) > 1:
             events.append(Marginalise(key))
             keys.remove(key)
-        elif what == "widen":
+        elif what == "inflate":
             events.append(Inflate(covariance_of(rng, 6, unit)))
-        elif what == "reshear":
+        elif what == "shear":
             events.append(CorrectShear(key, unit * rng.standard_normal(4), 0.1 * rng.uniform()))
         events.append(Mark())
     return events
@@ -475,7 +475,7 @@ def test_a_long_memory_is_told_from_a_white_acceleration() -> None:
         )
 
 
-def test_few_measurements_leave_the_restlessness_as_it_was() -> None:
+def test_few_measurements_leave_the_process_noise_as_it_was() -> None:
     events, _ = simulated(np.random.default_rng(0), np.arange(4.0), ProcessNoise(0.04), 0.05)
     near = ProcessNoise(0.7, 3.0)
     assert estimate_process_noise(initial_state(0.0), events, near) is near

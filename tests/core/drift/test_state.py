@@ -167,7 +167,7 @@ def test_white_noise_is_the_integral_too_and_a_short_memory_comes_near_it() -> N
         np.testing.assert_allclose(short[:2, :2] / exact, 1.0 - lacking, atol=3.5 / ratio**2)
 
 
-def test_an_acceleration_settles_at_the_variance_that_is_stated_for_it() -> None:
+def test_an_acceleration_converges_to_the_variance_that_is_stated_for_it() -> None:
     move, noise = FADING.discretise(0.9)
     variance = FADING.acceleration_variance
     assert variance == pytest.approx(0.5 * 0.3 / 1.7)
@@ -358,41 +358,41 @@ def assert_like_draws(state: DriftState, draws: Array) -> None:
     assert np.max(np.abs(seen - stated)) < 5.0 * np.sqrt(2.0 / count)
 
 
-def test_settle_puts_a_keyframe_where_the_frame_lies() -> None:
+def test_a_new_keyframe_lies_where_the_frame_lies() -> None:
     state, removed, acceleration_term_s2 = random_state(7), np.array([0.3, -0.2, 0.5, 0.1]), 0.4
     noise = np.diag([0.5, 0.2, 0.1, 0.3])
-    # Restless enough for what happens within the frame to matter, too.
-    restless = ProcessNoise(40.0)
-    settled = AddKeyframe(9, removed, acceleration_term_s2, noise, 0.8)(state, restless)
-    assert settled.keys == (4, 7, 9)
-    assert settled.keyframe_slice(9) == slice(BASE_SIZE + 8, BASE_SIZE + 12)
+    # Enough process noise for what happens within the frame to matter, too.
+    noisy = ProcessNoise(40.0)
+    extended = AddKeyframe(9, removed, acceleration_term_s2, noise, 0.8)(state, noisy)
+    assert extended.keys == (4, 7, 9)
+    assert extended.keyframe_slice(9) == slice(BASE_SIZE + 8, BASE_SIZE + 12)
     draws = sampled(state, 40000, 1)
-    own = noise + restless.frame_covariance(0.8)
+    own = noise + noisy.frame_covariance(0.8)
     error = np.random.default_rng(2).standard_normal((40000, 4)) * np.sqrt(np.diag(own))
-    # The picture is that of p + b a; b times what was taken out for the acceleration is gone, and
+    # The image is that of p + b a; b times what was taken out for the acceleration is gone, and
     # so is the velocity that was taken out.
     where = np.column_stack(
         [draws[:, :2] + acceleration_term_s2 * (draws[:, 4:6] - removed[2:]), draws[:, 2:4]]
     )
     where[:, 2:] -= removed[:2]
-    assert_like_draws(settled, np.column_stack([draws, where + error]))
+    assert_like_draws(extended, np.column_stack([draws, where + error]))
     # A frame now is expected where the keyframe lies, but for the acceleration_term_s2.
-    shift, _ = settled.predict_shift(9)
+    shift, _ = extended.predict_shift(9)
     np.testing.assert_allclose(shift, -acceleration_term_s2 * (state.acceleration - removed[2:]))
 
 
-def test_carry_copies_the_parent_with_what_was_measured() -> None:
+def test_a_clone_copies_the_parent_with_what_was_measured() -> None:
     state = random_state(8)
     shift, noise = np.array([5.0, -3.0, 0.2, 0.1]), np.diag([0.1, 0.2, 0.3, 0.4])
     zoom = np.array([[0.5, 0.1], [0.0, 0.4]])
-    carried = CloneKeyframe(8, 4, shift, 1.5, noise, zoom)(state, FADING)
-    assert carried.keys == (4, 7, 8)
+    cloned = CloneKeyframe(8, 4, shift, 1.5, noise, zoom)(state, FADING)
+    assert cloned.keys == (4, 7, 8)
     draws = sampled(state, 40000, 3)
     error = np.random.default_rng(4).standard_normal((40000, 4)) * np.sqrt(np.diag(noise))
     where = draws[:, BASE_SIZE : BASE_SIZE + 4] * [1.0, 1.0, 1.5, 1.5] + shift + error
     # What was measured lacks Z e.
     where[:, :2] += draws[:, 6:8] @ zoom.T
-    assert_like_draws(carried, np.column_stack([draws, where]))
+    assert_like_draws(cloned, np.column_stack([draws, where]))
     # Without noise of its own their distance is known exactly.
     exact = CloneKeyframe(8, 4, shift, 1.0, np.zeros((4, 4)))(state, FADING)
     both = np.hstack([-np.eye(4), np.zeros((4, 4)), np.eye(4)])
@@ -402,7 +402,7 @@ def test_carry_copies_the_parent_with_what_was_measured() -> None:
     )
 
 
-def test_reshear_moves_a_keyframe_and_leaves_every_covariance() -> None:
+def test_a_corrected_shear_moves_a_keyframe_and_leaves_every_covariance() -> None:
     state = random_state(9)
     removed = np.array([0.3, -0.2, 0.5, 0.1])
     again = CorrectShear(7, removed, 0.4)(state, FADING)
@@ -517,7 +517,7 @@ def follow(
     for k in range(1, len(stream.times)):
         state = Predict(float(stream.times[k]))(state, process_noise)
         frame = np.append(stream.seen[k], stream.seen_pace[k])
-        # A registration knows only the difference of two pictures.
+        # A registration knows only the difference of two images.
         count = 4 if with_shear else 2
         measure = Measure(
             current, (frame - truth[current])[:count], FRAME_NOISE[:count, :count], 1.0, BOW
@@ -569,7 +569,7 @@ def test_errors_of_simulated_streams_are_as_stated(with_shear: bool) -> None:
 
 
 def test_noise_of_a_keyframe_does_not_average_out() -> None:
-    # At rest, and known to be: only the noise of the pictures is left.
+    # At rest, and known to be: only the noise of the images is left.
     rest = ProcessNoise(0.0)
     state = AddKeyframe(0, np.zeros(4), 0.0, FRAME_NOISE, 0.0)(initial_state(0.0), rest)
     # A drift that may be anywhere but does not move.
@@ -588,7 +588,7 @@ def test_coming_back_to_the_first_keyframe_undoes_what_was_lost_on_the_way() -> 
         times += 1.0
         state = Predict(times)(state, process_noise)
         state = Measure(current, np.zeros(2), FRAME_NOISE[:2, :2])(state, process_noise).state
-        # As a picture it weighs a little otherwise than it did when it was measured.
+        # As an image it weighs a little otherwise than it did when it was measured.
         state = CloneKeyframe(k, current, np.zeros(4), 1.0, FRAME_NOISE * 0.2)(state, process_noise)
         current = k
         sigmas.append(float(np.sqrt(state.covariance[0, 0])))
@@ -600,7 +600,7 @@ def test_coming_back_to_the_first_keyframe_undoes_what_was_lost_on_the_way() -> 
     state = Predict(times + 1.0)(state, process_noise)
     back = Measure(0, np.zeros(2), FRAME_NOISE[:2, :2])(state, process_noise).state
     sigma = float(np.sqrt(back.covariance[0, 0]))
-    # Two pictures at most, as for the first frame after the keyframe.
+    # Two images at most, as for the first frame after the keyframe.
     assert sigma < np.sqrt(2.0) * SIGMA
     assert sigma < 0.75 * sigmas[-1]
     # The keyframes on the way become better known, too.

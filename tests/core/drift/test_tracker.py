@@ -16,6 +16,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.failures import MatchFailure
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, lattice, noisy, small_camera
 
 TIMING = ScanTiming(0.9, 1, 0.1)
@@ -100,7 +101,7 @@ def test_rekeys_before_the_overlap_is_lost_and_chains_the_uncertainty() -> None:
     keys = [k for k, u in enumerate(updates) if u.status_text == "keyframe"]
     assert len(keys) >= 4
     assert all(u.accepted for u in updates)
-    # 250 px of travel: more than the width of the picture.
+    # 250 px of travel: more than the width of the image.
     assert np.hypot(*updates[-1].drift_px) > 192.0
     error, sigma = np.array(run.errors_px), np.array(run.sigmas_px)
     assert np.all(np.abs(error) < 4.5 * sigma + 0.03)
@@ -154,6 +155,17 @@ def test_a_move_of_the_stage_is_not_drift() -> None:
     assert moved.status_text.startswith("coasting: ")
     assert float(np.max(np.abs(run.errors_px[-1]))) < 1.0
     assert run.step(5).status_text == "tracked"
+
+
+@pytest.mark.parametrize("jump", [(70.0, 0.0), (0.0, -70.0)])
+def test_a_jump_along_one_axis_is_a_move_of_the_stage(jump: tuple[float, float]) -> None:
+    texture, tracker = Texture(4), DriftTracker(DriftSettings(max_jump=0.3))
+    for k in range(5):
+        tracker.update(noisy(texture.view((0.2 * k, 0.0), 160), 4.0, k), float(k))
+    update = tracker.update(noisy(texture.view(jump, 160), 4.0, 9), 5.0)
+    assert update.rejection is not None
+    # 70 of 160 px is more than 0.3 of the width.
+    assert update.rejection.status is MatchFailure.STAGE_MOVE
 
 
 def test_goes_on_at_another_place_after_a_while() -> None:
@@ -332,7 +344,7 @@ def test_reference_recording_of_gold_on_carbon() -> None:
     drift = 1e-6 * np.array([f["drift_um"] for f in truth["frames"]])
     error = (np.array([u.drift_m for u in updates]) - (drift - drift[0])).T
     error_px = camera.ideal_from_sem_jacobian @ error
-    # The goal of the project is 0.03 px; the noise of the two pictures allows about 0.005.
+    # The goal of the project is 0.03 px; the noise of the two images allows about 0.005.
     assert float(np.sqrt(np.mean(np.sum(error_px**2, axis=0)))) < 0.03
 
 
@@ -342,7 +354,7 @@ def test_a_frozen_picture_says_nothing_about_drift() -> None:
     for k in range(12):
         update = run.step(k, spoil=(lambda _: frozen) if 5 <= k < 9 else None)
         if 6 <= k < 9:
-            assert update.status_text == "coasting: image: the same picture as the frame before"
+            assert update.status_text == "coasting: image: the same as the previous frame"
     assert run.updates[9].accepted
     error, sigma = np.array(run.errors_px)[1:], np.array(run.sigmas_px)[1:]
     assert np.all(np.abs(error) < 4.5 * sigma + 0.03)

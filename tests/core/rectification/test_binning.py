@@ -1,4 +1,4 @@
-"""Pictures averaged down, with the camera that belongs to them."""
+"""Images averaged down, with the camera that belongs to them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.helpers.drift_scenes import small_camera
 def test_the_small_picture_shows_what_its_camera_says(
     width: int, height: int, largest: int
 ) -> None:
-    """Ramps of grey levels tell which place of the full picture a pixel of the small one shows."""
+    """Ramps of grey levels tell which place of the full image a pixel of the small one shows."""
     camera = small_camera(1000.0, 192).resized(width, height)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     ramp_x, small = bin_image(x, camera, largest)

@@ -1,4 +1,4 @@
-"""Rectification against the exact map and against pictures with known contents."""
+"""Rectification against the exact map and against images with known contents."""
 
 from __future__ import annotations
 
@@ -91,6 +91,19 @@ def test_averaged_scans_shear_by_one_pass_only() -> None:
     assert middle[0, 0] == pytest.approx(SIZE / 2, abs=0.01)
 
 
+def test_averaged_scans_bend_by_the_mean_over_their_passes() -> None:
+    acceleration = np.array([6.0, -4.0])
+    timing = ScanTiming(0.4, averages=5, flyback_fraction=0.1)
+    xy = _grid(7, 5) * 20.0
+    size = (140, 100)
+    raw = raw_from_output(xy, size, None, RasterDrift(STILL, STILL, acceleration), timing)
+    # Each pass by itself, as a scan of its own.
+    single = ScanTiming(0.4, flyback_fraction=0.1).pixel_offset_s(raw[:, 1], raw[:, 0], 100, 140)
+    since_s = single[:, None] + 0.4 * np.arange(5) - 1.0
+    expected = xy + 0.5 * acceleration * np.mean(since_s**2, axis=1)[:, None]
+    np.testing.assert_allclose(raw, expected, atol=1e-4)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.floats(-0.05, 0.05),
@@ -119,7 +132,7 @@ def test_map_of_a_field_with_a_hole_in_the_distortion() -> None:
     camera = ScanCamera(
         100.0, 1e5, 1.0, 0.0, 95.5, 95.5, 0.0, 0.2, 0.0, 95.5, 95.5, 96.0, SIZE, SIZE
     )
-    # 4 xi_r r2 reaches 1 inside of the corners: no raw pixel there, black in the output.
+    # 4 xi_r r2 reaches 1 inside the corners: no raw pixel there, black in the output.
     out = Rectifier().rectify(np.full((SIZE, SIZE), 200, np.uint8), camera)
     assert out[0, 0] == 0
     assert out[96, 96] == 200
@@ -188,7 +201,7 @@ def test_writing_to_given_memory_gives_the_same_picture(dtype: type) -> None:
     picture = (200.0 * rng.random((100, SIZE))).astype(dtype)
     drift = RasterDrift(np.array([1e-6, 2e-6]), np.array([1e-7, 0.0]))
     memory = np.full(picture.nbytes + 1, 255, np.uint8)
-    # An odd address, as that of data inside of a message may be.
+    # An odd address, as that of data inside a message may be.
     out = memory[1:].view(dtype).reshape(picture.shape) if dtype is np.uint8 else None
     out = np.empty_like(picture) if out is None else out
     rectifier = Rectifier()

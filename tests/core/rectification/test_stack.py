@@ -1,4 +1,4 @@
-"""The drift-corrected average against pictures whose shift and noise are known exactly."""
+"""The drift-corrected average against images whose shift and noise are known exactly."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_the_shear_within_a_frame_is_undone():
     seen &= valid
     errors = [np.sqrt(np.mean((s.mean - truth)[seen] ** 2)) for s in (image, sheared)]
     # Rounding to whole grey levels and two interpolations of a contrast of 40; unsheared by 4.3 px
-    # within a frame it is another picture.
+    # within a frame it is another image.
     assert errors[0] < 0.5
     assert errors[1] > 5 * errors[0]
 
@@ -137,7 +137,7 @@ def test_the_reach_of_the_interpolation_is_respected():
     assert not find_scanned(x + 0.01, y, (8, 6))[:, -1].any()
     inner = find_scanned(x, y, (8, 6), reach=1)
     assert inner[1:-1, 1:-1].all() and inner.sum() == 6 * 4
-    # Every counted pixel of a constant picture keeps its value: nothing from beyond the edge.
+    # Every counted pixel of a constant image keeps its value: nothing from beyond the edge.
     for interpolation in ("linear", "cubic", "lanczos4"):
         image = stacked([np.full((48, 48), 90.0)], [at(0.4, -2.3)], interpolation=interpolation)
         np.testing.assert_allclose(image.result().mean[image.result().count == 1], 90.0, rtol=1e-5)

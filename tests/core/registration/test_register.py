@@ -104,7 +104,7 @@ def test_gain_offset_and_residual_are_measured() -> None:
     assert result.accepted
     assert result.alignment.gain == pytest.approx(0.5, abs=0.005)
     assert result.alignment.offset == pytest.approx(20.0, abs=1.0)
-    # White noise of 1.5 in each picture after the gain; smoothing can only lower it.
+    # White noise of 1.5 in each image after the gain; smoothing can only lower it.
     assert 0.2 < result.alignment.residual_rms < 1.1 * 1.5 * np.sqrt(2.0)
 
 
@@ -178,7 +178,7 @@ def test_refuses_blank_saturated_and_featureless() -> None:
     burnt = np.clip((image - 60.0) * 10.0, 0, 255).astype(np.uint8)
     _refused(register_pair(reference, burnt), "image: saturated")
     _refused(register_pair(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
-    _refused(register_pair(_noise(0), _noise(1)), "reference: featureless picture (noise only)")
+    _refused(register_pair(_noise(0), _noise(1)), "reference: featureless (noise only)")
     _refused(register_pair(reference, _noise(2)), "stands out")
 
 
@@ -229,7 +229,7 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures(band: Band) -> Non
     dx, dy = gradients(picture, band)
     exact_x, exact_y = TEXTURE.gradient((0.0, 0.0), 128)
     inner = np.s_[8:-8, 8:-8]
-    # Gradients of 0.21 RMS to 0.4 %, a picture of unit RMS to 0.2 %.
+    # Gradients of 0.21 RMS to 0.4 %, an image of unit RMS to 0.2 %.
     assert float(np.sqrt(np.mean((dx - exact_x)[inner] ** 2))) < 8e-4
     assert float(np.sqrt(np.mean((dy - exact_y)[inner] ** 2))) < 8e-4
     for fraction in ((0.3, -0.4), (0.5, 0.5), (-0.9, 0.0)):
@@ -304,7 +304,7 @@ def test_every_rejection_has_its_kind() -> None:
 def test_a_coarse_shift_that_the_fine_one_contradicts_is_refused(
     off_px: float, accepted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where coarse and fine structure of a picture move apart: a sample and 1 px are allowed."""
+    """As where coarse and fine structure of an image move apart: a sample and 1 px are allowed."""
     reference, image = _pair((3.3, -2.1), 4.0)
     # Samples of 1 px.
     peak = CoarsePeak((3.3, -2.1 + off_px), 0.9, 50.0, 1.0)
@@ -319,7 +319,7 @@ def test_a_coarse_shift_that_the_fine_one_contradicts_is_refused(
 
 
 def test_pictures_with_less_than_the_least_correlation_are_refused() -> None:
-    # Each picture adds a texture of its own that is as strong as the common one: they correlate by half.
+    # Each image adds a texture of its own that is as strong as the common one: they correlate by half.
     own = [40.0 * Texture(k).view((0.0, 0.0), SIZE) for k in (31, 32)]
     reference, image = (
         picture + extra for picture, extra in zip(_pair((3.3, -2.1), 4.0), own, strict=True)

@@ -1,4 +1,4 @@
-"""The report of a correction: its table, its pictures and its refusals."""
+"""The report of a correction: its table, its images and its refusals."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_table_has_ours_beside_the_papers(tmp_path: Path) -> None:
 )
 def test_pictures_of_any_depth(tmp_path: Path, image: np.ndarray) -> None:
     text = page_of(tmp_path, ROWS, [("before", image), ("after", image)])
-    assert text.count("<img ") == 3  # the chart and two pictures
+    assert text.count("<img ") == 3  # the chart and two images
     assert text.index("Image: before") < text.index("Image: after")
 
 

@@ -256,7 +256,7 @@ def expect_one_line(error: BagError) -> None:
         ("foreign.mcap", b"not a recording at all" * 10),
         ("foreign.db3", b"not a recording at all" * 10),
         ("old.bag", b"#ROSBAG V2.0\n"),
-        ("picture.png", b"\x89PNG"),
+        ("image.png", b"\x89PNG"),
     ],
 )
 def test_empty_and_foreign_files_are_one_clear_line(

@@ -403,7 +403,7 @@ def test_real_files_agree_with_the_truth_table(reference_data: Path, name: str, 
     assert sem.databar_rows == rows
     assert sem.working_distance_m == pytest.approx(float(truth["WD_mm"]) * 1e-3, rel=1e-4)
     assert sem.scan_rotation_rad == 0.0
-    if sem.vendor != "thermo_fisher":  # its shown magnification is only in the picture
+    if sem.vendor != "thermo_fisher":  # its shown magnification is only in the image
         assert sem.displayed_magnification == pytest.approx(
             float(truth["displayed_mag"].split()[0]), rel=1e-5
         )

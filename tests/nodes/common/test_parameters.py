@@ -130,3 +130,9 @@ def test_a_file_given_at_start_is_allowed_and_its_folder_too(tmp_path: Path) -> 
     node, _ = declared(CALIBRATION, calibration=str(tmp_path / "cal.yaml"))
     assert node.set("calibration", str(tmp_path / "other.yaml")).successful
     assert not node.set("calibration", "/etc/passwd").successful
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_are_not_finite_are_refused_without_limits_too(value: float) -> None:
+    with pytest.raises(InvalidValueError, match="a number"):
+        ParameterDeclaration("offset", 0.0, "Offset.").convert(value)

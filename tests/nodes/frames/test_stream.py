@@ -119,6 +119,15 @@ def test_after_a_restart_the_old_magnification_is_not_believed_until_a_new_one_c
     assert bench.frames[-1].magnification == 2000.0
 
 
+def test_an_unusable_magnification_makes_it_unknown_until_the_next_usable_one() -> None:
+    bench = Bench()
+    for sent_s, value in ((0.5, 1000.0), (1.5, -1.0), (2.5, 2000.0)):
+        bench.magnification(value, sent_ns=round(sent_s * 1e9))
+        bench.receive(sent_s + 0.5)
+    assert [frame.magnification for frame in bench.frames] == [1000.0, None, 2000.0]
+    assert any("a magnification of -1" in line for line in bench.log)
+
+
 def test_a_microscope_that_says_nothing_after_its_restart_is_believed_again_after_a_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

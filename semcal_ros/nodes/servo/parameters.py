@@ -11,86 +11,86 @@ __all__ = ["SERVO_PARAMETERS", "read_goal", "read_servo_settings"]
 
 _GOAL = (
     ParameterDeclaration(
-        "goal_x_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3
+        "goal_x_m", 0.0, "Goal of the target in the sem frame, x.", "m", -1e-3, 1e-3
     ),
     ParameterDeclaration(
-        "goal_y_m", 0.0, "Where the target shall lie, in the sem frame.", "m", -1e-3, 1e-3
+        "goal_y_m", 0.0, "Goal of the target in the sem frame, y.", "m", -1e-3, 1e-3
     ),
     ParameterDeclaration(
-        "goal_rotation_deg", 0.0, "And how it shall be turned.", "degrees", -180.0, 180.0
+        "goal_rotation_deg", 0.0, "Goal of its rotation.", "degrees", -180.0, 180.0
     ),
 )
 _LAW = (
     ParameterDeclaration(
-        "gain", 1.0, "Part of the error that is taken away per second.", "1/s", 0.001, 100.0
+        "gain", 1.0, "Fraction of the error that is corrected per second.", "1/s", 0.001, 100.0
     ),
     ParameterDeclaration(
         "speed_limit_um_s", 50.0, "Largest speed of the stage.", "um/s", 1e-3, 1e4
     ),
     ParameterDeclaration(
-        "turn_limit_deg_s", 5.0, "Largest speed of its rotation.", "degrees/s", 1e-3, 360.0
+        "turn_limit_deg_s", 5.0, "Largest speed of the stage's rotation.", "degrees/s", 1e-3, 360.0
     ),
     ParameterDeclaration(
         "travel_limit_px",
         12.0,
-        "How far a marker may move from one frame to the next: that blurs it.",
+        "Largest movement of a marker between two frames, which blurs it.",
         "px",
         0.1,
         1e4,
     ),
     ParameterDeclaration(
-        "tolerance_px", 0.5, "Converged is what is nearer to the goal.", "px", 0.01, 100.0
+        "tolerance_px", 0.5, "Largest error at which the goal counts as reached.", "px", 0.01, 100.0
     ),
     ParameterDeclaration(
         "scale_tolerance",
         0.05,
-        "The target must be as large as the camera of the frame says, to this fraction.",
+        "Largest relative error of the target's size against the camera of the frame.",
         low=0.001,
         high=0.5,
     ),
     ParameterDeclaration(
         "axis_sigma_px",
         15.0,
-        "How well the calibration knows where the optical axis is seen (1-sigma); what changes of the magnification"
-        " tell of that corrects it. 0: it is not corrected.",
+        "1-sigma of the calibrated position of the optical axis, which is corrected by what changes of the"
+        " magnification show. 0: it is not corrected.",
         "px",
         0.0,
         1e4,
         fixed=True,
     ),
     ParameterDeclaration(
-        "feed_forward", True, "Command away the drift that remains beside the commands."
+        "feed_forward", True, "Compensate the drift that remains besides the commands."
     ),
 )
 _STAGE = (
-    ParameterDeclaration("start", False, "Begin at once, without ~/start.", fixed=True),
+    ParameterDeclaration("start", False, "Start at once, without ~/start.", fixed=True),
     ParameterDeclaration(
         "stage", "virtual_sem/stage", "Topic of the stage's velocity.", fixed=True
     ),
     ParameterDeclaration(
         "goal_frame",
         "instrument",
-        "instrument: the goal is a place under the beam; what was removed from the picture as drift is added again."
-        " specimen: the goal is a place in the drift-free picture, for an actuator that moves the target over it.",
+        "instrument: the goal is a place under the beam; what was removed from the image as drift is added again."
+        " specimen: the goal is a place in the drift-free image, for an actuator that moves the target over it.",
         choices=("instrument", "specimen"),
         fixed=True,
     ),
     ParameterDeclaration(
         "with_drift",
         True,
-        "Whether a drift comes with each image, as from stream_corrector; false for images of rectifier.",
+        "Whether a drift is published with each image, as from stream_corrector; false for images of rectifier.",
         fixed=True,
     ),
     ParameterDeclaration(
         "reset_service",
         "stream_corrector/reset",
-        "Called when the corrected picture has moved too far from what is in view; empty: never.",
+        "Service to call when the corrected image has moved too far from what is in view; empty: none.",
         fixed=True,
     ),
     ParameterDeclaration(
         "reset_beyond",
         0.15,
-        "That is, when the drift is more than this fraction of the width.",
+        "It is called when the drift exceeds this fraction of the width.",
         low=0.01,
         high=1.0,
     ),
@@ -101,7 +101,7 @@ _STAGE = (
     ParameterDeclaration(
         "rotation_centre_x_m",
         0.0,
-        "Where the axis of the stage's rotation meets the target, in its own frame.",
+        "Where the axis of the stage's rotation meets the target, in the target's frame.",
         "m",
         -1.0,
         1.0,
@@ -110,7 +110,7 @@ _STAGE = (
     ParameterDeclaration(
         "rotation_centre_y_m",
         0.0,
-        "Where the axis of the stage's rotation meets the target, in its own frame.",
+        "Where the axis of the stage's rotation meets the target, in the target's frame.",
         "m",
         -1.0,
         1.0,

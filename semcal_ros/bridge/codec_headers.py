@@ -5,7 +5,7 @@ fills the rest of a truncated JPEG with grey). So the structure is checked here,
 (ISO/IEC 15948, https://www.w3.org/TR/png-3/, sections 5 and 11), with the checksum of every chunk; JPEG (ITU-T T.81,
 annex B).
 
-Pillow's ``open`` and ``verify`` would not do: of the damaged and foreign pictures that the tests hold they pass a
+Pillow's ``open`` and ``verify`` would not do: of the damaged and foreign images that the tests hold they pass a
 truncated and an arithmetic-coded JPEG, a PNG with two headers, and one whose end has a wrong checksum, and they take
 7.9 ms for a PNG of 2048 x 2048 pixels where this takes 2.3 ms.
 """
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["MAX_PIXELS", "PictureHeader", "read_picture_header"]
+__all__ = ["MAX_PIXELS", "CodecHeader", "read_codec_header"]
 
 MAX_PIXELS = 2**28
-"""Largest accepted picture: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
+"""Largest accepted image: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
 
 # Neither codec can hold more pixels in a byte. Deflate expands to at most 1032 times its size (https://zlib.net/zlib_tech.html);
 # a JPEG spends at least one bit on each block of 64 pixels, or of 128 with the coarsest subsampling.
@@ -34,7 +34,7 @@ _PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey and alpha", 6: "c
 _PNG_REFUSED = {b"tRNS": "transparency", b"acTL": "an animation", b"IHDR": "two headers"}
 _PNG_ACCEPTED = "a PNG with 8 or 16 bit grey or 8 bit colour, without alpha or palette"
 # Bounds the time that a stream of empty chunks costs. In libpng's chunks of 8 KiB this many hold
-# 512 MB, the largest accepted picture without any compression.
+# 512 MB, the largest accepted image without any compression.
 _MAX_PNG_CHUNKS = 65536
 
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
@@ -61,7 +61,7 @@ _OTHERS = {
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class CodecHeader:
     """Header of an image whose structure is complete.
 
     Attributes
@@ -80,7 +80,7 @@ class PictureHeader:
     encoding: str
 
 
-def read_picture_header(data: memoryview) -> PictureHeader:
+def read_codec_header(data: memoryview) -> CodecHeader:
     """Read the header of an image and check its structure from the first byte to the last.
 
     Parameters
@@ -102,7 +102,9 @@ def read_picture_header(data: memoryview) -> PictureHeader:
     else:
         kinds = [kind for signature, kind in _OTHERS.items() if start.startswith(signature)]
         raise MessageError(
-            f"compressed data that are {kinds[0]}" if kinds else "compressed data of no known kind",
+            f"compressed data that are {kinds[0]}"
+            if kinds
+            else "compressed data of an unknown format",
             expected="PNG or JPEG",
             do="choose png at the publisher, or send sensor_msgs/msg/Image for 32FC1",
         )
@@ -110,7 +112,7 @@ def read_picture_header(data: memoryview) -> PictureHeader:
     return header
 
 
-def _check_size(header: PictureHeader, size: int) -> None:
+def _check_size(header: CodecHeader, size: int) -> None:
     pixels = header.width * header.height
     declared = f"a {header.codec} of {header.width} x {header.height} pixels"
     if pixels == 0:
@@ -120,12 +122,12 @@ def _check_size(header: PictureHeader, size: int) -> None:
     if pixels > _MAX_PIXELS_PER_BYTE * size:
         raise MessageError(
             f"{declared} in {size} bytes",
-            expected=f"at most {_MAX_PIXELS_PER_BYTE} pixels per byte, more than which no {header.codec} holds",
+            expected=f"at most {_MAX_PIXELS_PER_BYTE} pixels per byte, the most that a {header.codec} holds",
             do="check the publisher or the recording",
         )
 
 
-def _damaged_error(codec: str, what: str) -> MessageError:
+def _make_damage_error(codec: str, what: str) -> MessageError:
     return MessageError(
         f"a damaged {codec}: {what}",
         expected="a whole one",
@@ -136,11 +138,11 @@ def _damaged_error(codec: str, what: str) -> MessageError:
 # -- PNG -----------------------------------------------------------------------------------------------
 
 
-def _read_png(data: memoryview) -> PictureHeader:
-    chunks = _png_chunks(data)
+def _read_png(data: memoryview) -> CodecHeader:
+    chunks = _read_png_chunks(data)
     name, body = next(chunks)
     if name != b"IHDR" or len(body) != 13:
-        raise _damaged_error("png", "its header is missing")
+        raise _make_damage_error("png", "its header is missing")
     width, height, depth, colour = struct.unpack_from(">IIBB", body)
     encoding = _PNG_ENCODINGS.get((colour, depth))
     if encoding is None:
@@ -149,54 +151,54 @@ def _read_png(data: memoryview) -> PictureHeader:
     for name, _ in chunks:
         if name in _PNG_REFUSED:
             raise MessageError(f"a png with {_PNG_REFUSED[name]}", expected=_PNG_ACCEPTED)
-    return PictureHeader("png", width, height, encoding)
+    return CodecHeader("png", width, height, encoding)
 
 
-def _png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+def _read_png_chunks(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Yield the name and content of each chunk except the end chunk."""
     position = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PNG_CHUNKS):
         if position + 12 > len(data):
-            raise _damaged_error("png", "it is truncated")
+            raise _make_damage_error("png", "it is truncated")
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 8 + length
         if end + 4 > len(data):
-            raise _damaged_error("png", "it is truncated")
+            raise _make_damage_error("png", "it is truncated")
         if zlib.crc32(data[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise _damaged_error("png", "a checksum is wrong")
+            raise _make_damage_error("png", "a checksum is wrong")
         name = bytes(data[position + 4 : position + 8])
         if name == b"IEND":
             return
         yield name, data[position + 8 : end]
         position = end + 4
-    raise _damaged_error("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
+    raise _make_damage_error("png", f"it has more than {_MAX_PNG_CHUNKS} chunks")
 
 
 # -- JPEG ----------------------------------------------------------------------------------------------
 
 
-def _read_jpeg(data: memoryview) -> PictureHeader:
-    header: PictureHeader | None = None
-    for marker, body, end in _jpeg_segments(data):
+def _read_jpeg(data: memoryview) -> CodecHeader:
+    header: CodecHeader | None = None
+    for marker, body, end in _read_jpeg_segments(data):
         if marker in _FRAMES:
-            header = _jpeg_frame(marker, body)
+            header = _find_jpeg_frame(marker, body)
         elif marker == _SOS:
             _check_jpeg_scans(data[end:])
             break
     if header is None:
-        raise _damaged_error("jpeg", "its header is missing")
+        raise _make_damage_error("jpeg", "its header is missing")
     return header
 
 
-def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
+def _read_jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
     """Yield the marker, content and end of each segment up to the first scan."""
     position = 2
     while True:
         if position + 4 > len(data):
-            raise _damaged_error("jpeg", "it is truncated")
+            raise _make_damage_error("jpeg", "it is truncated")
         marker = data[position + 1]
         if data[position] != 0xFF or marker in (0x00, _EOI):
-            raise _damaged_error("jpeg", "a marker is missing")
+            raise _make_damage_error("jpeg", "a marker is missing")
         if marker == 0xFF:  # filling
             position += 1
             continue
@@ -206,14 +208,14 @@ def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, memoryview, int]]:
         (length,) = struct.unpack_from(">H", data, position + 2)
         end = position + 2 + length
         if length < 2 or end > len(data):
-            raise _damaged_error("jpeg", "it is truncated")
+            raise _make_damage_error("jpeg", "it is truncated")
         yield marker, data[position + 4 : end], end
         position = end
 
 
-def _jpeg_frame(marker: int, body: memoryview) -> PictureHeader:
+def _find_jpeg_frame(marker: int, body: memoryview) -> CodecHeader:
     if len(body) < 6:
-        raise _damaged_error("jpeg", "its header is too short")
+        raise _make_damage_error("jpeg", "its header is too short")
     depth, height, width, components = struct.unpack_from(">BHHB", body)
     if marker not in _HUFFMAN_FRAMES or depth != 8:
         kind = "" if marker in _HUFFMAN_FRAMES else "lossless, hierarchical or arithmetic-coded "
@@ -223,13 +225,13 @@ def _jpeg_frame(marker: int, body: memoryview) -> PictureHeader:
     encoding = _JPEG_ENCODINGS.get(components)
     if encoding is None:
         raise MessageError(f"a jpeg with {components} components", expected=_JPEG_ACCEPTED)
-    return PictureHeader("jpeg", width, height, encoding)
+    return CodecHeader("jpeg", width, height, encoding)
 
 
 def _check_jpeg_scans(coded: memoryview) -> None:
     # In coded data a byte 0xFF is followed by 0 or a restart number, so these two are never pixels.
     scans = bytes(coded)
     if scans.rfind(bytes((0xFF, _EOI))) < 0:
-        raise _damaged_error("jpeg", "it is truncated")
+        raise _make_damage_error("jpeg", "it is truncated")
     if scans.count(bytes((0xFF, _SOS))) >= _MAX_SCANS:
-        raise _damaged_error("jpeg", f"it has more than {_MAX_SCANS} scans")
+        raise _make_damage_error("jpeg", f"it has more than {_MAX_SCANS} scans")

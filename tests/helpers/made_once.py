@@ -1,0 +1,45 @@
+"""What is expensive is made once in a run, however many of its processes ask for it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pickle
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+__all__ = ["folder_once", "made_once"]
+
+T = TypeVar("T")
+
+
+def made_once(name: str, make: Callable[[], T]) -> T:
+    """The value of ``make()``, from whichever process of this run came first.
+
+    The folder is that of this run (``tests/conftest.py``), so nothing of an older source can come
+    from it. A failure is not kept: the next one tries again.
+    """
+    path = Path(os.environ["SEMCAL_TESTS_SHARED"]) / f"{name}.pickle"
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            made = pickle.dumps(make())
+            part = path.with_suffix(".part")
+            part.write_bytes(made)
+            part.replace(path)
+    # Each gets a copy of its own, also the first, so that all see the same.
+    value: T = pickle.loads(path.read_bytes())
+    return value
+
+
+def folder_once(name: str, fill: Callable[[Path], None]) -> Path:
+    """A folder that ``fill`` has filled, the same for all processes of this run."""
+
+    def filled() -> str:
+        folder = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=os.environ["SEMCAL_TESTS_SHARED"]))
+        fill(folder)
+        return str(folder)
+
+    return Path(made_once(name, filled))
