@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -131,7 +131,7 @@ class CalibrationOptions:
     untilted: str | tuple[str, ...] = "auto"
     squares_sigma: float = 0.0
     height_sigma_m: float = 1e-5
-    axis: StageAxis = StageAxis()
+    axis: StageAxis = field(default_factory=StageAxis)
 
     def __post_init__(self) -> None:
         ScaleSigma(0.0, self.squares_sigma, self.height_sigma_m)

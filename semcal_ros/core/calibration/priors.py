@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -116,7 +116,7 @@ class Setup:
     priors: Priors
     breakpoints: tuple[float, ...] = ()
     shared: tuple[str, ...] = ()
-    axis: StageAxis = StageAxis()
+    axis: StageAxis = field(default_factory=StageAxis)
     stage_rotation_rad: float = 0.0
 
     @property
