@@ -51,7 +51,7 @@ def test_nano_ball(tmp_path: Path) -> None:
     out = tmp_path / "out"
     ran("nano_ball", "--output", out)
     result = json.loads((out / "summary.json").read_text())
-    # A fifth of the ball is shown; of the whole example, 264 points are asked.
+    # A sixth of the ball is covered; of the whole example, 264 points are asked.
     assert result["points_on_ball"] >= 150
     assert abs(result["diameter_error_percent"]) < 1.0
     assert result["interval_holds_truth"] == 1.0
