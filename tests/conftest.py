@@ -62,7 +62,7 @@ def _isolate() -> int:
         # As the executables do: threads of OpenBLAS would only wait for each other.
         OPENBLAS_NUM_THREADS="1",
         # The tests share the processors already. Processes for one recording would each import all again,
-        # about 2 s of a processor; the test that needs several says so.
+        # measured: 3.6 s of processor for two; the test that needs several says so.
         LOKY_MAX_CPU_COUNT="1",
     )
     # Other people's settings must not decide over the outcome of a test.

@@ -51,7 +51,7 @@ def test_nano_ball(tmp_path: Path) -> None:
     out = tmp_path / "out"
     ran("nano_ball", "--output", out)
     result = json.loads((out / "summary.json").read_text())
-    # A fifth of the ball is shown; of the whole example, 264 points are asked.
+    # A sixth of the ball is covered; of the whole example, 264 points are asked.
     assert result["points_on_ball"] >= 150
     assert abs(result["diameter_error_percent"]) < 1.0
     assert result["interval_holds_truth"] == 1.0
@@ -63,7 +63,8 @@ def test_nano_ball(tmp_path: Path) -> None:
 
 def test_visual_servo(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    ran("visual_servo", "--replay", "--output", out)
+    # At half the rate, as nodes on a busy machine pass over frames for which they are late.
+    ran("visual_servo", "--replay", "--rate", 0.5, "--output", out)
     results = json.loads((out / "results.json").read_text())
     final = {name: result["final_true_px"] for name, result in results.items()}
     # Two steps of the magnification are too few to learn the axis well; what they leave is under half a pixel of
@@ -74,7 +75,7 @@ def test_visual_servo(tmp_path: Path) -> None:
     # The nodes on a recording of the continuous case.
     rows = json.loads((out / "replay.json").read_text())
     assert [row["magnification"] for row in rows] == [500.0, 1600.0, 5000.0]
-    # The first frame has none before it, and on a busy machine late frames are passed over.
+    # The first frame has none before it, and late ones are passed over.
     assert all(row["measured"] >= row["frames"] / 2 for row in rows)
     # A quarter of a pixel at 5000x.
     assert rows[-1]["rms_nm"] < 24.0
