@@ -14,7 +14,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -38,7 +38,7 @@ class Case:
     """One row of the table: a stage, a grid, and what the calibration is told."""
 
     stage: SimulatedStage
-    grid: GridFaults = GridFaults()
+    grid: GridFaults = field(default_factory=GridFaults)
     readings: bool = False
     outliers: float = 0.0
     height_sigma_m: float = HEIGHT_M
