@@ -69,8 +69,11 @@ def test_calibration_agrees_with_the_truth(folder, capsys):
         capsys.readouterr()
         assert run("at", folder / "cal.yaml", row["magnification"], "--json") == 0
         answer = json.loads(capsys.readouterr().out)
-        # Nine views with heights of 40 um over a pivot of 20 mm leave 0.1 % (1 sigma) of the scale.
-        assert answer["mean_pixel_size_m"] == pytest.approx(1 / row["m_px_per_m"], rel=4e-3)
+        sigma = max(answer["pixel_size_sigma_m"])
+        # Three views at each of three magnifications tell neither how far the heights scatter nor how well the
+        # scale comes back: that leaves most of a per cent.
+        assert sigma < 1e-2 * answer["mean_pixel_size_m"]
+        assert abs(answer["mean_pixel_size_m"] - 1 / row["m_px_per_m"]) < 3.0 * sigma
         assert answer["in_range"]
         assert np.shape(answer["P"]) == (3, 4)
         assert min(answer["projection_sigma_px"]) > 0

@@ -29,7 +29,7 @@ from semcal_ros.core.calibration.outliers import (
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
-from semcal_ros.core.calibration.scale_checks import scale_warnings
+from semcal_ros.core.calibration.scale_checks import estimate_repeatability, scale_warnings
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.summary import (
     collect_statistics,
@@ -408,7 +408,7 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
         details,
         tuple(warnings),
         None if fit.field is None else fit.field.field,
-        adjustment.spread.scale.sigma if setup.shared else 0.0,
+        estimate_repeatability(setup, fit),
     )
 
 

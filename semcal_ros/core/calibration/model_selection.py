@@ -11,7 +11,7 @@ counts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -51,8 +51,8 @@ class Summary:
 
     information: Array
     right: Array
-    shared_mean: Array
-    shared_precision: Array
+    shared_mean: Array = field(default_factory=lambda: np.zeros(0))
+    shared_precision: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, problem: Problem, result: BundleResult) -> Summary:

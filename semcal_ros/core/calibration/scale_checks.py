@@ -12,7 +12,7 @@ from semcal_ros.core.calibration.joint import JointFit
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = ["Hysteresis", "estimate_hysteresis", "scale_warnings"]
+__all__ = ["Hysteresis", "estimate_hysteresis", "estimate_repeatability", "scale_warnings"]
 
 # Ratio of the smaller to the larger spread of the tilts: tilts of 30 degrees about one axis, with 3
 # degrees about the other.
@@ -69,6 +69,21 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
     counts = np.array([1.0 / len(upward[k]) + 1.0 / len(downward[k]) for k in both])
     sigma = fit.adjustment.spread.scale.sigma * np.sqrt(np.sum(counts)) / len(both)
     return Hysteresis(float(np.mean(difference)), float(sigma), len(both))
+
+
+def _is_repeatability_known(fit: JointFit) -> bool:
+    return fit.adjustment.spread.scale.determined >= _ENOUGH_VISITS
+
+
+def estimate_repeatability(setup: Setup, fit: JointFit) -> float:
+    """Return the relative 1-sigma of the scale of the next visit about its function.
+
+    Where the views do not tell, it is at least the usual one; 0 without visits, as for photographs.
+    """
+    if not setup.shared:
+        return 0.0
+    sigma = fit.adjustment.spread.scale.sigma
+    return sigma if _is_repeatability_known(fit) else max(sigma, setup.priors.visit_scale_sigma)
 
 
 def _tilts_span_one_direction(rotations: Array) -> bool:
@@ -128,11 +143,11 @@ def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list
             f"{', '.join(f'{g:g}' for g in where)}, where it is held by its prior; record also with "
             "the scan rotated by 90 degrees, or give the stage's tilt"
         )
-    spread = fit.adjustment.spread
-    if setup.shared and spread.scale.determined < _ENOUGH_VISITS:
+    if setup.shared and not _is_repeatability_known(fit):
         out.append(
             "scale: the views do not tell how well the magnification comes back; "
-            f"{100.0 * spread.scale.sigma:.2g} % is presumed. Visit some magnifications twice"
+            f"{100.0 * estimate_repeatability(setup, fit):.2g} % is presumed. Visit some "
+            "magnifications twice"
         )
     if fit.pattern is not None:
         out.append(
