@@ -43,7 +43,8 @@ format: setup ## bring the source into the form that lint wants
 	@$(VENV_PYTHON) -m ruff check --fix .
 	@$(VENV_PYTHON) -m ruff format .
 
-PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal
+# Three processes on two cores: tests of nodes mostly wait.
+PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal
 
 test: lint ## everything that is checked: style, types, tests
 	@$(PYTEST) $(PYTEST_ARGS) tests

@@ -129,18 +129,32 @@ def _make(factory: Callable[[], Node]) -> Node | None:
         return None
 
 
+class _Thread(SingleThreadedExecutor):
+    """The executor of rclpy, which may fail while it is made.
+
+    A signal can shut the middleware down at that moment. The destructor of what is half made then
+    misses an attribute, and prints a traceback.
+    """
+
+    _sigint_gc: Any = None
+
+
+class _Threads(MultiThreadedExecutor):
+    """The same with several threads."""
+
+    _sigint_gc: Any = None
+
+
 def _spin(node: Node, threads: int) -> int:
     executor: Executor | None = None
     try:
-        executor = (
-            MultiThreadedExecutor(num_threads=threads) if threads > 1 else SingleThreadedExecutor()
-        )
+        executor = _Threads(num_threads=threads) if threads > 1 else _Thread()
         executor.add_node(node)
         executor.spin()
     except ExternalShutdownException:
         pass
-    except RuntimeError:
-        # A signal can shut the middleware down at any moment.
+    except (RuntimeError, TypeError):
+        # A signal can shut the middleware down at any moment; rclpy then raises one or the other.
         if rclpy.utilities.ok():
             raise
     finally:
