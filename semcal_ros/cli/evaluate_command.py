@@ -31,7 +31,8 @@ def command(
 ) -> None:
     """Reprojection RMS of CALIBRATION on a grid RECORDING that it was not made from.
 
-    Poses are fitted to each view; the camera is not.
+    Poses are fitted to each view; the camera is not. The RMS does not show a wrong scale, since
+    heights imitate it: nm per px is compared by itself, with heights as usual.
 
     \b
     Example:
@@ -52,12 +53,13 @@ def command(
         echo_json(summary)
         return
     echo_table(
-        ["magnification", "views", "RMS px", ""],
+        ["magnification", "views", "RMS px", "nm per px off by %", ""],
         [
             [
                 f"{row.magnification:g}",
                 str(row.views),
                 f"{row.rms_px:.4f}",
+                f"{100.0 * row.scale_error:+.3f} +- {100.0 * row.scale_sigma:.3f}",
                 "" if row.in_range else "out of range",
             ]
             for row in result.by_magnification

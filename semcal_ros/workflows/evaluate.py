@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.evaluate import compare_scales, fit_poses, rms_by_magnification
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -37,6 +37,9 @@ class MagnificationError:
         The magnification, and the number of its views.
     rms_px
         Root of the mean square distance of the corners, px.
+    scale_error, scale_sigma
+        The calibration's nm per pixel over that of these images, minus 1, and its 1-sigma: of the
+        images, of their heights, and of the calibration.
     in_range
         Whether the calibration covers the magnification.
     """
@@ -44,6 +47,8 @@ class MagnificationError:
     magnification: float
     views: int
     rms_px: float
+    scale_error: float
+    scale_sigma: float
     in_range: bool
 
 
@@ -77,6 +82,9 @@ def evaluate(
 ) -> Evaluation:
     """Fit a pose to each view of the grid, not the camera, and compare.
 
+    The reprojection error does not show a wrong scale, because the heights of the views imitate
+    it; so the scale is compared by itself, with heights that are as usual as in the calibration.
+
     Parameters
     ----------
     calibration
@@ -106,17 +114,39 @@ def evaluate(
         display_width_m=microscope.display_width_m,
         squares_m=microscope.squares_m,
     )
+    height_m = _height_sigma_m(model.statistics)
     fit = fit_poses(
         collected.views,
         lambda g: model.at(g).resized(*collected.image_size),
-        height_sigma_m=_height_sigma_m(model.statistics),
+        height_sigma_m=height_m,
+    )
+    scales = compare_scales(
+        collected.views,
+        lambda g: model.at(g).resized(*collected.image_size),
+        fit,
+        height_sigma_m=height_m,
+        visit_height_sigma_m=_visit_height_sigma_m(model.statistics),
     )
     low, high = model.magnification_range
     errors = (
-        MagnificationError(g, int((fit.magnifications == g).sum()), rms, low <= g <= high)
+        MagnificationError(
+            magnification=g,
+            views=int((fit.magnifications == g).sum()),
+            rms_px=rms,
+            scale_error=scales[g].relative,
+            scale_sigma=scales[g].sigma,
+            in_range=low <= g <= high,
+        )
         for g, rms in rms_by_magnification(fit).items()
     )
     return Evaluation(fit.rms_px(), len(collected.views), len(collected.rejected), tuple(errors))
+
+
+def _visit_height_sigma_m(statistics: Mapping[str, Any]) -> float:
+    """Return the spread of the height of a visit in the calibration, or 0 where it says nothing."""
+    fit = statistics.get("fit")
+    height = fit.get("visit_height_sigma_m") if isinstance(fit, Mapping) else None
+    return float(height) if isinstance(height, (int, float)) and 0.0 <= height < math.inf else 0.0
 
 
 def _height_sigma_m(statistics: Mapping[str, Any]) -> float:

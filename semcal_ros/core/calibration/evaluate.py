@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
@@ -19,7 +19,12 @@ from semcal_ros.core.calibration.views import GridView, add_excess_noise, estima
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
-__all__ = ["ViewPose", "fit_poses", "rms_by_magnification"]
+__all__ = ["ScaleError", "ViewPose", "compare_scales", "fit_poses", "rms_by_magnification"]
+
+# Prior 1-sigma of the relative scale of the images about the calibration's: no limit in practice.
+_FREE_SCALE = 0.1
+# Prior 1-sigma that holds the camera itself.
+_HELD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,87 @@ class ViewPose:
         """Return the RMS distance over all corners, px."""
         square = np.concatenate([np.sum(r * r, axis=1) for r in self.residuals_px])
         return float(np.sqrt(np.mean(square)))
+
+
+@dataclass(frozen=True)
+class ScaleError:
+    """How nm per pixel of a calibration and of images of the grid disagree.
+
+    Attributes
+    ----------
+    relative
+        The calibration's nm per pixel over that of the images, minus 1.
+    sigma
+        1-sigma of it: of the images (corners, heights) and of the calibration, together.
+    """
+
+    relative: float
+    sigma: float
+
+
+def compare_scales(
+    views: Sequence[GridView],
+    camera_at: Callable[[float], ScanCamera],
+    poses: ViewPose,
+    *,
+    height_sigma_m: float,
+    visit_height_sigma_m: float = 0.0,
+) -> dict[float, ScaleError]:
+    """Compare the scale of images of a grid with that of a calibration, at each magnification.
+
+    With free heights, a wrong scale hides in them. Here they have a prior.
+
+    Parameters
+    ----------
+    views, camera_at
+        As for :func:`fit_poses`; the cameras have a covariance.
+    poses
+        Result of :func:`fit_poses`.
+    height_sigma_m
+        Prior 1-sigma of the height of each view about the reference plane.
+    visit_height_sigma_m
+        1-sigma of the height that all views at one magnification share.
+
+    Raises
+    ------
+    CalibrationError
+        If there are no views.
+    """
+    if not views:
+        raise CalibrationError("no views", expected="at least one view of a grid")
+    magnifications = np.unique([v.magnification for v in views])
+    cameras = [camera_at(float(g)) for g in magnifications]
+    group = np.searchsorted(magnifications, [v.magnification for v in views])
+    corrected = [
+        replace(v, image_xy=cameras[k].without_residual(v.image_xy))
+        for v, k in zip(views, group, strict=True)
+    ]
+    count = len(magnifications)
+    designs = np.zeros((count, 10, 1 + count))
+    designs[:, :, 0] = np.stack([c.parameters for c in cameras])
+    designs[np.arange(count), 0, 1 + np.arange(count)] = [c.m for c in cameras]
+    problem = make_problem(
+        corrected,
+        magnifications,
+        designs,
+        norm_px=cameras[0].norm_px,
+        nominal_px_per_m=np.array([c.m for c in cameras]),
+        prior_mean=np.append(1.0, np.zeros(count)),
+        prior_sigma=np.append(_HELD, np.full(count, _FREE_SCALE)),
+        height_sigma_m=height_sigma_m,
+    )
+    theta = np.append(1.0, np.zeros(count))
+    result = refine(problem, State(theta, poses.rotations, poses.translations_m))
+    own = np.concatenate([v.sigma_px for v in views])
+    # Corners that scatter more than they say make the scale as much less certain.
+    excess = max(float(np.median(np.sum(result.residuals_px**2, axis=1) / own**2)) / MEDIAN_CHI2_2, 1.0)
+    out = {}
+    for k, (g, camera) in enumerate(zip(magnifications, cameras, strict=True)):
+        sigma = np.sqrt(result.covariance[1 + k, 1 + k] * excess)
+        ours = camera.pixel_size_sigma_m[0] / camera.pixel_size_m[0]
+        parts = (sigma, camera.rho * visit_height_sigma_m, ours)
+        out[float(g)] = ScaleError(float(result.state.theta[1 + k]), float(np.linalg.norm(parts)))
+    return out
 
 
 def fit_poses(

@@ -170,3 +170,25 @@ def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
     assert not np.isfinite(blind.undistort(views[0].image_xy)).any()
     with pytest.raises(CalibrationError, match="can undistort only 0 corners"):
         fit_poses(views, lambda _: blind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [0.0, 0.01, -0.03])
+def test_a_wrong_scale_is_seen_beside_the_reprojection_error(joint, wrong):
+    """With free heights a calibration whose scale is 3 % wrong fits as well as a right one."""
+    microscope = preset("jsm820")
+    views = grid_views(
+        microscope.camera_at, BETWEEN, views=3, noise_px=0.05, seed=5, height_sigma_m=2e-5
+    )
+
+    def camera_at(g):
+        camera = joint.model.at(g)
+        # nm per px too large by so much: too few px per m.
+        return replace(camera, m=camera.m / (1.0 + wrong))
+
+    poses = fit_poses(views, camera_at, height_sigma_m=4e-5)
+    for g, error in compare_scales(views, camera_at, poses, height_sigma_m=2e-5).items():
+        truth = camera_at(g).pixel_size_m[0] / microscope.camera_at(g).pixel_size_m[0] - 1.0
+        assert abs(error.relative - truth) < 3.0 * error.sigma
+        # A third of a per cent: a wrong one of 1 % is significant.
+        assert error.sigma < 0.0035
