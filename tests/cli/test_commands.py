@@ -8,12 +8,14 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from semcal_ros import Calibration
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.files.bags.reader import open_bag
 from tests.helpers.made_once import folder_once
@@ -296,3 +298,26 @@ def test_what_is_known_beforehand_reaches_the_file(folder, tmp_path):
     saved = yaml.safe_load((tmp_path / "cal.yaml").read_text())
     assert saved["scale_sigma"]["height_m"] == 25e-6
     assert saved["scale_sigma"]["grid"] == 0.002
+
+
+@pytest.mark.slow
+def test_evaluate_says_how_far_nm_per_pixel_is_off(folder, tmp_path, capsys):
+    other = tmp_path / "other"
+    assert run("simulate", other, "--views", 2, "--seed", 7, "--magnification", 1000) == 0
+    calibration = Calibration.load(folder / "cal.yaml")
+    wide = {**calibration.functions}
+    wide["scale"] = replace(wide["scale"], coefficients=wide["scale"].coefficients / 1.02)
+    wrong = tmp_path / "wrong.yaml"
+    Calibration.from_model(replace(calibration, functions=wide)).save(wrong)
+    errors = {}
+    for name, path in (("right", folder / "cal.yaml"), ("wrong", wrong)):
+        capsys.readouterr()
+        assert run("evaluate", path, other, "--json") == 0
+        (row,) = json.loads(capsys.readouterr().out)["by_magnification"]
+        errors[name] = row
+        assert 0.0 < row["scale_sigma"] < 0.015
+    assert abs(errors["right"]["scale_error"]) < 3.0 * errors["right"]["scale_sigma"]
+    difference = errors["wrong"]["scale_error"] - errors["right"]["scale_error"]
+    assert difference == pytest.approx(0.02, abs=0.002)
+    # The reprojection error hardly sees it.
+    assert errors["wrong"]["rms_px"] < 1.5 * errors["right"]["rms_px"]

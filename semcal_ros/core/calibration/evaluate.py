@@ -126,7 +126,9 @@ def compare_scales(
     result = refine(problem, State(theta, poses.rotations, poses.translations_m))
     own = np.concatenate([v.sigma_px for v in views])
     # Corners that scatter more than they say make the scale as much less certain.
-    excess = max(float(np.median(np.sum(result.residuals_px**2, axis=1) / own**2)) / MEDIAN_CHI2_2, 1.0)
+    excess = max(
+        float(np.median(np.sum(result.residuals_px**2, axis=1) / own**2)) / MEDIAN_CHI2_2, 1.0
+    )
     out = {}
     for k, (g, camera) in enumerate(zip(magnifications, cameras, strict=True)):
         sigma = np.sqrt(result.covariance[1 + k, 1 + k] * excess)
