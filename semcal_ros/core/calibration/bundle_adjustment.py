@@ -18,6 +18,7 @@ from semcal_ros.core.calibration.normal_equations import (
     State,
     empty_effects,
     normal_equations,
+    pick_views,
     pose_priors,
     prior_cost,
     reduced_normal_equations,
@@ -259,15 +260,7 @@ def _refine_poses(
         trial_costs = view_costs(problem, trial)
         better = trial_costs <= costs
         decrease = np.where(better, costs - trial_costs, 0.0)
-        pick = better[:, None]
-        state = replace(
-            state,
-            rotations=np.where(pick[:, :, None], trial.rotations, state.rotations),
-            translations_m=np.where(pick, trial.translations_m, state.translations_m),
-            drift_px=np.where(pick, trial.drift_px, state.drift_px)
-            if len(state.drift_px)
-            else state.drift_px,
-        )
+        state = pick_views(better, trial, state)
         costs = np.where(better, trial_costs, costs)
         damping = np.where(better, np.maximum(0.1 * damping, _MIN_DAMPING), 10.0 * damping)
         predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, first:], change)

@@ -18,7 +18,7 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.distortion_centre import DistortionCentre, find_distortion_centre
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.normal_equations import Problem, State
-from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.priors import HELD_SIGMA, Setup
 from semcal_ros.core.calibration.problem import (
     adjust,
     build_problem,
@@ -31,10 +31,6 @@ from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
 __all__ = ["DiscreteFit", "fit_discrete", "table_functions"]
-
-
-# Prior 1-sigma that holds a parameter at its mean.
-_HELD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,7 @@ def _hold(problem: Problem, values: Mapping[str, float]) -> Problem:
     mean, sigma = problem.prior_mean.copy(), problem.prior_sigma.copy()
     for name, value in values.items():
         mean[FUNCTION_NAMES.index(name)] = value
-        sigma[FUNCTION_NAMES.index(name)] = _HELD
+        sigma[FUNCTION_NAMES.index(name)] = HELD_SIGMA
     return replace(problem, prior_mean=mean, prior_sigma=sigma)
 
 

@@ -15,6 +15,7 @@ from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
+from semcal_ros.core.calibration.priors import HELD_SIGMA
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
@@ -23,8 +24,6 @@ __all__ = ["ScaleError", "ViewPose", "compare_scales", "fit_poses", "rms_by_magn
 
 # Prior 1-sigma of the relative scale of the images about the calibration's: no limit in practice.
 _FREE_SCALE = 0.1
-# Prior 1-sigma that holds the camera itself.
-_HELD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -71,6 +70,22 @@ class ScaleError:
     sigma: float
 
 
+def _without_fields(
+    views: Sequence[GridView], camera_at: Callable[[float], ScanCamera]
+) -> tuple[Array, list[ScanCamera], list[GridView]]:
+    """Return the magnifications, their cameras, and the views without the residual field."""
+    if not views:
+        raise CalibrationError("no views", expected="at least one view of a grid")
+    magnifications = np.unique([v.magnification for v in views])
+    cameras = [camera_at(float(g)) for g in magnifications]
+    group = np.searchsorted(magnifications, [v.magnification for v in views])
+    corrected = [
+        replace(v, image_xy=cameras[k].without_residual(v.image_xy))
+        for v, k in zip(views, group, strict=True)
+    ]
+    return magnifications, cameras, corrected
+
+
 def compare_scales(
     views: Sequence[GridView],
     camera_at: Callable[[float], ScanCamera],
@@ -99,15 +114,7 @@ def compare_scales(
     CalibrationError
         If there are no views.
     """
-    if not views:
-        raise CalibrationError("no views", expected="at least one view of a grid")
-    magnifications = np.unique([v.magnification for v in views])
-    cameras = [camera_at(float(g)) for g in magnifications]
-    group = np.searchsorted(magnifications, [v.magnification for v in views])
-    corrected = [
-        replace(v, image_xy=cameras[k].without_residual(v.image_xy))
-        for v, k in zip(views, group, strict=True)
-    ]
+    magnifications, cameras, corrected = _without_fields(views, camera_at)
     count = len(magnifications)
     designs = np.zeros((count, 10, 1 + count))
     designs[:, :, 0] = np.stack([c.parameters for c in cameras])
@@ -119,7 +126,7 @@ def compare_scales(
         norm_px=cameras[0].norm_px,
         nominal_px_per_m=np.array([c.m for c in cameras]),
         prior_mean=np.append(1.0, np.zeros(count)),
-        prior_sigma=np.append(_HELD, np.full(count, _FREE_SCALE)),
+        prior_sigma=np.append(HELD_SIGMA, np.full(count, _FREE_SCALE)),
         height_sigma_m=height_sigma_m,
     )
     theta = np.append(1.0, np.zeros(count))
@@ -156,15 +163,7 @@ def fit_poses(
     CalibrationError
         If there are no views, or a view's corners cannot be projected by the camera at all.
     """
-    if not views:
-        raise CalibrationError("no views", expected="at least one view of a grid")
-    magnifications = np.unique([v.magnification for v in views])
-    cameras = [camera_at(float(g)) for g in magnifications]
-    of_view = [cameras[int(np.searchsorted(magnifications, v.magnification))] for v in views]
-    corrected = [
-        replace(v, image_xy=c.without_residual(v.image_xy))
-        for v, c in zip(views, of_view, strict=True)
-    ]
+    magnifications, cameras, corrected = _without_fields(views, camera_at)
     problem = make_problem(
         corrected,
         magnifications,
@@ -176,6 +175,7 @@ def fit_poses(
         height_sigma_m=height_sigma_m,
     )
     if starts is None:
+        of_view = [cameras[k] for k in problem.group]
         both = [pose_from_camera(v, c) for v, c in zip(views, of_view, strict=True)]
         rotations = np.stack([r for r, _ in both], axis=1)
         translations = np.stack([t for _, t in both], axis=1)

@@ -7,7 +7,7 @@ section 6.4).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -230,8 +230,7 @@ def add_shared_unknowns(setup: Setup) -> Setup:
     if setup.priors.is_wide:
         return setup
     squares = tuple(f"square_{k}" for k in range(1, len(setup.squares_m)))
-    tilted = any(v.stage is not None and v.stage.tilt_rad is not None for v in setup.views)
-    stage = tuple(OFFSET_NAMES) if tilted else ()
+    stage = OFFSET_NAMES if any(v.has_stage_tilt for v in setup.views) else ()
     return replace(setup, shared=(*GRID_NAMES, *squares, *MISS_NAMES, *stage))
 
 
@@ -279,6 +278,16 @@ def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
     return out
 
 
+def _linearise(
+    setup: Setup, padded: Functions, views: Sequence[GridView], adjustment: Adjustment
+) -> tuple[Problem, BundleResult]:
+    """Return the problem of the padded functions, and its equations at the adjusted solution."""
+    problem = build_problem(setup, padded, views, adjustment.spread)
+    state = adjustment.result.state
+    state = replace(state, theta=_theta(setup, padded, state))
+    return problem, refine(problem, state, max_iterations=0)
+
+
 def _pad_covariance(
     setup: Setup,
     padded: Functions,
@@ -294,10 +303,8 @@ def _pad_covariance(
     smaller than the corners say do not make it smaller; those that lines share make it larger.
     """
     views = setup.views if field is None else undo_field(setup, field.field).views
-    problem = build_problem(setup, padded, views, adjustment.spread)
-    state = adjustment.result.state
-    state = replace(state, theta=_theta(setup, padded, state))
-    result = refine(problem, state, max_iterations=0)
+    problem, result = _linearise(setup, padded, views, adjustment)
+    state = result.state
     factor = variance_factor(adjustment.problem, adjustment.result)
     size = len(state.theta) - len(setup.shared)
     if field is None:
@@ -326,13 +333,12 @@ def _pattern_covariance(
 
     It is the difference between the covariances with the pattern unknown and with none.
     """
-    problem = build_problem(setup, padded, setup.views, adjustment.spread)
-    state = adjustment.result.state
-    result = refine(problem, replace(state, theta=_theta(setup, padded, state)), max_iterations=0)
-    system = field_system(setup, problem, result, blank_field(setup), of_grid=True)
+    problem, result = _linearise(setup, padded, setup.views, adjustment)
+    blank = blank_field(setup)
+    system = field_system(setup, problem, result, blank, of_grid=True)
     size = len(result.state.theta) - len(setup.shared)
     free = system.covariance(pattern.choice.prior)[:size, :size]
-    none = system.covariance(held_prior(blank_field(setup), setup.norm_px))[:size, :size]
+    none = system.covariance(held_prior(blank, setup.norm_px))[:size, :size]
     return free - none
 
 

@@ -44,6 +44,7 @@ __all__ = [
     "empty_effects",
     "make_problem",
     "normal_equations",
+    "pick_views",
     "pose_priors",
     "prior_cost",
     "reduced_normal_equations",
@@ -615,6 +616,18 @@ def retract(problem: Problem, state: State, change: Array, pose: Array, visits: 
         state.translations_m + pose[:, 3:6] * problem.unit_m[:, None],
         state.visits + visits if len(state.visits) else state.visits,
         state.drift_px + pose[:, 6:] if len(state.drift_px) else state.drift_px,
+    )
+
+
+def pick_views(pick: Mask, chosen: State, other: State) -> State:
+    """Return ``other`` with the poses and drifts of ``chosen`` for the views in ``pick`` (V,)."""
+    rows = pick[:, None]
+    drift = len(other.drift_px) > 0
+    return replace(
+        other,
+        rotations=np.where(rows[:, :, None], chosen.rotations, other.rotations),
+        translations_m=np.where(rows, chosen.translations_m, other.translations_m),
+        drift_px=np.where(rows, chosen.drift_px, other.drift_px) if drift else other.drift_px,
     )
 
 

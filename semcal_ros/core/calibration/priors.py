@@ -12,7 +12,10 @@ from semcal_ros.core.calibration.normal_equations import MISS_NAMES
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 
-__all__ = ["Priors", "Setup"]
+__all__ = ["HELD_SIGMA", "Priors", "Setup"]
+
+HELD_SIGMA = 1e-9
+"""Prior 1-sigma that holds an unknown at its mean."""
 
 
 # The amplifiers of the scan change these at a breakpoint.

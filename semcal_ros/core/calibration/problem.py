@@ -14,6 +14,7 @@ from semcal_ros.core.calibration.normal_equations import (
     Problem,
     State,
     make_problem,
+    pick_views,
     pose_priors,
     whitened_norm,
 )
@@ -94,18 +95,19 @@ def build_problem(
         spread.drift_sigma_px,
         (y - 0.5 * (height - 1)) / height,
     )
+    known = attitudes(
+        [v.stage for v in views],
+        [v.untilted for v in views],
+        setup.axis,
+        setup.priors.untilted_sigma_rad,
+    )
     sizes = setup.squares_m
     return replace(
         problem,
         shared=shared,
         square_class=np.array([sizes.index(v.square_m) for v in views], dtype=np.intp),
         effects=effects,
-        attitudes=attitudes(
-            [v.stage for v in views],
-            [v.untilted for v in views],
-            setup.axis,
-            setup.priors.untilted_sigma_rad,
-        ),
+        attitudes=known if known.say_anything else None,
     )
 
 
@@ -188,16 +190,7 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     if not np.isfinite(other.cost):
         return own.state, 0
     better = _view_costs(problem, other) < _view_costs(problem, own) * (1.0 - 1e-6)
-    pick = better[:, None, None]
-    turned = replace(
-        own.state,
-        rotations=np.where(pick, other.state.rotations, own.state.rotations),
-        translations_m=np.where(pick[:, 0], other.state.translations_m, own.state.translations_m),
-        drift_px=np.where(pick[:, 0], other.state.drift_px, own.state.drift_px)
-        if len(own.state.drift_px)
-        else own.state.drift_px,
-    )
-    return turned, int(better.sum())
+    return pick_views(better, other.state, own.state), int(better.sum())
 
 
 def _view_costs(problem: Problem, result: BundleResult) -> Array:

@@ -95,17 +95,18 @@ def _tilts_span_one_direction(rotations: Array) -> bool:
 def _stage_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
     """List what the readings of the stage and the images do not agree on."""
     out: list[str] = []
-    means, sigmas = setup.shared_priors()
-    values = fit.adjustment.result.state.theta[
-        len(fit.adjustment.result.state.theta) - len(means) :
-    ]
-    for name, label in (("stage_tilt", "tilt"), ("stage_axis", "direction of the tilt axis")):
-        if name not in setup.shared:
-            return out
-        k = setup.shared.index(name)
-        if abs(values[k] - means[k]) > _SURPRISING * sigmas[k]:
+    if not any(v.has_stage_tilt for v in setup.views):
+        return out
+    errors = (
+        ("stage_tilt", "tilt", setup.priors.stage_tilt_sigma),
+        ("stage_axis", "direction of the tilt axis", setup.priors.stage_axis_sigma),
+    )
+    adjustment = fit.adjustment
+    for name, label, sigma in errors:
+        (value,) = adjustment.problem.shared_values(adjustment.result.state.theta, [name])
+        if abs(value) > _SURPRISING * sigma:
             out.append(
-                f"scale: the {label} of the stage is {np.degrees(values[k]):+.1f} degrees off from what "
+                f"scale: the {label} of the stage is {np.degrees(value):+.1f} degrees off from what "
                 "the configuration says: check stage.tilt_axis_deg and the unit of the readings"
             )
     camera = model.at(float(setup.magnifications[0]))
@@ -122,7 +123,7 @@ def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list
     """List what makes the scale less certain than the residuals suggest, with the remedy."""
     out: list[str] = []
     rotations = fit.adjustment.result.state.rotations
-    known = any(v.stage is not None and v.stage.tilt_rad is not None for v in setup.views)
+    known = any(v.has_stage_tilt for v in setup.views)
     if not known and _tilts_span_one_direction(rotations):
         out.append(
             "scale: all tilts are about one axis, so the images alone do not tell the aspect ratio "

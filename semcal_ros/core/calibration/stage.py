@@ -108,6 +108,11 @@ class Attitudes:
     axis_rad: float
     sigma_rad: Array
 
+    @property
+    def say_anything(self) -> bool:
+        """Whether an orientation or a scan rotation of any view is known."""
+        return bool(np.any(np.isfinite(self.sigma_rad)) or np.any(self.scan_rotation_rad))
+
     def chosen(self, keep: Mask) -> Attitudes:
         """Return those of some of the views."""
         return Attitudes(

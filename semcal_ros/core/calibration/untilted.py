@@ -40,9 +40,7 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
                 f"untilted {untilted!r}",
                 expected=f"{' or '.join(UNTILTED_MODES)}, or a list of names of views",
             )
-        if untilted == "none" or any(
-            v.stage is not None and v.stage.tilt_rad is not None for v in setup.views
-        ):
+        if untilted == "none" or any(v.has_stage_tilt for v in setup.views):
             return setup
         chosen = _apparently_untilted(setup)
     else:

@@ -109,16 +109,11 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
     height = problem.height_sigma_m.copy()
     for own in (flat, ~flat):
         if np.any(own):
-            residuals = (
-                result.prior_residuals[own, 0] * problem.height_sigma_m[own] / height[own][0]
-            )
-            spread = _update(
-                float(height[own][0]),
-                priors.height_sigma_m,
-                residuals,
-                result.prior_variance[own, 0],
-            )
-            height[own] = spread.sigma
+            # A view whose tilt passed the limit still has the spread of the others.
+            sigma = height[own]
+            residuals = result.prior_residuals[own, 0] * sigma / sigma[0]
+            variance = result.prior_variance[own, 0]
+            height[own] = _update(float(sigma[0]), priors.height_sigma_m, residuals, variance).sigma
     effects = problem.effects
     if effects is None:
         start = initial_components(setup)

@@ -96,6 +96,11 @@ class GridView:
             )
 
     @property
+    def has_stage_tilt(self) -> bool:
+        """Whether the stage said how the specimen was tilted."""
+        return self.stage is not None and self.stage.tilt_rad is not None
+
+    @property
     def whitening(self) -> Array:
         """(n, 3) lower triangle (xx, yx, yy) of the matrix that whitens the observation errors."""
         if self.covariance_px2 is None:
