@@ -251,7 +251,7 @@ def _refine_poses(
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        normal = normal_equations(problem, state)
+        normal = normal_equations(problem, state, poses_only=True)
         pose = normal.matrix[:, first:, first:].copy()
         pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
         change = solve_scaled(pose, normal.right[:, first:])
