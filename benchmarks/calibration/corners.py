@@ -61,7 +61,7 @@ def corners(quick: bool) -> None:
             error = mine.xy[right] - truth[nearest]
             sigma = float(np.sqrt(np.mean(mine.sigma_px[right] ** 2)))
             score = float(np.sqrt(np.mean((error / mine.sigma_px[right][:, None]) ** 2)))
-        other = against(truth, results["cv2"][0])  # type: ignore[arg-type]
+        other = against(truth, results["cv2"][0])
         tilt = np.degrees(frame.pose.tilt_rad)
         label = f"{frame.magnification:g}x, tilt {tilt:.0f} deg"
         row = [label, visible, found, false, rms, sigma, score, *other[:3]]

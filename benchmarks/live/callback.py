@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -25,6 +25,11 @@ from benchmarks.live.scenes import CONFIG, calibration, pictures
 from benchmarks.table import interleaved
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
+
+if TYPE_CHECKING:
+    from semcal_ros.nodes.frames.live_drift import LiveDrift
+    from semcal_ros.nodes.rectifier import RectifierNode
+    from semcal_ros.nodes.stream_corrector import StreamCorrector
 
 MAGNIFICATION = 5000.0
 # More than any cache keeps: each is new to it.
@@ -76,7 +81,7 @@ def core_actions(size: int, image: np.ndarray) -> dict[str, Callable[[], object]
 class KnownDrift:
     """In the place of the tracker, whose time is measured by itself."""
 
-    def __init__(self, tracker: Any, update: Any, camera: Any) -> None:
+    def __init__(self, tracker: LiveDrift, update: Any, camera: Any) -> None:
         from semcal_ros.core.drift.estimates import DriftEstimate
         from semcal_ros.nodes.frames.live_drift import FrameDrift
 
@@ -98,7 +103,7 @@ class KnownDrift:
 
 
 @contextmanager
-def nodes(size: int, folder: Path) -> Iterator[tuple[Any, Any]]:
+def nodes(size: int, folder: Path) -> Iterator[tuple[RectifierNode, StreamCorrector]]:
     """A rectifier and a stream corrector, both with a calibration."""
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped as Pose
@@ -135,7 +140,7 @@ def nodes(size: int, folder: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def node_actions(
-    rectifier: Any, corrector: Any, images: list[np.ndarray]
+    rectifier: RectifierNode, corrector: StreamCorrector, images: list[np.ndarray]
 ) -> dict[str, Callable[[], object]]:
     """From a message that has arrived to the messages that are published."""
     from sensor_msgs.msg import Image
@@ -181,7 +186,7 @@ def node_actions(
         message = next(frames)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(clock["ns"], 10**9)
         given = corrector.frames._frame(message, info(), 1.0)
-        tracker.of(given, camera)
+        tracker.estimate(given, camera)
 
     return {
         "node, still": lambda: frame(rectifier),
@@ -199,7 +204,7 @@ def measure(size: int, depth: int, quick: bool) -> dict[str, float]:
         interleaved(actions, 20 if size <= 1024 else 4)
         times = interleaved(actions, max(ROUNDS[size] // (3 if quick else 1), 3))
         for node in made:
-            rejected = node.statistics.rejected
+            rejected = node.reporter.statistics.rejected
             assert not rejected, f"{rejected} frames rejected"
     return {"floor": times["floor"], **{k: times[k] / times["floor"] for k in COLUMNS}}
 

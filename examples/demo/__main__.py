@@ -35,7 +35,7 @@ OUTPUT = Path("demo_output")
 CALIBRATED = (100, 250, 600, 1200, 2500, 4000, 6000, 8000, 10000)
 REPLAYED = (400, 1800, 7000)
 FRAMES = 10
-STAGES = {
+STAGES: dict[str, tuple[str, float | tuple[float, float]]] = {
     "image_raw": ("without correction", 7.0),
     "image_stabilized": ("with drift correction", 3.0),
     "image_rect": ("with drift and distortion correction", (0.9, 1.45)),

@@ -17,6 +17,7 @@ import json
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -87,10 +88,11 @@ def distances_nm(points: np.ndarray, diameter_nm: float) -> np.ndarray:
 def compared(cloud: Path, mesh: Path, truth: dict, result: dict) -> dict[str, float]:
     """What was measured against the truth."""
     true_nm = 1e9 * truth["ball_diameter_m"]
-    made = trimesh.load(cloud, process=False)
+    made: Any = trimesh.load(cloud, process=False)
     raw = made.metadata["_ply_raw"]["vertex"]["data"]
     points = np.asarray(made.vertices)[np.asarray(raw["on_ball"]).ravel() > 0.5]
-    vertices = np.asarray(trimesh.load(mesh, process=False).vertices)
+    shape: Any = trimesh.load(mesh, process=False)
+    vertices = np.asarray(shape.vertices)
     low, high = (1e9 * v for v in result["diameter_interval_m"])
     return {
         "diameter_error_percent": 100.0 * (1e9 * result["diameter_m"] / true_nm - 1.0),
@@ -116,13 +118,13 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
     keyframes = tracker.finish()
     chosen = [keyframes[int(k)] for k in np.linspace(0, len(keyframes) - 1, 3)]
     figure = create_figure(9.6, 2.6)
-    for column, frame in enumerate(chosen):
+    for column, keyframe in enumerate(chosen):
         axes = figure.add_subplot(1, 3, column + 1)
-        axes.imshow(frame.image, cmap="gray", vmin=0, vmax=200)
-        draw_trails(axes, keyframes[: keyframes.index(frame) + 1])
-        left = np.percentile(frame.xy[:, 0], 1) - 40.0
+        axes.imshow(keyframe.image, cmap="gray", vmin=0, vmax=200)
+        draw_trails(axes, keyframes[: keyframes.index(keyframe) + 1])
+        left = np.percentile(keyframe.xy[:, 0], 1) - 40.0
         axes.set(xlim=(left, left + 420.0), ylim=(319.5, -0.5), xticks=[], yticks=[])
-        title = f"frame {frame.index}, {frame.camera.magnification:g}x"
+        title = f"frame {keyframe.index}, {keyframe.camera.magnification:g}x"
         axes.set_title(title, fontsize=9, color=INK)
     return encode_png(figure, 100.0)
 
@@ -132,14 +134,15 @@ def draw_trails(axes, keyframes: list[TrackKeyframe]) -> None:
     last = keyframes[-1]
     axes.plot(*last.xy.T, ".", color="#4fb3ff", markersize=2)
     for number in last.ids[:: max(1, len(last.ids) // 120)]:
-        trail = [f.xy[f.ids == number] for f in keyframes[-8:]]
-        trail = np.concatenate([part for part in trail if len(part)])
+        parts = [f.xy[f.ids == number] for f in keyframes[-8:]]
+        trail = np.concatenate([part for part in parts if len(part)])
         axes.plot(*trail.T, "-", color="#ffb347", linewidth=0.6)
 
 
 def picture_of_error(mesh: Path, true_nm: float) -> bytes:
     """Where the mesh departs from the true sphere."""
-    vertices = np.asarray(trimesh.load(mesh, process=False).vertices)
+    shape: Any = trimesh.load(mesh, process=False)
+    vertices = np.asarray(shape.vertices)
     error = distances_nm(vertices, true_nm)
     figure = create_figure(8.0, 3.0)
     axes = figure.add_subplot(1, 2, 1)

@@ -21,6 +21,7 @@ import math
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
@@ -103,7 +104,7 @@ def frames_to(near: np.ndarray) -> int | None:
     return None if first >= len(near) else first
 
 
-def summary(run: Run) -> dict[str, object]:
+def summary(run: Run) -> dict[str, Any]:
     """Figures of one run, plain numbers for JSON."""
     g = np.array(run.magnification)
     true_px, true_m = np.array(run.true_px), run.true_m()
@@ -135,7 +136,7 @@ def summary(run: Run) -> dict[str, object]:
     }
 
 
-def printed(results: dict[str, dict[str, object]]) -> None:
+def printed(results: dict[str, dict[str, Any]]) -> None:
     print(f"\n{'':14} final error, truth        own estimate +- 1 sigma      largest true error")
     print(f"{'':14}     nm      px    mrad         nm             px       after a step, px")
     for name, r in results.items():
