@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import (
     Undistortion,
+    distort_jacobians,
     distort_normalised,
     undistort_normalised,
 )
@@ -20,7 +22,7 @@ from semcal_ros.core.camera.projection import (
 from semcal_ros.core.camera.residual_field import FieldSlice
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["ScanCamera", "as_points"]
+__all__ = ["RectifiedCamera", "ScanCamera", "as_points"]
 
 
 def as_points(values: ArrayLike, dimensions: int) -> Array:
@@ -44,6 +46,10 @@ def as_points(values: ArrayLike, dimensions: int) -> Array:
 @dataclass(frozen=True)
 class ScanCamera:
     """Projection and distortion of the SEM at one magnification (design section 4).
+
+    It knows three kinds of pixels of one image: *raw* ones, as scanned; *ideal* ones, without
+    distortion; *rectified* ones, which are ideal, square and at right angles, as in ``image_rect``.
+    The camera of those is :attr:`rectified`.
 
     Parameters
     ----------
@@ -192,20 +198,33 @@ class ScanCamera:
         It is by the 10 parameters, followed by the F coefficients of the residual field.
         """
         points = as_points(xyz_m, 3)
+        known, xy, jacobian = self._parametric_jacobian(points)
+        if self.residual is not None:
+            gradient = self.residual.gradient(self._normalised(xy))
+            jacobian = np.asarray(np.linalg.solve(np.eye(2) + gradient, jacobian))
+        return _scatter_rows(jacobian, known, len(points))
+
+    def _parametric_jacobian(self, points: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Linearise the projection before the residual field.
+
+        Returns
+        -------
+        Indices (k,) of the sem-frame points that have a raw pixel, these pixels (k, 2), and the
+        derivative (k, 2, 10 + F) of the pixels under the parametric distortion alone: by the 10
+        parameters, and, where the raw pixels stay, minus that by the F coefficients of the field.
+        """
         jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
-        if self.residual is None:
-            return jacobians.d_parameters
         known = np.flatnonzero(np.all(np.isfinite(jacobians.xy), axis=1))
-        q = self._normalised(self._with_residual(jacobians.xy[known]))
-        found = np.all(np.isfinite(q), axis=1)
-        known, q = known[found], q[found]
-        size = self.residual.coefficients.size
-        own = np.zeros((len(q), 2, 10 + size))
-        own[:, :, :10] = jacobians.d_parameters[known]
-        own[:, 0, 10::2] = own[:, 1, 11::2] = -self.norm_px * self.residual.basis(q)
-        out = np.full((len(points), 2, 10 + size), np.nan)
-        out[known] = np.linalg.solve(np.eye(2) + self.residual.gradient(q), own)
-        return out
+        xy = self._with_residual(jacobians.xy[known])
+        found = np.all(np.isfinite(xy), axis=1)
+        known, xy = known[found], xy[found]
+        by = jacobians.d_parameters[known]
+        if self.residual is not None:
+            fields = np.zeros((len(known), 2, self.residual.coefficients.size))
+            basis = self.residual.basis(self._normalised(xy))
+            fields[:, 0, 0::2] = fields[:, 1, 1::2] = -self.norm_px * basis
+            by = np.concatenate([by, fields], axis=2)
+        return known, xy, by
 
     @property
     def joint_covariance(self) -> Array | None:
@@ -242,7 +261,7 @@ class ScanCamera:
 
     def _normalised(self, xy: Array) -> Array:
         """Return pixels in half image widths from the image centre, as for the residual field."""
-        return (xy - 0.5 * np.array([self.width - 1.0, self.height - 1.0])) / self.norm_px
+        return (xy - self._middle) / self.norm_px
 
     def without_residual(self, xy: ArrayLike) -> Array:
         """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
@@ -275,6 +294,93 @@ class ScanCamera:
         """Undistort to normalised coordinates, with convergence flags and residuals."""
         q_d = (self.without_residual(xy) - self._centre) / self.norm_px
         return undistort_normalised(q_d, self.xi_r, self.xi_t)
+
+    # -- rectified pixels -------------------------------------------------------------------------
+
+    @property
+    def _middle(self) -> Array:
+        """(2,) middle of the image, px, which keeps its place when the image is rectified."""
+        return 0.5 * np.array([self.width - 1.0, self.height - 1.0])
+
+    @property
+    def _rect_from_ideal(self) -> Array:
+        """(2, 2) matrix that takes aspect and skew out of ideal pixels and keeps their area."""
+        return np.array([[1.0 / self.aspect, -self.skew], [0.0, self.aspect]])
+
+    @property
+    def _ideal_from_rect(self) -> Array:
+        """(2, 2) inverse of :attr:`_rect_from_ideal`."""
+        return np.array([[self.aspect, self.skew], [0.0, 1.0 / self.aspect]])
+
+    def rect_from_ideal(self, xy: ArrayLike) -> Array:
+        """Map ideal pixels (n, 2) to rectified pixels (n, 2), px.
+
+        ``x_rect = c + [[1/a, -sigma], [0, a]] (x_u - c)`` with the middle ``c`` of the image: what
+        is left of ``m [[a, sigma], [0, 1/a]]`` is m times the identity.
+        """
+        return self._middle + (as_points(xy, 2) - self._middle) @ self._rect_from_ideal.T
+
+    def ideal_from_rect(self, xy: ArrayLike) -> Array:
+        """Map rectified pixels (n, 2) to ideal pixels (n, 2), px: invert :meth:`rect_from_ideal`."""
+        return self._middle + (as_points(xy, 2) - self._middle) @ self._ideal_from_rect.T
+
+    def rect_from_raw(self, xy: ArrayLike) -> Array:
+        """Map raw pixels (n, 2) to rectified pixels (n, 2), px; NaN where there is none."""
+        return self.rect_from_ideal(self.undistort(xy))
+
+    def raw_from_rect(self, xy: ArrayLike) -> Array:
+        """Map rectified pixels (n, 2) to raw pixels (n, 2), px; NaN where there is none.
+
+        Every rectification of an image samples it here.
+        """
+        return self.distort(self.ideal_from_rect(xy))
+
+    @cached_property
+    def rectified(self) -> RectifiedCamera:
+        """The camera of the rectified image: square pixels, no skew, no distortion.
+
+        Its pixel has the area of this camera's: 1/m along both axes. What is seen in the middle of
+        the undistorted image is seen in the middle of the rectified one.
+        """
+        px, py = self.rect_from_ideal([[self.px, self.py]])[0].tolist()
+        ex, ey = self.rect_from_ideal([[self.ex, self.ey]])[0].tolist()
+        covariance = self.covariance
+        if covariance is not None:
+            covariance = _congruent(self._rectified_from_own, covariance)
+        return RectifiedCamera(
+            magnification=self.magnification,
+            m=self.m,
+            aspect=1.0,
+            skew=0.0,
+            px=px,
+            py=py,
+            rho=self.rho,
+            xi_r=0.0,
+            xi_t=0.0,
+            ex=ex,
+            ey=ey,
+            norm_px=self.norm_px,
+            width=self.width,
+            height=self.height,
+            covariance=covariance,
+            in_range=self.in_range,
+            source=self,
+        )
+
+    @property
+    def _rectified_from_own(self) -> Array:
+        """(10, 10) from errors of the parameters to those of the parameters of :attr:`rectified`.
+
+        The rectification is done with the parameters as they are estimated, so an error dM of the
+        matrix ``M = m [[a, sigma], [0, 1/a]]`` is left over in the image: m (I + M^-1 dM).
+        """
+        matrix = np.eye(10)
+        matrix[1:3, 1:3] = [
+            [1.0 / self.aspect, 0.0],
+            [self.skew / self.aspect**2, 1.0 / self.aspect],
+        ]
+        matrix[3:5, 3:5] = self._rect_from_ideal
+        return matrix
 
     # -- matrices ---------------------------------------------------------------------------------
 
@@ -389,3 +495,76 @@ class ScanCamera:
             covariance=covariance,
             residual=residual,
         )
+
+
+@dataclass(frozen=True)
+class RectifiedCamera(ScanCamera):
+    """The camera of a rectified image, as :attr:`ScanCamera.rectified` makes it.
+
+    Its raw, ideal and rectified pixels are the same: those of the rectified image. So ``project``
+    says where a point of the sem frame is seen in ``image_rect``.
+
+    The image is rectified with the parameters as they are estimated, and their errors stay in it.
+    ``covariance`` is that of the rectified image's own m, aspect, skew, px, py and rho, followed by
+    xi_r, xi_t, ex and ey of the distortion that was taken out; in :attr:`joint_covariance` and
+    :meth:`project_jacobian` the coefficients of the residual field that was taken out come last.
+
+    Parameters
+    ----------
+    source
+        The camera of the raw image.
+    """
+
+    source: ScanCamera = field(kw_only=True, repr=False, compare=False)
+
+    @property
+    def rectified(self) -> RectifiedCamera:
+        """The camera itself."""
+        return self
+
+    def resized(self, width: int, height: int) -> RectifiedCamera:
+        """Return the rectified camera of the resized :attr:`source`."""
+        return self.source.resized(width, height).rectified
+
+    @property
+    def joint_covariance(self) -> Array | None:
+        """As :attr:`ScanCamera.joint_covariance`, after the rectification."""
+        covariance = self.source.joint_covariance
+        if covariance is None:
+            return None
+        return _congruent(_extend(self.source._rectified_from_own, len(covariance)), covariance)
+
+    def project_jacobian(self, xyz_m: ArrayLike) -> Array:
+        """Return the derivative (n, 2, 10 + F) of the rectified pixel of a point.
+
+        The point is seen at a raw pixel that depends on the true parameters, which is then mapped
+        with the estimated ones.
+        """
+        source, points = self.source, as_points(xyz_m, 3)
+        known, _, by = source._parametric_jacobian(points)
+        q = (source.project_ideal(points[known]) - source._centre) / source.norm_px
+        # The residual field displaces a pixel and is inverted at the same place: it cancels.
+        by = source._rect_from_ideal @ np.linalg.solve(
+            distort_jacobians(q, source.xi_r, source.xi_t)[1], by
+        )
+        own = by @ np.linalg.inv(_extend(source._rectified_from_own, by.shape[2]))
+        return _scatter_rows(own, known, len(points))
+
+
+def _congruent(matrix: Array, covariance: Array) -> Array:
+    """Covariance after a linear map."""
+    return np.asarray(matrix @ covariance @ matrix.T)
+
+
+def _extend(matrix: Array, size: int) -> Array:
+    """The matrix as the first block of one that is the identity elsewhere."""
+    extended = np.eye(size)
+    extended[: len(matrix), : len(matrix)] = matrix
+    return extended
+
+
+def _scatter_rows(values: Array, rows: NDArray[np.intp], size: int) -> Array:
+    """Array of ``size`` rows with values in some of them, NaN in the others."""
+    scattered = np.full((size, *values.shape[1:]), np.nan)
+    scattered[rows] = values
+    return scattered
