@@ -121,8 +121,8 @@ class Calibration(CalibrationModel):
     def rectify(
         self, image: AnyImage, magnification: float, *, interpolation: str = "linear"
     ) -> AnyImage:
-        """The image without distortion, as the camera ``at(magnification)`` with an ideal beam
-        would have taken it.
+        """The image in square pixels without skew and distortion, as the camera
+        ``at(magnification).rectified`` would have taken it.
 
         Drift is left in; :func:`semcal_ros.rectify` removes it from the frames of a recording.
 

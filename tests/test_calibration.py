@@ -83,8 +83,9 @@ def test_numbers_of_numpy_are_numbers(calibration):
 
 def test_a_rectified_image_is_without_distortion(calibration):
     camera = calibration.at(1000.0)
-    # A point of light where the raw image shows the ideal pixel (400, 90).
-    x, y = camera.distort(np.array([[400.0, 90.0]]))[0]
+    # A point of light where the raw image shows what belongs at (400, 90).
+    point = camera.rectified.sem_from_ideal([[400.0, 90.0]])
+    x, y = camera.project(point)[0]
     assert np.hypot(x - 400.0, y - 90.0) > 0.3
     rows, columns = np.mgrid[:512, :512]
     spot = 200.0 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 3.0**2))

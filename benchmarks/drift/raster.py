@@ -89,7 +89,7 @@ def field_residual_px(
 
     def belongs(raw: Array) -> Array:
         moved_m = drift_at_pixels(raw, size, drift, start_s, timing) - zero_m
-        return camera.undistort(raw) - moved_m @ camera.ideal_from_sem_jacobian.T
+        return camera.rect_from_raw(raw) - moved_m @ camera.rectified.ideal_from_sem_jacobian.T
 
     # Output pixels that should show these points; the map looks for them where it believes.
     output = belongs(field_points(size))

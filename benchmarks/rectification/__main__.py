@@ -42,11 +42,11 @@ def map_error_px(
     step = max(size // 512, 1)
     y, x = np.mgrid[0:size:step, 0:size:step]
     raw = np.stack([m[::step, ::step].ravel() for m in maps], axis=1).astype(np.float64)
-    output = camera.undistort(raw)
+    output = camera.rect_from_raw(raw)
     if drift is not None:
         late_s = TIMING.pixel_offset_s(raw[:, 1], raw[:, 0], size, size) - TIMING.centre_offset_s
         moved_m = drift.position + late_s[:, None] * drift.velocity
-        output -= moved_m @ camera.ideal_from_sem_jacobian.T
+        output -= moved_m @ camera.rectified.ideal_from_sem_jacobian.T
     error = np.hypot(output[:, 0] - x.ravel(), output[:, 1] - y.ravel())
     return float(np.sqrt(np.mean(error**2))), float(error.max())
 

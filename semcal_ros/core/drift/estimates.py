@@ -150,7 +150,7 @@ class DriftUpdate(DriftEstimate):
     residual
         RMS grey levels that the shift does not explain; NaN where nothing was registered.
     px_from_unit
-        (2, 2) ideal pixels of this frame per unit of the drift.
+        (2, 2) rectified pixels of this frame per unit of the drift.
     overlap
         Fraction of the image that was compared with the keyframe.
     calibrated
@@ -207,7 +207,7 @@ class DriftUpdate(DriftEstimate):
 
     @property
     def drift_px(self) -> Array:
-        """(2,) drift in ideal pixels of this frame."""
+        """(2,) drift in rectified pixels of this frame."""
         return self.px_from_unit @ self.drift_m
 
 
@@ -298,7 +298,7 @@ class DriftPath:
 
     @cached_property
     def drift_px(self) -> Array:
-        """(n, 2) drift in ideal pixels of each frame."""
+        """(n, 2) drift in rectified pixels of each frame."""
         return np.array([u.drift_px for u in self.updates]).reshape(-1, 2)
 
     @cached_property

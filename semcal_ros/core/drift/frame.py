@@ -48,7 +48,7 @@ class ScanFrame:
     timing
         Its raster timing, or None for an instant.
     rectified
-        Whether the image already is in the camera's ideal pixels.
+        Whether the image already is in the camera's rectified pixels.
     """
 
     image: AnyImage
@@ -69,8 +69,8 @@ class ScanFrame:
 
     @property
     def px_from_unit(self) -> Array:
-        """(2, 2) px per unit of the drift: per m with a camera, per px without."""
-        return np.eye(2) if self.camera is None else self.camera.ideal_from_sem_jacobian
+        """(2, 2) rectified px per unit of the drift: per m with a camera, per px without."""
+        return np.eye(2) if self.camera is None else self.camera.rectified.ideal_from_sem_jacobian
 
     @property
     def acquisition_time_s(self) -> float:
@@ -86,7 +86,7 @@ class ScanFrame:
 
 
 class MotionCorrector:
-    """Makes frames in ideal pixels as if they had been scanned in the instant of their centre.
+    """Makes frames in rectified pixels as if they had been scanned in the instant of their centre.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class Keyframe:
     removed
         (4,) drift velocity and acceleration (unit per s and s^2) that were removed from that frame.
     mean
-        (h, w) float32 mean of the frames, in ideal pixels of the camera.
+        (h, w) float32 mean of the frames, in rectified pixels of the camera.
     region
         The part of it that was scanned.
     time_s
@@ -113,23 +113,23 @@ def make_keyframe(
 
 def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
     """Factor by which the px per unit differ, at least 1; infinite where they cannot be compared."""
-    if (before.camera is None) != (now.camera is None):
-        return float("inf")
-    if before.camera is None:
-        return 1.0 if before.size == now.size else float("inf")
-    stretch = np.linalg.svd(now.px_from_unit @ np.linalg.inv(before.px_from_unit), compute_uv=False)
-    return float(max(stretch.max(), 1.0 / stretch.min()))
+    if before.camera is not None and now.camera is not None:
+        # Rectified pixels are square: it is the same in all directions.
+        ratio = now.camera.m / before.camera.m
+        return max(ratio, 1.0 / ratio)
+    is_same = before.camera is now.camera and before.size == now.size
+    return 1.0 if is_same else float("inf")
 
 
 def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
     """The keyframe as the camera of ``now`` would show it.
 
-    Both cameras must be known. Ideal pixels of two magnifications are related by the affine map of
-    the reference plane.
+    Both cameras must be known. Rectified pixels of two magnifications are related by the zoom of
+    the reference plane about the principal point.
     """
-    before, after = key.frame.camera, now.camera
-    if before is None or after is None:
+    if key.frame.camera is None or now.camera is None:
         return key
+    before, after = key.frame.camera.rectified, now.camera.rectified
     matrix = now.px_from_unit @ np.linalg.inv(key.frame.px_from_unit)
     offset = np.array([after.px, after.py]) - matrix @ np.array([before.px, before.py])
     shrink = float(np.sqrt(abs(np.linalg.det(matrix))))

@@ -211,7 +211,7 @@ class DriftTracker:
         timing
             Raster timing; None takes the frame as an instant at ``time_s``.
         rectified
-            Whether the image already is in ideal pixels of ``camera``.
+            Whether the image already is in rectified pixels of ``camera``.
 
         Raises
         ------

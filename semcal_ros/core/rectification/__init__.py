@@ -1,1 +1,1 @@
-"""Raw frames to undistorted, drift-free images in one interpolation, and their average."""
+"""Raw frames to rectified, drift-free images in one interpolation, and their average."""

@@ -1,12 +1,13 @@
 """Where in the raw frame each pixel of a rectified one was seen, exactly.
 
-The specimen drifts before it is projected and distorted, so an output pixel u, which is an ideal
+The specimen drifts before it is projected and distorted, so an output pixel x, which is a rectified
 pixel of the camera with the specimen at zero drift, is seen in the raw frame at
 
-    raw = distort(u + J d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
+    raw = raw_from_rect(x + m d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
 
-with ``J`` the derivative of ideal pixels by sem-frame coordinates and ``t(raw)`` the time at which
-that raw pixel was scanned.
+with the scale ``m`` of the rectified camera, in px per m, and ``t(raw)`` the time at which that raw
+pixel was scanned. Aspect, skew and distortion of the camera are all in ``raw_from_rect``
+(:class:`~semcal_ros.core.camera.scan_camera.ScanCamera`).
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def raw_from_output(
     drift: RasterDrift | None,
     timing: ScanTiming | None,
 ) -> Array:
-    """Raw pixels (n, 2) of output pixels (n, 2), exactly; NaN where the distortion has no answer.
+    """Raw pixels (n, 2) of rectified pixels (n, 2), exactly; NaN where the distortion has no answer.
 
     Parameters
     ----------
@@ -66,17 +67,17 @@ def raw_from_output(
     size
         (width, height) of the raw frame.
     camera
-        Camera of that size, or None for no distortion; drift is then in px.
+        Camera of that size, or None for a raw frame that counts as rectified; drift is then in px.
     drift
         Drift to remove, or None.
     timing
         Raster timing; None takes the frame as an instant, so that the velocity has no effect.
     """
-    jacobian = np.eye(2) if camera is None else camera.ideal_from_sem_jacobian
+    jacobian = np.eye(2) if camera is None else camera.rectified.ideal_from_sem_jacobian
     if drift is None:
-        return xy.copy() if camera is None else camera.distort(xy)
+        return xy.copy() if camera is None else camera.raw_from_rect(xy)
     at_centre = xy + jacobian @ np.asarray(drift.position, dtype=np.float64)
-    raw = at_centre if camera is None else camera.distort(at_centre)
+    raw = at_centre if camera is None else camera.raw_from_rect(at_centre)
     velocity = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
     acceleration = 0.5 * (jacobian @ np.asarray(drift.acceleration, dtype=np.float64))
     is_accelerated = bool(acceleration.any())
@@ -92,7 +93,7 @@ def raw_from_output(
             # The mean over the passes of the square of the time.
             square_s2 = since_s**2 + timing.pass_variance_s2
             moved += np.multiply.outer(acceleration, square_s2).T
-        new = moved if camera is None else camera.distort(moved)
+        new = moved if camera is None else camera.raw_from_rect(moved)
         change_px = np.abs(new - raw)
         raw = new
         # The error that remains is smaller than the step by the same factor again.

@@ -1,4 +1,4 @@
-"""Undo distortion and drift of a frame in one interpolation.
+"""Undo distortion, skew and drift of a frame in one interpolation, into square pixels.
 
 The raw position of every output pixel (:mod:`semcal_ros.core.rectification.raw_positions`) is computed in bands of
 rows that stay in the processor's cache while the image is resampled at them
@@ -82,7 +82,7 @@ class Rectifier:
         *,
         out: AnyImage | None = None,
     ) -> AnyImage:
-        """The frame as an ideal camera would see the specimen at zero drift.
+        """The frame as ``camera.rectified`` would see the specimen at zero drift.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class Rectifier:
             (h, w) or (h, w, 3) of uint8, uint16 or float32.
         camera
             Camera of this frame's magnification; scaled to the image's size if it has another.
-            None: no distortion.
+            None: the pixels stay where they are.
         drift
             Drift during this frame: in m with a camera, in px without; None for none.
         timing

@@ -49,7 +49,7 @@ def left_px(
         # Of all passes together: the offset of a pixel is the mean over them.
         first = timing.pixel_offset_s(raw[:, 1], raw[:, 0], SIZE, SIZE) - passes.mean()
         moved = np.mean([drift(start_s + first + p) for p in passes], axis=0)
-        return camera.undistort(raw) - (moved - zero) @ camera.ideal_from_sem_jacobian.T
+        return camera.rect_from_raw(raw) - camera.m * (moved - zero)
 
     side = np.linspace(0.0, SIZE - 1.0, 5)
     field = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)

@@ -25,7 +25,7 @@ VELOCITY = np.array([0.10e-6, -0.06e-6])
 
 def feed(tracker: DriftTracker, first: int, last: int) -> None:
     for k in range(first, last):
-        shift = CAMERA.ideal_from_sem_jacobian @ (VELOCITY * k)
+        shift = CAMERA.m * VELOCITY * k
         picture = noisy(TEXTURE.view((shift[0], shift[1]), SIZE), 5.0, k)
         tracker.update(picture.astype(np.float32), float(k), CAMERA, rectified=True)
 

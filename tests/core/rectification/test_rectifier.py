@@ -36,8 +36,8 @@ def _centroid(picture: np.ndarray) -> np.ndarray:
     return np.array([np.sum(x * weight), np.sum(y * weight)]) / weight.sum()
 
 
-def test_undistorts_a_spot_to_its_ideal_pixel() -> None:
-    point = CAMERA.sem_from_ideal([[30.0, 160.0]])
+def test_puts_a_spot_at_its_rectified_pixel() -> None:
+    point = CAMERA.rectified.sem_from_ideal([[30.0, 160.0]])
     raw = CAMERA.project(point)[0]
     rectified = Rectifier().rectify(_spot((raw[0], raw[1])), CAMERA)
     # A spot of 3 px is resampled linearly: its centroid keeps to about 0.02 px.
@@ -48,7 +48,7 @@ def test_undistorts_a_spot_to_its_ideal_pixel() -> None:
 def test_sign_of_the_drift() -> None:
     # A point that drifted by (+5, -3) um is seen away from its place and is put back.
     drift = np.array([5e-6, -3e-6])
-    point = CAMERA.sem_from_ideal([[100.0, 80.0]])
+    point = CAMERA.rectified.sem_from_ideal([[100.0, 80.0]])
     raw = CAMERA.project(point + np.append(drift, 0.0))[0]
     assert raw[0] > 115.0
     assert raw[1] < 72.0
@@ -171,7 +171,7 @@ def test_what_was_not_scanned_is_black() -> None:
 
 
 def test_another_image_size_uses_the_same_field_of_view() -> None:
-    raw = CAMERA.project(CAMERA.sem_from_ideal([[30.0, 160.0]]))[0]
+    raw = CAMERA.project(CAMERA.rectified.sem_from_ideal([[30.0, 160.0]]))[0]
     double = CAMERA.resized(2 * SIZE, 2 * SIZE)
     ideal = 2.0 * (np.array([30.0, 160.0]) + 0.5) - 0.5
     at = 2.0 * (raw + 0.5) - 0.5
