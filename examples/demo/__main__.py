@@ -16,7 +16,6 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,14 +84,15 @@ def replay(calibration: Path) -> Received:
 
 
 def reprojection_rms(
-    images: dict[int, np.ndarray], reference: int, view: GridView, cal: Calibration
+    images: dict[int, np.ndarray], view: GridView, cal: Calibration, *, rectified: bool
 ) -> float:
     """RMS px between the corners of ``images`` and where the grid of the reference frame is.
 
-    The pose of the grid is fitted once, to the corrected reference frame under the ideal (undistorted) camera, so what
-    is left in other frames is drift and distortion.
+    The pose of the grid is fitted once, to the corrected reference frame under the camera of rectified images, so what
+    is left in other frames is drift and distortion. The aspect and skew of images that are not rectified are no error.
     """
-    camera = replace(cal.at(view.magnification), xi_r=0.0, xi_t=0.0)
+    raw = cal.at(view.magnification)
+    camera = raw.rectified
     fit = fit_poses([view], lambda g: camera)
     rotation, translation = fit.rotations[0], fit.translations_m[0]
     h = camera.P_affine @ np.vstack(
@@ -104,7 +104,7 @@ def reprojection_rms(
         detection = find_lattice(image)
         if isinstance(detection, Rejection):
             continue
-        xy = detection.xy
+        xy = detection.xy if rectified else raw.rect_from_ideal(detection.xy)
         board = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
         corner = np.round(board[:, :2] / board[:, 2:] / square) * square
         seen = np.column_stack([corner, np.ones(len(corner))]) @ h.T
@@ -135,7 +135,8 @@ def measure(received: Received, cal: Calibration) -> dict[str, list[float]]:
         view = GridView(float(g), found.ij * frames_at(g)[0]["square_m"], found.xy, found.sigma_px)
         for topic in STAGES:
             images = {s: received.images[topic][s] for s in stamps if s in received.images[topic]}
-            rows[topic].append(reprojection_rms(images, first, view, cal))
+            rms = reprojection_rms(images, view, cal, rectified=topic == "image_rect")
+            rows[topic].append(rms)
     return rows
 
 

@@ -20,11 +20,14 @@ def fill_camera_info(
     width: int,
     height: int,
 ) -> None:
-    """Describe a rectified image as a pinhole camera.
+    """Describe a rectified image as a pinhole camera: ``camera.rectified``.
 
-    Points are those of the optical frame, whose origin is the scan pivot: a sem-frame point (X, Y,
-    z) lies at ``Z = 1/rho + z``. Then ``K`` has ``f = m / rho``, ``P = [K | 0]``, ``R`` is the
-    identity and the five ``plumb_bob`` coefficients are zero.
+    CameraInfo has no skew: its readers take ``fx, fy, cx, cy`` and nothing else. The rectified
+    camera has no skew either, and one focal length.
+
+    Points are those of the optical frame, whose origin is the scan pivot: a sem-frame point
+    (X, Y, z) lies at ``Z = 1/rho + z``. Then ``K`` has ``f = m / rho``, ``P = [K | 0]``, ``R`` is
+    the identity and the five ``plumb_bob`` coefficients are zero.
 
     Parameters
     ----------
@@ -46,7 +49,7 @@ def fill_camera_info(
     k, r = np.zeros((3, 3)), np.zeros((3, 3))
     if camera is not None and camera.rho > 0.0:
         with np.errstate(over="ignore"):
-            pinhole = camera.resized(width, height).K
+            pinhole = camera.resized(width, height).rectified.K
         if np.all(np.isfinite(pinhole)):
             k, r = pinhole, np.eye(3)
     assign_floats(message, "d", np.zeros(5))

@@ -51,20 +51,24 @@ _FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
 _GRAY_CODES = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 
-def image_from_message(message: Any) -> NDArray[Any]:
+def image_from_message(
+    message: Any, encodings: Mapping[str, PixelFormat] = ENCODINGS
+) -> NDArray[Any]:
     """Return the pixels of an image message in the byte order of this machine.
 
     Parameters
     ----------
     message
-        An image with an encoding of :data:`ENCODINGS`; row padding (``step``) and ``is_bigendian``
+        An image with an encoding of ``encodings``; row padding (``step``) and ``is_bigendian``
         are honoured.
+    encodings
+        What is accepted.
 
     Returns
     -------
-    Read-only array of shape (height, width) or (height, width, 3), dtype uint8, uint16 or float32.
-    It shares memory with the message where the layout allows it, so it is valid as long as the
-    message is not changed.
+    Read-only array of shape (height, width) or (height, width, 3), of the type of the encoding:
+    uint8, uint16 or float32. It shares memory with the message where the layout allows it, so it is
+    valid as long as the message is not changed.
 
     Raises
     ------
@@ -73,7 +77,7 @@ def image_from_message(message: Any) -> NDArray[Any]:
         size and step.
     """
     require_fields(message, _FIELDS, "sensor_msgs/msg/Image")
-    pixel = _pixel_format(message.encoding)
+    pixel = _pixel_format(message.encoding, encodings)
     height, width, step, big_endian = (
         whole_number(getattr(message, name), name)
         for name in ("height", "width", "step", "is_bigendian")
@@ -91,12 +95,12 @@ def image_from_message(message: Any) -> NDArray[Any]:
     return image
 
 
-def _pixel_format(encoding: str) -> PixelFormat:
-    pixel = ENCODINGS.get(encoding) if isinstance(encoding, str) else None
+def _pixel_format(encoding: str, encodings: Mapping[str, PixelFormat]) -> PixelFormat:
+    pixel = encodings.get(encoding) if isinstance(encoding, str) else None
     if pixel is None:
         raise MessageError(
             f"an image with encoding {str(encoding)[:40]!r}",
-            expected="one of " + ", ".join(ENCODINGS),
+            expected="one of " + ", ".join(encodings),
             do="convert the stream, for example with image_proc, or change the driver's setting",
         )
     return pixel
@@ -192,7 +196,13 @@ def without_databar(image: NDArray[Any], databar_rows: int) -> NDArray[Any]:
     return image[: image.shape[0] - databar_rows]
 
 
-def fill_image(message: Any, image: NDArray[Any], encoding: str, header: HeaderMessage) -> None:
+def fill_image(
+    message: Any,
+    image: NDArray[Any],
+    encoding: str,
+    header: HeaderMessage,
+    encodings: Mapping[str, PixelFormat] = ENCODINGS,
+) -> None:
     """Set every field of an image message; the pixels are copied and rows are not padded.
 
     Parameters
@@ -202,20 +212,26 @@ def fill_image(message: Any, image: NDArray[Any], encoding: str, header: HeaderM
     image
         (height, width) or (height, width, 3) of exactly the type of ``encoding``.
     encoding
-        One of :data:`ENCODINGS`.
+        One of ``encodings``.
     header
         Copied verbatim.
+    encodings
+        What can be filled in.
 
     Raises
     ------
     InvalidValueError
         Shape or type of the image do not fit the encoding.
     """
-    np.copyto(pixel_memory(message, image, encoding, header), image)
+    np.copyto(pixel_memory(message, image, encoding, header, encodings), image)
 
 
 def pixel_memory(
-    message: Any, like: NDArray[Any], encoding: str, header: HeaderMessage
+    message: Any,
+    like: NDArray[Any],
+    encoding: str,
+    header: HeaderMessage,
+    encodings: Mapping[str, PixelFormat] = ENCODINGS,
 ) -> NDArray[Any]:
     """Set every field of an image message but the pixels, and return the memory for them.
 
@@ -226,7 +242,7 @@ def pixel_memory(
         returned for it before changes too.
     like
         Array of the shape and type that the image will have; those of ``encoding``.
-    encoding, header
+    encoding, header, encodings
         As for :func:`fill_image`.
 
     Returns
@@ -239,10 +255,10 @@ def pixel_memory(
     InvalidValueError
         As :func:`fill_image`.
     """
-    pixel = ENCODINGS.get(encoding)
+    pixel = encodings.get(encoding)
     if pixel is None:
         raise InvalidValueError(
-            f"image encoding {encoding!r}", expected="one of " + ", ".join(ENCODINGS)
+            f"image encoding {encoding!r}", expected="one of " + ", ".join(encodings)
         )
     dimensions_fit = like.ndim == 2 if pixel.channels == 1 else like.shape[2:] == (pixel.channels,)
     if not dimensions_fit or like.size == 0 or like.dtype.newbyteorder("=") != pixel.dtype:

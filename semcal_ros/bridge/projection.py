@@ -1,4 +1,9 @@
-"""std_msgs/msg/Float64MultiArray with the affine-safe projection matrix."""
+"""The affine-safe projection matrix of rectified images, as a message without and with a stamp.
+
+``projection`` is a std_msgs/msg/Float64MultiArray, which has no header. ``projection_stamped`` is a
+sensor_msgs/msg/Image of 3 rows and 4 columns in the encoding ``64FC1``: the one standard message that
+holds a matrix of any size and has a header, so that it pairs with its image by the stamp.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +12,27 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.bridge.fields import assign_floats, new_nested, whole_number
+from semcal_ros.bridge.headers import HeaderMessage
+from semcal_ros.bridge.images import PixelFormat, fill_image, image_from_message
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["fill_projection", "projection_from_message"]
+__all__ = [
+    "fill_projection",
+    "fill_stamped_projection",
+    "projection_from_message",
+    "stamped_projection_from_message",
+]
 
 _SHAPE = (("rows", 3), ("columns", 4))
+_STAMPED_ENCODING = "64FC1"
+_STAMPED_ENCODINGS = {_STAMPED_ENCODING: PixelFormat(np.dtype(np.float64), 1)}
 
 
 def fill_projection(message: Any, camera: ScanCamera) -> None:
-    """Set a 3 x 4 array, row by row: the undistorted homogeneous pixel of a homogeneous sem-frame
-    point in m.
+    """Set a 3 x 4 array, row by row: the homogeneous rectified pixel of a homogeneous sem-frame point
+    in m, ``camera.rectified.P_affine``.
 
     It is finite for every camera, parallel ones too, and its last row is ``[0 0 rho 1]``.
     """
@@ -37,7 +51,7 @@ def fill_projection(message: Any, camera: ScanCamera) -> None:
         stride //= size
     message.layout.dim = dimensions
     message.layout.data_offset = 0
-    assign_floats(message, "data", camera.P_affine)
+    assign_floats(message, "data", camera.rectified.P_affine)
 
 
 def projection_from_message(message: Any) -> Array:
@@ -62,3 +76,45 @@ def projection_from_message(message: Any) -> Array:
             expected="12 finite numbers, 3 rows of 4",
         )
     return values[offset:].reshape(3, 4)
+
+
+def fill_stamped_projection(
+    message: Any, camera: ScanCamera | None, header: HeaderMessage, width: int, height: int
+) -> None:
+    """Set an image message to the matrix of :func:`fill_projection`, with the header of an image.
+
+    Parameters
+    ----------
+    message
+        A sensor_msgs/msg/Image.
+    camera
+        The camera of the rectified image, in any size: it is resized to the image's. None, for an
+        image without a camera, gives a matrix of zeros, as K is in its camera_info.
+    header
+        Header of the image, copied verbatim.
+    width, height
+        Size of the rectified image, px.
+    """
+    matrix = np.zeros((3, 4))
+    if camera is not None:
+        matrix = camera.resized(width, height).rectified.P_affine
+    fill_image(message, matrix, _STAMPED_ENCODING, header, _STAMPED_ENCODINGS)
+
+
+def stamped_projection_from_message(message: Any) -> Array:
+    """Return the (3, 4) matrix of a message filled by :func:`fill_stamped_projection`.
+
+    It is zero for an image without a camera.
+
+    Raises
+    ------
+    MessageError
+        The message is not an image of 3 x 4 double-precision numbers, or they are not finite.
+    """
+    matrix = image_from_message(message, _STAMPED_ENCODINGS)
+    if matrix.shape != (3, 4) or not np.all(np.isfinite(matrix)):
+        raise MessageError(
+            f"a projection of {matrix.shape[0]} x {matrix.shape[1]} numbers",
+            expected=f"3 rows of 4 finite numbers in {_STAMPED_ENCODING}",
+        )
+    return np.array(matrix, dtype=np.float64)

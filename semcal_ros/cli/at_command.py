@@ -54,6 +54,12 @@ def _echo_camera(camera: dict[str, Any]) -> None:
     else:
         click.echo("K, P         parallel projection: no finite focal length")
     click.echo(_format_matrix("P_affine", camera["P_affine"]))
+    square = camera["rectified"]
+    focal = "" if square["K"] is None else f"f {square['K'][0][0]:.6g} px, "
+    click.echo(
+        f"image_rect   {1e9 * square['pixel_size_m']:.4f} nm per px along both axes, {focal}"
+        "principal point ({:.2f}, {:.2f}) px".format(*square["principal_point_px"])
+    )
     click.echo(f"xi_r         {value['xi_r']:.6g} +- {sigma['xi_r']:.2g}")
     click.echo(f"xi_t         {value['xi_t']:.6g} +- {sigma['xi_t']:.2g}")
     click.echo(

@@ -43,7 +43,7 @@ def command(
     frame_time: float | None,
     overwrite: bool,
 ) -> None:
-    """Drift-free, undistorted copy of RECORDING with camera_info and projection per frame.
+    """Drift-free, undistorted copy of RECORDING in square pixels, with camera_info and projection per frame.
 
     \b
     Example:

@@ -65,6 +65,7 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
         ("drift", "geometry_msgs/msg/PoseWithCovarianceStamped", "drift", True),
         ("drift_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", "drift rate", True),
         ("projection", "std_msgs/msg/Float64MultiArray", "projection", True),
+        ("projection_stamped", _IMAGE, "projection of each image", True),
         ("calibration", "std_msgs/msg/String", "calibration", False),
     )
     return (

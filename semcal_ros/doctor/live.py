@@ -107,6 +107,7 @@ class _Observer:
             f"{namespace}/calibration": self._take_calibration,
             f"{namespace}/image_rect": lambda _message: None,
             f"{namespace}/image_stabilized": lambda _message: None,
+            f"{namespace}/projection_stamped": lambda _message: None,
         }
         self._classes = {t.name: message_class(t.type) for t in topics if t.name in self._takes}
         self._subscribed: set[str] = set()

@@ -1,4 +1,4 @@
-"""Executable ``rectifier``: publishes the stream without distortion, with the camera of each frame."""
+"""Executable ``rectifier``: publishes the stream without distortion, in square pixels, with each frame's camera."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INPUT = ParameterDeclaration(
 
 
 class RectifierNode(CalibratedStreamNode):
-    """Publishes ``image_rect`` and ``camera_info``."""
+    """Publishes ``image_rect``, ``camera_info`` and ``projection_stamped``."""
 
     def __init__(self) -> None:
         super().__init__("rectifier", (_INPUT,))

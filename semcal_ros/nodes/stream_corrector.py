@@ -14,7 +14,7 @@ __all__ = ["StreamCorrector", "main"]
 
 
 class StreamCorrector(CalibratedStreamNode):
-    """Publishes ``image_rect``, ``camera_info``, ``drift`` and ``drift_velocity``.
+    """Publishes ``image_rect``, ``camera_info``, ``projection_stamped``, ``drift`` and ``drift_velocity``.
 
     Without a calibration the drift is still removed, on the scale of the display width.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
-from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_camera import RectifiedCamera, ScanCamera
 
 __all__ = ["describe_camera", "parameter_sigma"]
 
@@ -44,9 +44,23 @@ def describe_camera(calibration: Calibration, magnification: float) -> dict[str,
         "K": camera.K.tolist() if perspective else None,
         "P": camera.P.tolist() if perspective else None,
         "P_affine": camera.P_affine.tolist(),
+        "rectified": _describe_rectified(camera.rectified),
         "distortion": {"xi_r": camera.xi_r, "xi_t": camera.xi_t, "norm_px": camera.norm_px},
         "distortion_centre_px": [camera.ex, camera.ey],
         "parameters": dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True)),
         "parameter_sigma": parameter_sigma(camera),
         "projection_sigma_px": continuous_value("sigma", camera),
+    }
+
+
+def _describe_rectified(camera: RectifiedCamera) -> dict[str, Any]:
+    """Return the camera of ``image_rect``, whose pixels are square."""
+    perspective = camera.rho > 0.0
+    return {
+        "pixel_size_m": camera.pixel_size_m[0],
+        "pixel_size_sigma_m": list(camera.pixel_size_sigma_m),
+        "principal_point_px": [camera.px, camera.py],
+        "K": camera.K.tolist() if perspective else None,
+        "P": camera.P.tolist() if perspective else None,
+        "P_affine": camera.P_affine.tolist(),
     }

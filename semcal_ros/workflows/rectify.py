@@ -1,4 +1,4 @@
-"""The drift-free, undistorted copy of a recording."""
+"""The drift-free, rectified copy of a recording."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = ["RectifiedFrame", "RectifiedRecording", "rectify"]
 
 @dataclass(frozen=True, eq=False)
 class RectifiedFrame:
-    """One frame without distortion and drift.
+    """One frame in square pixels, without distortion and drift.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class RectifiedFrame:
     stamp_ns
         Header stamp, ns since 1970.
     camera
-        Camera of its magnification, for images of the calibration's size.
+        Camera of the image: the ``rectified`` one of its magnification, of the image's size.
     drift
         The drift that was removed; None where it was left in.
     """
@@ -117,7 +117,7 @@ def rectify(
     source
         A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
     output
-        Bag to make, with camera_info and projection of each frame; without it, the frames are
+        Bag to make, with camera_info and projection_stamped of each frame; without it, the frames are
         returned, which takes the memory of all of them.
     calibration
         A calibration or its file.
@@ -178,7 +178,7 @@ def rectify(
                 frame.image, camera, None if update is None else update.raster, microscope.scan
             )
             if bag is None:
-                frames.append(RectifiedFrame(image, frame.stamp_ns, camera, update))
+                frames.append(RectifiedFrame(image, frame.stamp_ns, camera.rectified, update))
             else:
                 bag.write(frame, image, camera, update)
             count += 1

@@ -47,7 +47,7 @@ class StackResult:
     image
         Mean, standard error, and number of frames in each pixel.
     camera
-        Camera of the first frame, whose coordinates the average has; nominal without a calibration.
+        Camera of the average: the ``rectified`` one of the first frame; nominal without a calibration.
     dtype
         Type of the grey levels of the recording.
     stamps_ns
@@ -90,7 +90,7 @@ class StackResult:
         return float(np.median(error[known])) if known.any() else None
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the mean: ``.tif`` (32-bit, with the pixel size) or ``.png`` (as deep as the
+        """Write the mean: ``.tif`` (32-bit, with the size of its square pixels) or ``.png`` (as deep as the
         recording).
 
         Raises
@@ -200,7 +200,7 @@ def stack(
         notes = (*notes, selection.timing_note)
     result = StackResult(
         summed.result(),
-        selection.camera,
+        selection.camera.rectified,
         selection.dtype,
         selection.stamps_ns,
         used,

@@ -189,7 +189,7 @@ def test_the_pixel_size_is_in_the_tiff(gold, tmp_path, capsys):
         per_um = [np.divide(*tags[name].value) for name in ("XResolution", "YResolution")]
         assert file.pages[0].dtype == np.float32 and file.pages[0].shape == (SIZE, SIZE)
     # The 96 px of the calibration and the 160 px of the frames show the same field.
-    expected = 1e6 * np.array(model.at(G).pixel_size_m) * 96 / SIZE
+    expected = 1e6 * np.array(model.at(G).rectified.pixel_size_m) * 96 / SIZE
     np.testing.assert_allclose(1 / np.array(per_um), expected, rtol=1e-6)
 
 

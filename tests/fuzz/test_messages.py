@@ -28,7 +28,12 @@ from semcal_ros.bridge.images import (
     without_databar,
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
-from semcal_ros.bridge.projection import fill_projection, projection_from_message
+from semcal_ros.bridge.projection import (
+    fill_projection,
+    fill_stamped_projection,
+    projection_from_message,
+    stamped_projection_from_message,
+)
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
@@ -359,12 +364,16 @@ def _cameras(draw: st.DrawFn) -> ScanCamera:
 def test_cameras(camera: ScanCamera | None, width: int, height: int) -> None:
     info = blank_message("sensor_msgs/msg/CameraInfo")
     projection = blank_message("std_msgs/msg/Float64MultiArray")
+    stamped = blank_message("sensor_msgs/msg/Image")
 
     def fill() -> bool:
         fill_camera_info(info, camera, _stamped(), width, height)
         if camera is not None:
             fill_projection(projection, camera)
-            np.testing.assert_array_equal(projection_from_message(projection), camera.P_affine)
+            expected = camera.rectified.P_affine
+            np.testing.assert_array_equal(projection_from_message(projection), expected)
+        fill_stamped_projection(stamped, camera, _stamped(), width, height)
+        assert stamped_projection_from_message(stamped).shape == (3, 4)
         return True
 
     if attempt(fill):
@@ -444,3 +453,23 @@ def test_what_a_damaged_message_holds(case: tuple[str, bytes]) -> None:
         return True
 
     attempt(read)
+
+
+def _stored_projection() -> bytes:
+    message = blank_message("sensor_msgs/msg/Image")
+    camera = ScanCamera.nominal(1000.0, 512, 512, 0.12)
+    fill_stamped_projection(message, camera, _stamped(), 512, 512)
+    return bytes(serialize_message(message))
+
+
+@fuzz()
+@given(data=damaged([_stored_projection()]))
+def test_a_damaged_stamped_projection(data: bytes) -> None:
+    try:
+        message = jazzy_types().deserialize_cdr(data, "sensor_msgs/msg/Image")
+    except Exception:  # as above
+        return
+    matrix = attempt(lambda: stamped_projection_from_message(message))
+    if matrix is not None:
+        assert matrix.shape == (3, 4)
+        assert np.all(np.isfinite(matrix))

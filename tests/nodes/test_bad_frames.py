@@ -280,7 +280,7 @@ def test_the_parameter_server_survives_absurd_magnifications(peer: Peer, tmp_pat
         assert projections == []
         value.publish(magnification_message(3000.0))
         peer.wait_for(lambda: projections, "the projection")
-        expected = CALIBRATION.at(3000.0).P_affine
+        expected = CALIBRATION.at(3000.0).rectified.P_affine
         np.testing.assert_allclose(np.reshape(projections[-1].data, (3, 4)), expected, rtol=1e-12)
         before = resident_kib(process.process.pid)
         for index in range(600):
@@ -288,7 +288,7 @@ def test_the_parameter_server_survives_absurd_magnifications(peer: Peer, tmp_pat
             if index % 50 == 0:
                 peer.spin(0.02)
         value.publish(magnification_message(4000.0))
-        final = CALIBRATION.at(4000.0).P_affine.ravel()
+        final = CALIBRATION.at(4000.0).rectified.P_affine.ravel()
         peer.wait_for(lambda: np.allclose(projections[-1].data, final, rtol=1e-12), "the last one")
         assert resident_kib(process.process.pid) - before < 6 * 1024
         assert process.process.poll() is None

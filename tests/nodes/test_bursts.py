@@ -215,7 +215,7 @@ def test_ten_times_too_many_magnifications(peer: Peer, calibration_file: Path) -
         bench.set_magnification(MAGNIFICATION)
         message = bench.exchange(texture(1))
         np.testing.assert_array_equal(pixels(message), RECTIFIER.right(texture(1), MAGNIFICATION))
-        final = CALIBRATION.at(MAGNIFICATION).P_affine.ravel()
+        final = CALIBRATION.at(MAGNIFICATION).rectified.P_affine.ravel()
         peer.wait_for(lambda: np.allclose(projections[-1].data, final, rtol=1e-12), "the last one")
         assert bench.resident_kib() - before_kib[0] < 8 * 1024
         assert resident_kib(process.process.pid) - before_kib[1] < 8 * 1024

@@ -42,4 +42,6 @@ def test_a_stabilized_frame_is_rectified_at_its_own_magnification(tmp_path: Path
     peer.close()
     assert [stamp_of(m) for m in infos] == [stamp_of(m) for m in images]
     for info, g in zip(infos, MAGNIFICATIONS, strict=True):
-        np.testing.assert_allclose(np.reshape(info.k, (3, 3)), CALIBRATION.at(g).K, rtol=1e-12)
+        np.testing.assert_allclose(
+            np.reshape(info.k, (3, 3)), CALIBRATION.at(g).rectified.K, rtol=1e-12
+        )

@@ -140,7 +140,7 @@ def test_frames_of_another_size_get_the_scaled_model(bench: Bench) -> None:
     bench.send(image_message(small))
     bench.peer.wait_for(lambda: bench.images and bench.infos, "the small frame")
     camera = CALIBRATION.at(3000.0).resized(SIZE // 2, SIZE // 2)
-    np.testing.assert_allclose(np.reshape(bench.infos[0].k, (3, 3)), camera.K, rtol=1e-12)
+    np.testing.assert_allclose(np.reshape(bench.infos[0].k, (3, 3)), camera.rectified.K, rtol=1e-12)
     assert (bench.infos[0].width, bench.infos[0].height) == (SIZE // 2, SIZE // 2)
 
 
@@ -170,7 +170,7 @@ def test_a_corrupt_calibration_on_the_topic_leaves_the_old_one_in_force(bench: B
     bench.send(image_message(texture()))
     bench.peer.wait_for(lambda: bench.infos, "the frame")
     np.testing.assert_allclose(
-        np.reshape(bench.infos[0].k, (3, 3)), CALIBRATION.at(1000.0).K, rtol=1e-12
+        np.reshape(bench.infos[0].k, (3, 3)), CALIBRATION.at(1000.0).rectified.K, rtol=1e-12
     )
 
 
@@ -271,7 +271,9 @@ def test_a_microscope_that_publishes_its_pixel_size_in_another_message(
             publisher.publish(image_message(texture(), stamp_s=count + 0.5))
             peer.wait_for(lambda n=count: min(len(images), len(infos)) == n, f"{size_nm} nm")
             camera = CALIBRATION.at(0.12 / (SIZE * size_nm * 1e-9))
-            np.testing.assert_allclose(np.reshape(infos[-1].k, (3, 3)), camera.K, rtol=1e-9)
+            np.testing.assert_allclose(
+                np.reshape(infos[-1].k, (3, 3)), camera.rectified.K, rtol=1e-9
+            )
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def _check_after_restart(bench: Bench, stream: Stream, killed_at_s: int) -> None
         if bench.kind.rectifies:
             camera = CALIBRATION.at(MAGNIFICATION)
             received = np.reshape(infos[stamp_of(message)].k, (3, 3))
-            np.testing.assert_allclose(received, camera.K, rtol=1e-12)
+            np.testing.assert_allclose(received, camera.rectified.K, rtol=1e-12)
     assert calibrated >= 3
 
 
@@ -187,9 +187,9 @@ def test_a_killed_parameter_server_comes_back_with_camera_and_parameters(
         peer.wait_for(lambda: all(received), "all of them again")
         assert Calibration.loads(texts[-1].data).dumps() == CALIBRATION.dumps()
         camera = CALIBRATION.at(MAGNIFICATION)
-        np.testing.assert_allclose(np.reshape(infos[-1].k, (3, 3)), camera.K, rtol=1e-12)
+        np.testing.assert_allclose(np.reshape(infos[-1].k, (3, 3)), camera.rectified.K, rtol=1e-12)
         np.testing.assert_allclose(
-            np.reshape(projections[-1].data, (3, 4)), camera.P_affine, rtol=1e-12
+            np.reshape(projections[-1].data, (3, 4)), camera.rectified.P_affine, rtol=1e-12
         )
         (answer,) = peer.get_parameters(SERVER, f"p@{MAGNIFICATION:g}")
         np.testing.assert_allclose(answer.double_array_value, camera.P.ravel(), rtol=1e-12)
@@ -238,7 +238,7 @@ def test_a_newer_calibration_outlives_the_parameter_server(
         stream = Stream(bench)
         stream.until(lambda: bench.infos, "a frame")
         newer.publish(String(data=OTHER.dumps()))
-        expected = OTHER.at(MAGNIFICATION).K
+        expected = OTHER.at(MAGNIFICATION).rectified.K
 
         def is_newer(message: Any) -> bool:
             return bool(np.allclose(np.reshape(message.k, (3, 3)), expected, rtol=1e-12))
@@ -278,7 +278,7 @@ def test_a_calibration_outlives_the_node_that_made_it(peer: Peer) -> None:
         stream = Stream(bench)
         stream.until(lambda: bench.infos and any(bench.infos[-1].k), "a calibrated frame")
         received = np.reshape(bench.infos[-1].k, (3, 3))
-        np.testing.assert_allclose(received, OTHER.at(MAGNIFICATION).K, rtol=1e-12)
+        np.testing.assert_allclose(received, OTHER.at(MAGNIFICATION).rectified.K, rtol=1e-12)
 
 
 def test_a_broken_calibration_that_somebody_keeps_does_not_hide_the_good_one(
@@ -303,4 +303,4 @@ def test_a_broken_calibration_that_somebody_keeps_does_not_hide_the_good_one(
         stream = Stream(bench)
         stream.until(lambda: bench.infos, "a frame")
         received = np.reshape(bench.infos[-1].k, (3, 3))
-        np.testing.assert_allclose(received, CALIBRATION.at(MAGNIFICATION).K, rtol=1e-12)
+        np.testing.assert_allclose(received, CALIBRATION.at(MAGNIFICATION).rectified.K, rtol=1e-12)

@@ -65,7 +65,7 @@ def test_a_killed_microscope_comes_back_and_nothing_of_it_is_mixed_up(
         def shown() -> float:
             return float(infos[-1].k[0]) if infos else 0.0
 
-        at = {g: CALIBRATION.at(g).K[0, 0] for g in (1000.0, 4000.0)}
+        at = {g: CALIBRATION.at(g).rectified.K[0, 0] for g in (1000.0, 4000.0)}
         peer.wait_for(lambda: np.isclose(shown(), at[1000.0], rtol=1e-12), "frames at 1000x")
         sem.kill()
         # Published by then at the latest; a frame is stamped when its scan begins.
@@ -175,7 +175,7 @@ def test_a_killed_compensator_does_not_confuse_the_rectifier_behind_it(
     for message in others:
         right = RECTIFIER.right(stream.sent[message.header.stamp.sec], MAGNIFICATION)
         assert difference(pixels(message), right) < 2.0 * NOISE
-    expected = CALIBRATION.at(MAGNIFICATION).K
+    expected = CALIBRATION.at(MAGNIFICATION).rectified.K
     for message in stream.since(bench.infos, killed_at_s):
         np.testing.assert_allclose(np.reshape(message.k, (3, 3)), expected, rtol=1e-12)
 

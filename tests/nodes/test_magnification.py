@@ -95,10 +95,10 @@ def test_a_magnification_that_changes_during_a_scan(
     for info in infos:
         by_stamp.setdefault(stamp_of(info), []).append(k_of(info))
     assert before == spoilt
-    expected = [CALIBRATION.at(2000.0).K] + [np.zeros((3, 3))] * (policy == "flag")
+    expected = [CALIBRATION.at(2000.0).rectified.K] + [np.zeros((3, 3))] * (policy == "flag")
     np.testing.assert_allclose(by_stamp[before], expected, rtol=1e-12)
     # The first frame after the change is the new magnification's.
-    np.testing.assert_allclose(by_stamp[after], [CALIBRATION.at(4000.0).K], rtol=1e-12)
+    np.testing.assert_allclose(by_stamp[after], [CALIBRATION.at(4000.0).rectified.K], rtol=1e-12)
     assert len(images) == len(infos)
 
 
@@ -128,6 +128,6 @@ def test_stamps_decide_where_there_are_any(peer: Peer, files: Path) -> None:
                 )
                 continue
             peer.wait_for(lambda s=stamp_s: infos and stamp_of(infos[-1]) == (s, 0), "a frame")
-            np.testing.assert_allclose(k_of(infos[-1]), CALIBRATION.at(g).K, rtol=1e-12)
+            np.testing.assert_allclose(k_of(infos[-1]), CALIBRATION.at(g).rectified.K, rtol=1e-12)
         assert [stamp_of(info)[0] for info in infos] == [8, 12, 18, 20]
         peer.wait_for(lambda: peer.state("/sem/rectifier")["frames_mixed"] == "2", "the count")

@@ -90,9 +90,11 @@ def test_images_and_camera_infos_pair_one_to_one(replay: Replay) -> None:
 def test_camera_info_is_that_of_the_frames_own_magnification(replay: Replay) -> None:
     for info, g in zip(replay.infos, MAGNIFICATIONS, strict=True):
         camera = CALIBRATION.at(g)
-        np.testing.assert_allclose(np.reshape(info.k, (3, 3)), camera.K, rtol=1e-12)
+        np.testing.assert_allclose(np.reshape(info.k, (3, 3)), camera.rectified.K, rtol=1e-12)
         np.testing.assert_allclose(
-            np.reshape(info.p, (3, 4)), np.hstack([camera.K, np.zeros((3, 1))]), rtol=1e-12
+            np.reshape(info.p, (3, 4)),
+            np.hstack([camera.rectified.K, np.zeros((3, 1))]),
+            rtol=1e-12,
         )
         assert (info.distortion_model, list(info.d)) == ("plumb_bob", [0.0] * 5)
         assert list(info.r) == list(np.eye(3).ravel())
@@ -112,7 +114,7 @@ def test_every_change_of_magnification_gives_a_projection(replay: Replay) -> Non
     assert len(replay.projections) == len(MAGNIFICATIONS)
     for message, g in zip(replay.projections, MAGNIFICATIONS, strict=True):
         np.testing.assert_allclose(
-            np.reshape(message.data, (3, 4)), CALIBRATION.at(g).P_affine, rtol=1e-12
+            np.reshape(message.data, (3, 4)), CALIBRATION.at(g).rectified.P_affine, rtol=1e-12
         )
         assert [(d.label, d.size) for d in message.layout.dim] == [("rows", 3), ("columns", 4)]
 
@@ -124,7 +126,7 @@ def test_the_server_publishes_the_text_of_the_file(replay: Replay) -> None:
 def test_projection_is_kept_for_those_who_come_later(replay: Replay) -> None:
     late = replay.peer.collect(Float64MultiArray, "projection", LATCHED)
     replay.peer.wait_for(lambda: late, "the latched projection")
-    expected = CALIBRATION.at(MAGNIFICATIONS[-1]).P_affine
+    expected = CALIBRATION.at(MAGNIFICATIONS[-1]).rectified.P_affine
     np.testing.assert_allclose(np.reshape(late[0].data, (3, 4)), expected, rtol=1e-12)
 
 
@@ -290,7 +292,7 @@ def test_stream_corrector_corrects_every_frame(replay: Replay, tmp_path: Path) -
     peer.close()
     assert [stamp_of(m) for m in images] == [stamp_of(m) for m in infos]
     assert [stamp_of(m) for m in images] == [stamp_of(m) for m in drifts]
-    assert infos[0].k[0] == pytest.approx(CALIBRATION.at(1500.0).K[0, 0])
+    assert infos[0].k[0] == pytest.approx(CALIBRATION.at(1500.0).rectified.K[0, 0])
     # A new keyframe is where drift is zero by definition, exactly.
     first = drifts[0].pose.pose.position
     assert (first.x, first.y) == (0.0, 0.0)

@@ -134,7 +134,11 @@ def _of_image(stream: Stream, message: Any) -> str:
 
 def _of_info(message: Any) -> str:
     matrix = np.reshape(message.k, (3, 3))
-    matches = [n for n, c in {"A": A, "B": B}.items() if np.allclose(matrix, c.at(MAGNIFICATION).K)]
+    matches = [
+        n
+        for n, c in {"A": A, "B": B}.items()
+        if np.allclose(matrix, c.at(MAGNIFICATION).rectified.K)
+    ]
     assert len(matches) == 1
     return matches[0]
 

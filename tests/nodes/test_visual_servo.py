@@ -18,7 +18,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift
-from semcal_ros.bridge.projection import fill_projection
+from semcal_ros.bridge.projection import fill_projection, fill_stamped_projection
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -53,6 +53,8 @@ class Microscope:
         self.infos = make(CameraInfo, "camera_info", RELIABLE)
         self.drifts = make(PoseWithCovarianceStamped, "drift", RELIABLE)
         self.projections = make(Float64MultiArray, "projection", LATCHED)
+        self.matrices = make(Image, "projection_stamped", RELIABLE)
+        self.with_stamped = False
         self.knob = make(Float64, "magnification", LATCHED)
         self.twists = peer.collect(Twist, "virtual_sem/stage")
         self.errors = peer.collect(PoseWithCovarianceStamped, "visual_servo/error")
@@ -73,6 +75,10 @@ class Microscope:
         info, drift = CameraInfo(), PoseWithCovarianceStamped()
         fill_camera_info(info, self.camera, image.header, SIZE, SIZE)
         fill_drift(drift, self.drift_m, np.eye(2) * 1e-18, image.header)
+        if self.with_stamped:
+            matrix = Image()
+            fill_stamped_projection(matrix, self.camera, image.header, SIZE, SIZE)
+            self.matrices.publish(matrix)
         # The order of arrival is not that of the pairs.
         self.drifts.publish(drift)
         self.images.publish(image)
@@ -138,6 +144,21 @@ def test_it_waits_for_the_start_and_stops_without_frames_and_when_asked(peer: Pe
         count = len(microscope.errors)
         microscope.frames_until(lambda: len(microscope.errors) > count + 1, "measurements")
         assert _stands(microscope)
+
+
+def test_the_stamped_projection_of_a_frame_is_enough(peer: Peer) -> None:
+    """No parameter_server, and a parallel camera besides, which has no K to search by."""
+    microscope = Microscope(peer)
+    microscope.with_stamped = True
+    with running("visual_servo", NEVER_FAST):
+        peer.wait_heard(SERVO, "virtual_sem/stage", "~/error")
+        inputs = (microscope.images, microscope.infos, microscope.drifts, microscope.matrices)
+        peer.wait_for(lambda: all(p.get_subscription_count() for p in inputs), "the node")
+        microscope.frames_until(lambda: _moves(microscope), "a command")
+        microscope.camera = None
+        microscope.frames_until(lambda: _stands(microscope), "the stop without a camera")
+        microscope.camera = replace(SCOPE.camera_at(G), rho=0.0)
+        microscope.frames_until(lambda: _moves(microscope), "a command by a parallel camera")
 
 
 def test_a_lost_target_a_missing_camera_and_a_turned_knob_stop_it(peer: Peer) -> None:

@@ -11,8 +11,10 @@ import tifffile
 
 import semcal_ros
 from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stack, track_drift
+from semcal_ros.bridge.projection import stamped_projection_from_message
 from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.synthetic.specimens.cantilever import cantilever_plan
@@ -163,6 +165,23 @@ def test_rectified_frames_in_memory_are_those_of_the_bag(frames, tmp_path):
     np.testing.assert_array_equal(images, done.images)
 
 
+def test_each_rectified_frame_in_a_bag_has_its_projection(frames, tmp_path):
+    calibration = make_calibration()
+    folder = tmp_path / "bag"
+    rectify(frames, folder, calibration=calibration, config="virtual_sem", drift=False)
+    flat = rectify(frames, calibration=calibration, config="virtual_sem", drift=False).frames
+    seen = {"image_rect": [], "camera_info": [], "projection_stamped": []}
+    with open_bag(folder) as bag:
+        for message in bag.messages([f"/sem/{name}" for name in seen]):
+            seen[message.topic.rpartition("/")[2]].append(message.message)
+    for image, info, matrix, frame in zip(*seen.values(), flat, strict=True):
+        assert matrix.header == image.header == info.header
+        p_g = stamped_projection_from_message(matrix)
+        np.testing.assert_allclose(p_g, frame.camera.P_affine, rtol=1e-12)
+        np.testing.assert_allclose(p_g[:, :3], frame.camera.rho * info.k.reshape(3, 3))
+        assert frame.camera.pixel_size_m[0] == frame.camera.pixel_size_m[1]
+
+
 def test_without_drift_only_distortion_is_undone(frames):
     calibration = make_calibration()
     done = rectify(frames[:2], calibration=calibration, drift=False)
@@ -176,7 +195,7 @@ def test_the_pixel_size_is_that_of_the_calibration(frames, tmp_path):
     calibration.save(tmp_path / "cal.yaml")
     for given in (calibration, tmp_path / "cal.yaml", str(tmp_path / "cal.yaml")):
         result = stack(frames, calibration=given, drift=False)
-        assert result.camera.pixel_size_m == calibration.at(G).pixel_size_m
+        assert result.camera.pixel_size_m == calibration.at(G).rectified.pixel_size_m
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ class Servo:
         Parameters
         ----------
         view
-            Markers in ideal pixels.
+            Markers in rectified pixels.
         camera
             Camera of this frame.
         time_s

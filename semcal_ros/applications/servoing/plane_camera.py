@@ -22,12 +22,12 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlaneCamera:
-    """Homography from the plane at one height of the sem frame to ideal pixels.
+    """Homography from the plane at one height of the sem frame to the pixels of ``image_rect``.
 
     Parameters
     ----------
     matrix
-        (3, 3), homogeneous ideal pixel of (X, Y, 1) in m.
+        (3, 3), homogeneous rectified pixel of (X, Y, 1) in m.
 
     Raises
     ------
@@ -59,18 +59,18 @@ class PlaneCamera:
 
     @classmethod
     def from_camera(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
-        """Create from a camera, in ideal pixels."""
-        return cls.from_projection(camera.P_affine, height_m)
+        """Create from a camera, for images that were rectified with it."""
+        return cls.from_projection(camera.rectified.P_affine, height_m)
 
     def project(self, xy_m: ArrayLike) -> Array:
-        """Project points (n, 2) of the plane, m, to ideal pixels (n, 2)."""
+        """Project points (n, 2) of the plane, m, to rectified pixels (n, 2)."""
         points = as_points(xy_m, 2)
         image = np.column_stack([points, np.ones(len(points))]) @ self.matrix.T
         pixels: Array = image[:, :2] / image[:, 2:]
         return pixels
 
     def plane_from_px(self, xy: ArrayLike) -> Array:
-        """Return the points (n, 2) of the plane, m, that are seen at ideal pixels (n, 2)."""
+        """Return the points (n, 2) of the plane, m, that are seen at rectified pixels (n, 2)."""
         pixels = as_points(xy, 2)
         rays = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
         points: Array = rays[:, :2] / rays[:, 2:]
@@ -93,10 +93,10 @@ class PlaneCamera:
 
 
 def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
-    """Choose the P_g (3, 4) of a frame, given its K, among those published recently.
+    """Choose the P_g (3, 4) of a frame, given its K, among those that may be its own.
 
     K belongs to the frame, by its stamp, but holds only f = m / rho: without the distance 1 / rho
-    of the pivot it has no metric scale. The published P_g has both but no stamp. For one camera its
+    of the pivot it has no metric scale. P_g has both, but not always a stamp. For one camera its
     first three columns are rho K, which identifies the P_g of the frame.
 
     A parallel projection (rho = 0) has no K, and neither has a frame without calibration. The

@@ -118,7 +118,7 @@ def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
     Parameters
     ----------
     view
-        Markers in ideal pixels.
+        Markers in rectified pixels.
     camera
         Camera of this image.
     """
@@ -226,7 +226,7 @@ def compute_interaction_of_points(camera: PlaneCamera, xy_m: Array, centre_m: Ar
 
 
 def compute_interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: ArrayLike) -> Array:
-    """Compute the derivative of ideal pixels with respect to the stage velocity in the sem frame.
+    """Compute the derivative of rectified pixels with respect to the stage velocity in the sem frame.
 
     P_g of the frame is known, and with it the depth 1 / rho of the stage plane, so a pixel has one
     position in the plane. No depth has to be estimated, as it has for other cameras (Chaumette and
@@ -237,7 +237,7 @@ def compute_interaction_matrix(camera: PlaneCamera, xy: ArrayLike, centre_m: Arr
     camera
         Camera of the frame.
     xy
-        (n, 2) ideal pixels of points that the stage carries.
+        (n, 2) rectified pixels of points that the stage carries.
     centre_m
         (2,) where the axis of rotation meets the plane, m.
 

@@ -9,7 +9,7 @@ from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.bridge.projection import fill_projection
+from semcal_ros.bridge.projection import fill_projection, fill_stamped_projection
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
@@ -26,13 +26,14 @@ _TOPICS = {
     "drift": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "drift_velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
     "projection": "std_msgs/msg/Float64MultiArray",
+    "projection_stamped": "sensor_msgs/msg/Image",
     "calibration": "std_msgs/msg/String",
 }
 _LATCHED = ("projection", "calibration")
 
 
 class CorrectedBagWriter:
-    """Writes what ``stream_corrector`` would publish.
+    """Writes what ``stream_corrector`` and ``parameter_server`` would publish.
 
     Parameters
     ----------
@@ -77,6 +78,9 @@ class CorrectedBagWriter:
         info = blank_message(_TOPICS["camera_info"])
         fill_camera_info(info, camera, header, image.shape[1], image.shape[0])
         self._write("camera_info", when, info)
+        matrix = blank_message(_TOPICS["projection_stamped"])
+        fill_stamped_projection(matrix, camera, header, image.shape[1], image.shape[0])
+        self._write("projection_stamped", when, matrix)
         if update is not None:
             drift = blank_message(_TOPICS["drift"])
             fill_drift(drift, update.drift_m, update.covariance, header)

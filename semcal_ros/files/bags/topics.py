@@ -70,6 +70,8 @@ def find_topic(
     )
 
 
+# An Image that is a matrix, and no picture (doc/nodes.md).
+_MATRIX = "projection_stamped"
 # What image_transport appends to the name of a topic for its compressed images.
 _SUFFIX = "/compressed"
 
@@ -77,7 +79,7 @@ _SUFFIX = "/compressed"
 def find_image_topic(
     path: Path, topics: Sequence[BagTopic], image: ImageConfig
 ) -> tuple[BagTopic, list[str]]:
-    """Find the topic of images to read; also return notes.
+    """Find the topic of images to read; also return notes. ``projection_stamped`` is not one unless it is configured.
 
     A recorder often takes only one of ``image_raw`` and ``image_raw/compressed``, which show the same; if that is not
     the configured one, the other is read, with a note.
@@ -87,6 +89,8 @@ def find_image_topic(
     BagError
         As :func:`~semcal_ros.files.bags.topics.find_topic`.
     """
+    if not topic_matches(_MATRIX, image.topic):
+        topics = [topic for topic in topics if not topic_matches(_MATRIX, topic.name)]
     wanted, type_name = _source(image, [topic for topic in topics if topic.count])
     found, note = find_topic(path, topics, what="image", wanted=wanted, type_name=type_name)
     notes = [note] if note else []

@@ -17,7 +17,7 @@ __all__ = ["CalibratedStreamNode"]
 
 
 class CalibratedStreamNode(StreamNode):
-    """A stream node with a calibration, a rectifier, and the outputs ``image_rect`` and ``camera_info``."""
+    """A stream node with a calibration, a rectifier, and the outputs of :class:`RectifiedOutput`."""
 
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(

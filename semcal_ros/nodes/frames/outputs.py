@@ -13,6 +13,7 @@ from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
+from semcal_ros.bridge.projection import fill_stamped_projection
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import Parameters
@@ -56,13 +57,14 @@ class ImageOutput:
 
 
 class RectifiedOutput:
-    """Publishes ``image_rect`` and ``camera_info`` in pairs."""
+    """Publishes ``image_rect`` with ``camera_info`` and ``projection_stamped``, which have its header."""
 
     def __init__(self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter) -> None:
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
         self._info = endpoints.stream_publisher(CameraInfo, "camera_info")
-        self._message = CameraInfo()
-        # What the message describes, apart from its header.
+        self._projection = endpoints.stream_publisher(Image, "projection_stamped")
+        self._messages = CameraInfo(), Image()
+        # What the messages describe, apart from their headers.
         self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
@@ -75,18 +77,21 @@ class RectifiedOutput:
 
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""
-        # The camera_info first: a subscriber that has the image can then use it at once.
-        if self._info.get_subscription_count():
-            self._describe(camera, frame)
-            self._info.publish(self._message)
+        # The camera first: a subscriber that has the image can then use it at once.
+        for publisher, message in zip((self._info, self._projection), self._messages, strict=True):
+            if publisher.get_subscription_count():
+                self._describe(camera, frame)
+                copy_header(message.header, frame.header)
+                publisher.publish(message)
         self._image.publish(frame)
 
     def _describe(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         known = self._described
         if known is None or known[0] is not camera or known[1] != frame.size:
-            fill_camera_info(self._message, camera, frame.header, *frame.size)
+            info, projection = self._messages
+            fill_camera_info(info, camera, frame.header, *frame.size)
+            fill_stamped_projection(projection, camera, frame.header, *frame.size)
             self._described = camera, frame.size
-        copy_header(self._message.header, frame.header)
 
 
 class DriftOutput:

@@ -16,7 +16,10 @@ from std_msgs.msg import Float64MultiArray
 
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
-from semcal_ros.bridge.projection import projection_from_message
+from semcal_ros.bridge.projection import (
+    projection_from_message,
+    stamped_projection_from_message,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
@@ -43,7 +46,7 @@ class ServoFrame:
     drift_m
         (2,) drift that was removed from the image, m.
     projections
-        (3, 4) latest P_g, the oldest first.
+        (3, 4) P_g with the frame's own stamp; without one, the latest of all, the oldest first.
     header, stamp_ns
         Its header.
     """
@@ -57,9 +60,10 @@ class ServoFrame:
 
 
 class ServoInput:
-    """Subscribes to ``image_rect``, ``camera_info``, ``drift`` and ``projection``; pairs the first three by stamp.
+    """Subscribes to ``image_rect``, ``camera_info``, ``drift``, ``projection_stamped`` and ``projection``.
 
-    The newest complete frame counts; older ones are dropped.
+    All but the last are paired by stamp. The newest complete frame counts; older ones are dropped. A frame is complete
+    without its ``projection_stamped``, which bags of earlier versions do not have.
 
     Parameters
     ----------
@@ -87,9 +91,13 @@ class ServoInput:
         self._on_error = on_error
         self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
         self._projections: deque[Array] = deque(maxlen=_PROJECTIONS)
+        self._stamped: dict[int, Array] = {}
         self._draining = False
         endpoints.subscribe(Float64MultiArray, "projection", self._on_projection, value_input())
         self._inputs = [
+            endpoints.subscribe(
+                Image, "projection_stamped", self._on_stamped_projection, stream_output()
+            ),
             endpoints.subscribe(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
             endpoints.subscribe(Image, "image_rect", self._keeps("image"), image_input()),
         ]
@@ -105,12 +113,19 @@ class ServoInput:
         except NODE_ERRORS as error:
             self._reporter.reject(error)
 
+    def _on_stamped_projection(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            matrix = stamped_projection_from_message(message)
+            _insert_newest(self._stamped, stamp_ns_from_msg(message), matrix)
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+
     def _keeps(self, part: str) -> Callable[[Any, MessageInfo], None]:
         def keep(message: Any, _info: MessageInfo) -> None:
             if part == "image":
                 self._reporter.count_received()
             try:
-                self._insert(part, stamp_ns_from_msg(message), message)
+                _insert_newest(self._parts[part], stamp_ns_from_msg(message), message)
             except NODE_ERRORS as error:
                 self._reporter.reject(error)
                 self._on_error(" ".join(str(error).split()))
@@ -118,13 +133,6 @@ class ServoInput:
                 self._drain()
 
         return keep
-
-    def _insert(self, part: str, stamp_ns: int, message: Any) -> None:
-        waiting = self._parts[part]
-        waiting[stamp_ns] = message
-        # In order of arrival: stamps go back when a clock does.
-        while len(waiting) > _WAITING:
-            del waiting[next(iter(waiting))]
 
     def _drain(self) -> None:
         """Take all waiting messages, then process the newest frame that has all its parts."""
@@ -155,10 +163,18 @@ class ServoInput:
                 place = parts["drift"].pose.pose.position
                 drift_m = np.array([place.x, place.y])
             k = np.array(parts["info"].k, dtype=np.float64).reshape(3, 3)
-            self._on_frame(
-                ServoFrame(grey, k, drift_m, tuple(self._projections), image.header, stamp_ns)
-            )
+            own = self._stamped.get(stamp_ns)
+            projections = tuple(self._projections) if own is None else (own,)
+            self._on_frame(ServoFrame(grey, k, drift_m, projections, image.header, stamp_ns))
         except NODE_ERRORS as error:
             self._reporter.reject(error)
             self._on_error(" ".join(str(error).split()))
         self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))
+
+
+def _insert_newest(waiting: dict[int, Any], stamp_ns: int, value: Any) -> None:
+    """Add what belongs to a stamp, and drop what has waited the longest."""
+    waiting[stamp_ns] = value
+    # In order of arrival: stamps go back when a clock does.
+    while len(waiting) > _WAITING:
+        del waiting[next(iter(waiting))]

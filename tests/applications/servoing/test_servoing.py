@@ -61,7 +61,7 @@ def test_a_plane_camera_is_the_camera(name: str) -> None:
     camera, height_m = preset(name).camera_at(3000.0), 20e-6
     plane = PlaneCamera.from_camera(camera, height_m)
     xy_m = np.random.default_rng(0).uniform(-15e-6, 15e-6, (20, 2))
-    seen = camera.project_ideal(np.column_stack([xy_m, np.full(20, height_m)]))
+    seen = camera.rectified.project(np.column_stack([xy_m, np.full(20, height_m)]))
     np.testing.assert_allclose(plane.project(xy_m), seen, atol=1e-8)
     np.testing.assert_allclose(plane.plane_from_px(seen), xy_m, atol=1e-15)
 

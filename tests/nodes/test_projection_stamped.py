@@ -1,0 +1,69 @@
+"""Every rectified image comes with its projection, which has its header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64
+
+from semcal_ros.bridge.projection import stamped_projection_from_message
+from tests.helpers.node_scenes import (
+    SIZE,
+    image_message,
+    magnification_message,
+    make_calibration,
+    texture,
+)
+from tests.helpers.ros_process import LATCHED, RELIABLE, Peer, running
+
+CALIBRATION = make_calibration()
+
+
+@pytest.mark.parametrize("node", ["stream_corrector", "rectifier"])
+def test_each_image_has_the_projection_of_its_own_magnification(
+    peer: Peer, tmp_path: Path, node: str
+) -> None:
+    CALIBRATION.save(tmp_path / "cal.yaml")
+    image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
+    magnification = peer.node.create_publisher(Float64, "magnification", LATCHED)
+    images, infos = peer.collect(Image, "image_rect"), peer.collect(CameraInfo, "camera_info")
+    matrices = peer.collect(Image, "projection_stamped")
+    steps = ((1000.0, SIZE), (1000.0, SIZE), (5250.0, SIZE), (5250.0, 2 * SIZE), (700.0, SIZE))
+    with running(node, {"calibration": tmp_path / "cal.yaml"}):
+        peer.wait_heard(f"/sem/{node}", "image_rect", "camera_info", "projection_stamped")
+        for publisher in (image, magnification):
+            peer.wait_for(lambda p=publisher: p.get_subscription_count() == 1, "the subscription")
+        for count, (g, size) in enumerate(steps, 1):
+            magnification.publish(magnification_message(g))
+            peer.spin(0.1)
+            message = image_message(texture(size=size), stamp_s=count + 0.25)
+            message.header.frame_id = f"frame {count}"
+            image.publish(message)
+            peer.wait_for(
+                lambda n=count: min(len(images), len(infos), len(matrices)) == n, f"frame {count}"
+            )
+    for shown, info, matrix, (g, size) in zip(images, infos, matrices, steps, strict=True):
+        assert matrix.header == shown.header == info.header
+        camera = CALIBRATION.at(g).resized(size, size).rectified
+        p_g = stamped_projection_from_message(matrix)
+        np.testing.assert_allclose(p_g, camera.P_affine, rtol=1e-12)
+        # No search by K: it is the same camera.
+        k = np.reshape(info.k, (3, 3))
+        np.testing.assert_allclose(p_g[:, :3], camera.rho * k, rtol=1e-12)
+        assert k[0, 0] == k[1, 1]
+        assert k[0, 1] == 0.0
+
+
+def test_without_a_calibration_the_projection_is_zero(peer: Peer) -> None:
+    image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
+    images, matrices = peer.collect(Image, "image_rect"), peer.collect(Image, "projection_stamped")
+    with running("rectifier", {}):
+        peer.wait_heard("/sem/rectifier", "image_rect", "projection_stamped")
+        peer.wait_for(lambda: image.get_subscription_count() == 1, "the subscription")
+        image.publish(image_message(texture(), stamp_s=3.0))
+        peer.wait_for(lambda: images and matrices, "the frame")
+    assert matrices[0].header == images[0].header
+    assert not stamped_projection_from_message(matrices[0]).any()
