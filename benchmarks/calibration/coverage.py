@@ -80,11 +80,10 @@ def deviations(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, bool, floa
         microscope.camera_at,
         VISITS,
         case.stage,
-        case.grid,
+        replace(case.grid, squares_sigma=SQUARE_RATIO),
         outliers=case.outliers,
         seed=seed,
         readings=case.readings,
-        square_ratio_sigma=SQUARE_RATIO,
     )
     axis = StageAxis(case.stage.axis_rad or 0.0) if case.readings else StageAxis()
     result = calibrate_views(

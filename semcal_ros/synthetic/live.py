@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,8 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.plans import specimen_for
 from semcal_ros.synthetic.pose import Pose, rotation_about_beam
 from semcal_ros.synthetic.render import render_frame
-from semcal_ros.synthetic.specimens.grid import Specimen
+from semcal_ros.synthetic.specimens.grid import GridFaults, Specimen
+from semcal_ros.synthetic.stage import SimulatedStage, visit_scales
 
 __all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
 
@@ -125,6 +127,8 @@ class LiveFrame:
         (2,) drift at the centre of the acquisition, without the travel of the stage.
     square_m
         Square size when the specimen is the chess grid, else None.
+    visit_scale
+        Factor with which this magnification came back.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16]
@@ -134,6 +138,15 @@ class LiveFrame:
     pose: Pose
     drift_m: Array
     square_m: float | None
+    visit_scale: float = 1.0
+
+
+class _Turn(NamedTuple):
+    """A change of the magnification, and the factor with which it came back."""
+
+    time_s: float
+    magnification: float
+    scale: float
 
 
 class LiveScene:
@@ -156,6 +169,9 @@ class LiveScene:
         Image formation.
     seed
         Seed of the specimen and of the noise; the noise of a frame depends on its number only.
+    faults, grid
+        Faults of the stage and of the grid, or None for perfect ones. Of the stage's, the scene has the
+        scale of each visit and the jitter of the lines; that its axis misses is a matter of the pose.
     """
 
     def __init__(
@@ -168,26 +184,47 @@ class LiveScene:
         drift: DriftFunction = NO_DRIFT,
         detector: Detector | None = None,
         seed: int = 0,
+        faults: SimulatedStage | None = None,
+        grid: GridFaults | None = None,
     ) -> None:
         self.microscope = microscope
         self.kind = kind
-        self.pose = Pose.flat() if pose is None else pose
         self.drift = drift
         self.detector = Detector() if detector is None else detector
+        if faults is not None:
+            self.set_detector(line_jitter_px=faults.line_jitter_px)
         self.seed = seed
         self.stage = VirtualStage()
+        self._grid = grid
         self._taken = 0
-        self._turns: list[tuple[float, float]] = []
+        self._poses = [(-math.inf, Pose.flat() if pose is None else pose)]
+        self._scales = visit_scales(faults, seed)
+        self._turns: list[_Turn] = []
         self.set_magnification(magnification)
         self._specimen(magnification)
 
     @property
     def magnification(self) -> float:
         """Magnification that was set last."""
-        return self._turns[-1][1]
+        return self._turns[-1].magnification
+
+    @property
+    def pose(self) -> Pose:
+        """Specimen plane with the stage at home, as it was set last."""
+        return self._poses[-1][1]
+
+    def set_pose(self, pose: Pose, time_s: float = -math.inf) -> None:
+        """Turn or lift the specimen; a frame that is being scanned shows it as it was.
+
+        Poses that were set for later times are forgotten.
+        """
+        earlier = [set_before for set_before in self._poses if set_before[0] < time_s]
+        self._poses = [*earlier[-_COMMANDS_KEPT:], (time_s, pose)]
 
     def set_magnification(self, magnification: float, time_s: float = -math.inf) -> None:
         """Change the magnification from a time on; a frame that is being scanned then shows both.
+
+        Setting the present magnification changes nothing.
 
         Raises
         ------
@@ -196,13 +233,16 @@ class LiveScene:
             before that of the last change.
         """
         self.microscope.camera_at(magnification)
-        if self._turns and not self._turns[-1][0] <= time_s:
+        g = float(magnification)
+        if self._turns and not self._turns[-1].time_s <= time_s:
             raise InvalidValueError(
                 f"a magnification set at {time_s} s",
-                expected=f"not before the last one at {self._turns[-1][0]} s",
+                expected=f"not before the last one at {self._turns[-1].time_s} s",
             )
-        self._turns = [turn for turn in self._turns if turn[0] < time_s][-_TURNS:]
-        self._turns.append((time_s, float(magnification)))
+        if self._turns and self._turns[-1].magnification == g:
+            return
+        self._turns = [turn for turn in self._turns if turn.time_s < time_s][-_TURNS:]
+        self._turns.append(_Turn(time_s, g, next(self._scales)))
 
     def set_detector(self, **changes: object) -> None:
         """Change image settings by name, for instance ``bits=16``."""
@@ -216,9 +256,16 @@ class LiveScene:
 
     def pose_at(self, time_s: float) -> Pose:
         """Return the specimen plane in the sem frame at a time, without drift."""
+        return self._moved(self._set_pose_at(time_s), time_s)
+
+    def _set_pose_at(self, time_s: float) -> Pose:
+        set_before = [pose for at_s, pose in self._poses if at_s <= time_s]
+        return set_before[-1] if set_before else self._poses[0][1]
+
+    def _moved(self, pose: Pose, time_s: float) -> Pose:
         turn = rotation_about_beam(self.stage.rotation_at(time_s))
         travel = np.append(self.stage.position_at(time_s)[0], 0.0)
-        return Pose(turn @ self.pose.R, self.pose.t_m + travel)
+        return Pose(turn @ pose.R, pose.t_m + travel)
 
     def frame(self, start_time_s: float) -> LiveFrame:
         """Take the frame whose first pixel is at ``start_time_s``.
@@ -227,7 +274,7 @@ class LiveScene:
         of the acquisition.
         """
         centre_s = start_time_s + self.microscope.timing.centre_offset_s
-        pose = self.pose_at(centre_s)
+        pose = self._moved(self._set_pose_at(start_time_s), centre_s)
         stage, drift = self.stage, self.drift
         at_centre = stage.position_at(centre_s)
 
@@ -235,8 +282,8 @@ class LiveScene:
             return drift(time_s) + stage.position_at(time_s) - at_centre
 
         parts = self._parts(start_time_s)
-        images = [self._image(g, start_time_s, pose, displacement) for g, _ in parts]
-        g = parts[-1][0]
+        images = [self._image(turn, start_time_s, pose, displacement) for turn, _ in parts]
+        g = parts[-1][0].magnification
         image = images[-1]
         if len(parts) > 1:
             rows = self.microscope.height
@@ -245,40 +292,49 @@ class LiveScene:
         self._taken += 1
         drift_m = drift(np.array([centre_s]))[0]
         square_m = self._specimen(g)[1]
-        return LiveFrame(image, start_time_s, g, len(parts) > 1, pose, drift_m, square_m)
+        return LiveFrame(
+            image,
+            start_time_s,
+            g,
+            len(parts) > 1,
+            pose,
+            drift_m,
+            square_m,
+            parts[-1][0].scale,
+        )
 
-    def _parts(self, start_time_s: float) -> list[tuple[float, Array]]:
+    def _parts(self, start_time_s: float) -> list[tuple[_Turn, Array]]:
         """Return the magnifications during a frame, each with the fraction (h, w) of every pixel's passes
         scanned at it.
         """
         timing = self.microscope.timing
         height, width = self.microscope.height, self.microscope.width
         end_s = start_time_s + timing.acquisition_time_s
-        before = sum(at_s <= start_time_s for at_s, _ in self._turns)
-        turns = [turn for turn in self._turns[max(before - 1, 0) :] if turn[0] < end_s]
+        before = sum(turn.time_s <= start_time_s for turn in self._turns)
+        turns = [turn for turn in self._turns[max(before - 1, 0) :] if turn.time_s < end_s]
         if len(turns) < 2:
-            return [((turns or self._turns)[0][1], np.ones((height, width)))]
+            return [((turns or self._turns)[0], np.ones((height, width)))]
         row, col = np.mgrid[:height, :width]
         pass_s = replace(timing, averages=1).pixel_offset_s(row, col, height, width)
         times_s = start_time_s + pass_s + timing.frame_time_s * _column(timing.averages)
         # The fraction scanned since each change, minus the fraction scanned since the next one.
-        begun = [np.mean(times_s >= at_s, axis=0) for at_s, _ in turns[1:]]
+        begun = [np.mean(times_s >= turn.time_s, axis=0) for turn in turns[1:]]
         shares = [np.ones((height, width)), *begun]
         left = [share - after for share, after in zip(shares, [*begun, 0.0], strict=True)]
-        return [(g, share) for (_, g), share in zip(turns, left, strict=True)]
+        return list(zip(turns, left, strict=True))
 
     def _specimen(self, magnification: float) -> tuple[Specimen, float | None]:
         pixel_m = self.microscope.nominal_pixel_size_m(magnification)
-        return specimen_for(self.kind, pixel_m, self.microscope.width, self.seed)
+        return specimen_for(self.kind, pixel_m, self.microscope.width, self.seed, self._grid)
 
     def _image(
-        self, magnification: float, start_time_s: float, pose: Pose, drift: DriftFunction
+        self, turn: _Turn, start_time_s: float, pose: Pose, drift: DriftFunction
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         return render_frame(
-            self.microscope,
-            self._specimen(magnification)[0],
+            self.microscope.during_visit(turn.scale),
+            self._specimen(turn.magnification)[0],
             pose,
-            magnification,
+            turn.magnification,
             start_time_s=start_time_s,
             drift=drift,
             seed=(self.seed, self._taken),

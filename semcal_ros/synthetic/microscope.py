@@ -103,6 +103,8 @@ class VirtualMicroscope:
         Image size that the pixel-valued laws refer to.
     width, height
         Size of the images taken; 0 means the native size.
+    visit_scale
+        Factor on the image about its centre: how the magnification came back this time.
     """
 
     name: str
@@ -124,6 +126,7 @@ class VirtualMicroscope:
     native_height: int = 512
     width: int = 0
     height: int = 0
+    visit_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.width == 0:
@@ -144,12 +147,16 @@ class VirtualMicroscope:
         """Return the same microscope with another raster timing."""
         return replace(self, timing=timing)
 
+    def during_visit(self, visit_scale: float) -> VirtualMicroscope:
+        """Return the microscope whose magnification came back with this factor."""
+        return replace(self, visit_scale=visit_scale)
+
     def nominal_pixel_size_m(self, magnification: float) -> float:
         """Return the pixel size that the microscope would display, from the display width alone."""
         return self.display_width_m / (_check_magnification(magnification) * self.width)
 
     def camera_at(self, magnification: float) -> ScanCamera:
-        """Return the true camera at a magnification, without the residual.
+        """Return the true camera at a magnification in this visit, without the residual.
 
         Raises
         ------
@@ -158,13 +165,14 @@ class VirtualMicroscope:
         """
         g = _check_magnification(magnification)
         nominal = g * self.native_width / self.display_width_m
+        middle_x, middle_y = 0.5 * (self.native_width - 1.0), 0.5 * (self.native_height - 1.0)
         camera = ScanCamera(
             magnification=g,
-            m=nominal * (1.0 + self.scale_error(g)),
+            m=nominal * (1.0 + self.scale_error(g)) * self.visit_scale,
             aspect=self.aspect(g),
             skew=self.skew(g),
-            px=self.px(g),
-            py=self.py(g),
+            px=middle_x + self.visit_scale * (self.px(g) - middle_x),
+            py=middle_y + self.visit_scale * (self.py(g) - middle_y),
             rho=self.rho(g),
             xi_r=self.xi_r(g),
             xi_t=self.xi_t(g),

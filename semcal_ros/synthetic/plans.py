@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,21 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose, random_poses
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
-from semcal_ros.synthetic.specimens.grid import ChessGrid, FlatSpecimen, Specimen, square_for
+from semcal_ros.synthetic.specimens.grid import (
+    ChessGrid,
+    FlatSpecimen,
+    GridFaults,
+    Specimen,
+    square_for,
+)
 from semcal_ros.synthetic.specimens.target import TargetSpecimen
+from semcal_ros.synthetic.stage import (
+    SimulatedStage,
+    StagePosition,
+    pose_on_stage,
+    read_position,
+    visit_scales,
+)
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",
@@ -39,10 +53,20 @@ CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in ran
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
 
 
+# Tilt and rotation of what is not recorded at many poses.
+_RESTING_RAD = (math.radians(8.0), 0.1)
+
+
 def specimen_for(
-    kind: str, pixel_size_m: float, image_width: int, seed: int = 0
+    kind: str,
+    pixel_size_m: float,
+    image_width: int,
+    seed: int = 0,
+    grid: GridFaults | None = None,
 ) -> tuple[Specimen, float | None]:
     """Return the specimen of a kind, and the square size in m if it is the grid.
+
+    ``grid`` says how the grid differs from squares in a plane.
 
     Raises
     ------
@@ -51,7 +75,7 @@ def specimen_for(
     """
     if kind == "grid":
         square_m = square_for(pixel_size_m, image_width)
-        return ChessGrid(square_m), square_m
+        return _grid_of(square_m, grid, seed), square_m
     if kind == "gold":
         return GoldOnCarbon(seed), None
     if kind == "flat":
@@ -59,6 +83,13 @@ def specimen_for(
     if kind == "target":
         return TargetSpecimen(), None
     raise InvalidValueError(f"specimen '{kind}'", expected=f"one of {', '.join(SPECIMEN_KINDS)}")
+
+
+def _grid_of(square_m: float, grid: GridFaults | None, seed: int) -> ChessGrid:
+    """Return the region of the grid with squares of this size."""
+    if grid is None:
+        return ChessGrid(square_m)
+    return ChessGrid(square_m, grid, grid.size_errors(seed)[square_m])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +106,27 @@ class PlannedFrame:
         Specimen plane without drift.
     square_m
         Square size in view when the specimen is the grid, else None.
+    visit
+        Number of the visit: a stretch of the recording in which the magnification is not changed.
+    visit_scale
+        Factor with which the magnification came back in this visit.
+    position, position_read
+        Where the stage is and what it says, or None for a stage that says nothing.
     """
 
     start_time_s: float
     magnification: float
     pose: Pose
     square_m: float | None
+    visit: int = 0
+    visit_scale: float = 1.0
+    position: StagePosition | None = None
+    position_read: StagePosition | None = None
+
+    @property
+    def joints(self) -> dict[str, float] | None:
+        """What the stage says, by the names of its joints, or None."""
+        return None if self.position_read is None else self.position_read.joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +137,8 @@ class RecordingPlan:
     ----------
     microscope, kind, frames, drift, detector, seed
         What is recorded; ``kind`` is one of :data:`SPECIMEN_KINDS`.
+    stage, grid
+        Their faults, or None for a perfect stage and grid. The jitter of the lines is that of the stage.
     """
 
     microscope: VirtualMicroscope
@@ -99,10 +147,15 @@ class RecordingPlan:
     drift: DriftFunction
     detector: Detector
     seed: int
+    stage: SimulatedStage | None = None
+    grid: GridFaults | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in SPECIMEN_KINDS:
             specimen_for(self.kind, 1e-6, self.microscope.width)
+        if self.stage is not None:
+            jitter_px = self.stage.line_jitter_px
+            object.__setattr__(self, "detector", replace(self.detector, line_jitter_px=jitter_px))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -112,12 +165,12 @@ class RecordingPlan:
         frame = self.frames[index]
         specimen: Specimen
         if frame.square_m is not None:
-            specimen = ChessGrid(frame.square_m)
+            specimen = _grid_of(frame.square_m, self.grid, self.seed)
         else:
             pixel_m = self.microscope.nominal_pixel_size_m(frame.magnification)
             specimen, _ = specimen_for(self.kind, pixel_m, self.microscope.width, self.seed)
         return render_frame(
-            self.microscope,
+            self.microscope.during_visit(frame.visit_scale),
             specimen,
             frame.pose,
             frame.magnification,
@@ -145,24 +198,79 @@ def calibration_plan(
     drift: DriftFunction = NO_DRIFT,
     detector: Detector | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = None,
+    grid: GridFaults | None = None,
 ) -> RecordingPlan:
-    """Plan the grid at several magnifications, ``views`` poses each, the first one untilted."""
+    """Plan the grid at several magnifications, ``views`` poses each, the first one untilted.
+
+    With a ``stage``, the magnifications are visited in their order and then back, with half of the views
+    each; the last one is visited once. On a stage with a tilt axis, every visit of two views or more begins
+    untilted, and the others take the stage's tilts in turn; ``max_tilt_rad`` and ``height_sigma_m`` are
+    those of the other stages.
+    """
     _require_positive("views per magnification", views)
-    frames: list[PlannedFrame] = []
-    for number, g in enumerate(magnifications):
-        pixel_m = microscope.nominal_pixel_size_m(g)
-        square_m = square_for(pixel_m, microscope.width)
-        poses = random_poses(
+    drawn = [
+        random_poses(
             seed * 1009 + number,
             views,
-            field_width_m=pixel_m * microscope.width,
+            field_width_m=microscope.nominal_pixel_size_m(g) * microscope.width,
             max_tilt_rad=max_tilt_rad,
             min_tilt_rad=min(math.radians(15.0), 0.5 * max_tilt_rad),
-            height_sigma_m=height_sigma_m,
+            height_sigma_m=height_sigma_m if stage is None else stage.height_sigma_m,
         )
-        for pose in poses:
-            frames.append(PlannedFrame(interval_s * len(frames), float(g), pose, square_m))
-    return RecordingPlan(microscope, "grid", tuple(frames), drift, detector or Detector(), seed)
+        for number, g in enumerate(magnifications)
+    ]
+    rng, scales = np.random.default_rng((seed, 0x57A6)), visit_scales(stage, seed)
+    frames: list[PlannedFrame] = []
+    tilted = 0
+    for visit, (number, poses) in enumerate(_list_visits(drawn, stage)):
+        g, scale = float(magnifications[number]), next(scales)
+        pixel_m = microscope.nominal_pixel_size_m(g)
+        square_m = square_for(pixel_m, microscope.width)
+        level_m = 0.0
+        if stage is not None:
+            level_m = stage.common_height_m + stage.visit_height_sigma_m * float(rng.normal())
+        for index, pose in enumerate(poses):
+            frame = PlannedFrame(interval_s * len(frames), g, pose, square_m, visit, scale)
+            if stage is not None and stage.axis_rad is not None:
+                tilt = 0.0
+                if index > 0 or len(poses) == 1:
+                    tilt = stage.tilted_rad[tilted % len(stage.tilted_rad)]
+                    tilted += 1
+                own, position = pose_on_stage(
+                    stage,
+                    tilt,
+                    float(rng.uniform(-math.pi, math.pi)),
+                    offset_m=rng.normal(0.0, 0.02 * pixel_m * microscope.width, 2),
+                    height_m=level_m + stage.height_sigma_m * float(rng.normal()),
+                )
+                frame = replace(
+                    frame,
+                    pose=own,
+                    position=position,
+                    position_read=read_position(stage, position, rng),
+                )
+            elif level_m != 0.0:
+                frame = replace(frame, pose=Pose(pose.R, pose.t_m + [0.0, 0.0, level_m]))
+            frames.append(frame)
+    return RecordingPlan(
+        microscope, "grid", tuple(frames), drift, detector or Detector(), seed, stage, grid
+    )
+
+
+def _list_visits(
+    drawn: Sequence[tuple[Pose, ...]], stage: SimulatedStage | None
+) -> Iterator[tuple[int, tuple[Pose, ...]]]:
+    """(number of the magnification, its poses) of each visit."""
+    last = len(drawn) - 1
+    for number, poses in enumerate(drawn):
+        whole = stage is None or number == last
+        yield number, poses if whole else poses[: (len(poses) + 1) // 2]
+    if stage is None:
+        return
+    for number in reversed(range(last)):
+        if rest := drawn[number][(len(drawn[number]) + 1) // 2 :]:
+            yield number, rest
 
 
 def drift_plan(
@@ -176,11 +284,13 @@ def drift_plan(
     pose: Pose | None = None,
     detector: Detector | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = None,
+    grid: GridFaults | None = None,
 ) -> RecordingPlan:
     """Plan one magnification and pose under drift; without ``interval_s`` there is no pause."""
-    return _fixed_pose(
-        microscope, [magnification] * frames, kind, interval_s, drift, pose, detector, seed
-    )
+    step_s = microscope.timing.acquisition_time_s if interval_s is None else interval_s
+    plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
+    return _at_rest(plan, [magnification] * frames, step_s, pose, (0.0, 0.0), one_region=True)
 
 
 def zoom_plan(
@@ -195,12 +305,15 @@ def zoom_plan(
     pose: Pose | None = None,
     detector: Detector | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = None,
+    grid: GridFaults | None = None,
 ) -> RecordingPlan:
     """Plan a geometric sweep of the magnification over one region and pose (by default tilted by 8 deg)."""
     _require_positive("frames", frames)
     sweep = np.geomspace(first_magnification, last_magnification, frames).round(1)
-    tilted = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
-    return _fixed_pose(microscope, sweep.tolist(), kind, interval_s, drift, tilted, detector, seed)
+    step_s = microscope.timing.acquisition_time_s if interval_s is None else interval_s
+    plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
+    return _at_rest(plan, sweep.tolist(), step_s, pose, _RESTING_RAD, one_region=True)
 
 
 def steps_plan(
@@ -213,40 +326,54 @@ def steps_plan(
     pose: Pose | None = None,
     detector: Detector | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = None,
+    grid: GridFaults | None = None,
 ) -> RecordingPlan:
     """Plan ``frames`` at each of several magnifications without a pause, each on the grid region that suits it."""
     _require_positive("frames", frames)
-    plane = Pose.tilted(math.radians(8.0), 0.6, 0.1) if pose is None else pose
-    period_s = microscope.timing.acquisition_time_s
-    planned: list[PlannedFrame] = []
-    for g in magnifications:
-        _, square_m = specimen_for(kind, microscope.nominal_pixel_size_m(g), microscope.width)
-        for _ in range(frames):
-            planned.append(PlannedFrame(period_s * len(planned), float(g), plane, square_m))
-    return RecordingPlan(microscope, kind, tuple(planned), drift, detector or Detector(), seed)
+    steps = [g for g in magnifications for _ in range(frames)]
+    step_s = microscope.timing.acquisition_time_s
+    plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
+    return _at_rest(plan, steps, step_s, pose, _RESTING_RAD, one_region=False)
 
 
-def _fixed_pose(
-    microscope: VirtualMicroscope,
+def _at_rest(
+    plan: RecordingPlan,
     magnifications: Sequence[float],
-    kind: str,
-    interval_s: float | None,
-    drift: DriftFunction,
+    step_s: float,
     pose: Pose | None,
-    detector: Detector | None,
-    seed: int,
+    angles_rad: tuple[float, float],
+    *,
+    one_region: bool,
 ) -> RecordingPlan:
+    """Return the plan with frames of a stage that stands still, by default with this tilt and rotation.
+
+    With ``one_region``, the region of the grid that suits the middle of the magnifications stays in view.
+    """
     _require_positive("frames", len(magnifications))
-    step_s = microscope.timing.acquisition_time_s if interval_s is None else interval_s
-    # One region of the grid is in view throughout: the one that suits the middle of the sweep.
+    microscope, stage = plan.microscope, plan.stage
+    position = read = None
+    if pose is not None:
+        plane = pose
+    elif stage is None or stage.axis_rad is None:
+        tilt, rotation = angles_rad
+        plane = Pose.tilted(tilt, 0.6, rotation) if tilt else Pose.flat(rotation_rad=rotation)
+    else:
+        plane, position = pose_on_stage(stage, *angles_rad, height_m=stage.common_height_m)
+        read = read_position(stage, position, np.random.default_rng((plan.seed, 0x57A6)))
     middle = math.exp(float(np.mean(np.log(magnifications))))
-    _, square_m = specimen_for(kind, microscope.nominal_pixel_size_m(middle), microscope.width)
-    plane = Pose.flat() if pose is None else pose
-    planned = tuple(
-        PlannedFrame(step_s * index, float(g), plane, square_m)
-        for index, g in enumerate(magnifications)
-    )
-    return RecordingPlan(microscope, kind, planned, drift, detector or Detector(), seed)
+    scales = visit_scales(stage, plan.seed)
+    planned: list[PlannedFrame] = []
+    for visit, (g, visited) in enumerate(groupby(magnifications)):
+        scale = next(scales)
+        pixel_m = microscope.nominal_pixel_size_m(middle if one_region else g)
+        _, square_m = specimen_for(plan.kind, pixel_m, microscope.width)
+        for _ in visited:
+            at_s = step_s * len(planned)
+            planned.append(
+                PlannedFrame(at_s, float(g), plane, square_m, visit, scale, position, read)
+            )
+    return replace(plan, frames=tuple(planned))
 
 
 def _require_positive(what: str, count: int) -> None:

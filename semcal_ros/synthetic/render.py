@@ -13,7 +13,7 @@ from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
-from semcal_ros.synthetic.specimens.grid import Specimen
+from semcal_ros.synthetic.specimens.grid import Specimen, UnevenSpecimen
 from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_lattice
 
 __all__ = ["render_frame", "render_reflectivity"]
@@ -109,6 +109,8 @@ def render_reflectivity(
         time_s = start_time_s + offset_s
         left_m, right_m = _at_lines(drift, time_s + left_s), _at_lines(drift, time_s + right_s)
         u, v = lattice.displaced(left_m, right_m)
+        if isinstance(specimen, UnevenSpecimen):
+            u, v = specimen.undeform(u, v, lattice.lift)
         _add_pass(total, weight, lattice, specimen, u, v)
     return total
 

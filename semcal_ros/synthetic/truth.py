@@ -15,8 +15,18 @@ Keys carry their unit; everything is SI or px. The dictionary holds::
         square_m            square size, or None without a grid
         drift_m             (2,) at the centre of the acquisition; what lay at X is seen
                             at X + drift
-        pixel_size_m        (x, y) true size of an undistorted pixel at the reference plane
-    parameters          list, one entry per magnification, ascending:
+        pixel_size_m        (x, y) true size of an undistorted pixel at the reference plane, in
+                            this visit
+        visit, visit_scale  number of the visit of the magnification, and the factor with which it
+                            came back
+        stage, stage_read   tilt, rotation, x, y, z, scan_rotation (rad, m): where the stage was,
+                            and what it said; None for a stage that says nothing
+    stage               tilt_axis_rad (None for any direction), miss_m (beside the beam, below),
+                        height_sigma_m, repeatability, tilt_error_rad, rotation_error_rad,
+                        line_jitter_px; None for a perfect one
+    grid                stretch, shear, curvature_per_m, wave, wave_squares, and square_errors, a
+                        list of square_m and relative error; None for a perfect one
+    parameters          list, one entry per magnification, ascending, without the visits' factors:
         magnification, m_px_per_m, aspect, skew, principal_point_px (x, y), rho_per_m, xi_r, xi_t,
         centre_px (x, y), residual_spiral, residual_sine, residual_settling
     residual_sine_cycles, residual_settling_length   shape of the residual, see Residual
@@ -76,11 +86,46 @@ def truth_of(plan: RecordingPlan) -> dict[str, Any]:
         "parameters": [parameters_of(microscope, g) for g in magnifications],
         "residual_sine_cycles": microscope.residual.sine_cycles,
         "residual_settling_length": microscope.residual.settling_length,
+        "stage": _describe_stage(plan),
+        "grid": _describe_grid(plan),
+    }
+
+
+def _describe_stage(plan: RecordingPlan) -> dict[str, Any] | None:
+    stage = plan.stage
+    if stage is None:
+        return None
+    return {
+        "tilt_axis_rad": stage.axis_rad,
+        "miss_m": list(stage.miss_m),
+        "height_sigma_m": stage.height_sigma_m,
+        "repeatability": stage.scale_sigma,
+        "tilt_error_rad": stage.tilt_error_rad,
+        "rotation_error_rad": stage.rotation_error_rad,
+        "line_jitter_px": plan.detector.line_jitter_px,
+    }
+
+
+def _describe_grid(plan: RecordingPlan) -> dict[str, Any] | None:
+    grid = plan.grid
+    if grid is None:
+        return None
+    return {
+        "stretch": grid.stretch,
+        "shear": grid.shear,
+        "curvature_per_m": grid.curvature,
+        "wave": grid.wave,
+        "wave_squares": grid.wave_squares,
+        "square_errors": [
+            {"square_m": square_m, "error": error}
+            for square_m, error in grid.size_errors(plan.seed).items()
+        ],
     }
 
 
 def _describe_frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
     frame = plan.frames[index]
+    camera = plan.microscope.during_visit(frame.visit_scale).camera_at(frame.magnification)
     return {
         "start_time_s": frame.start_time_s,
         "magnification": frame.magnification,
@@ -88,5 +133,9 @@ def _describe_frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
         "translation_m": frame.pose.t_m.tolist(),
         "square_m": frame.square_m,
         "drift_m": plan.drift_at_centre_m(index).tolist(),
-        "pixel_size_m": list(plan.microscope.camera_at(frame.magnification).pixel_size_m),
+        "pixel_size_m": list(camera.pixel_size_m),
+        "visit": frame.visit,
+        "visit_scale": frame.visit_scale,
+        "stage": None if frame.position is None else frame.position.joints,
+        "stage_read": frame.joints,
     }

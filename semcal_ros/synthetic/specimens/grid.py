@@ -1,9 +1,10 @@
-"""The interface of a specimen, and the two simplest: the chess grid and a uniform one."""
+"""The interface of a specimen, and the two simplest: the chess grid, with its faults, and a uniform one."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,33 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["SQUARES_M", "ChessGrid", "FlatSpecimen", "Specimen", "square_for"]
+__all__ = [
+    "SQUARES_M",
+    "TYPICAL_GRID",
+    "ChessGrid",
+    "FlatSpecimen",
+    "GridFaults",
+    "Specimen",
+    "UnevenSpecimen",
+    "square_for",
+]
 
 
 SQUARES_M: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 """Square sizes of the multi-scale grid."""
 
 _LARGEST_SQUARE = 0.155  # of the image width: at least six squares are in view
+
+# No grid is off by more than this part: it would be another grid.
+_LARGEST_FAULT = 0.05
+# 1/m. At 100x the field reaches 0.85 mm from its middle: on a tighter curve its border would be steeper than
+# 10 degrees, and no chip is.
+_LARGEST_CURVATURE = 200.0
+# The height changes by the slope of the surface (0.17 at most) times the tangent of the tilt (1.7 at 60
+# degrees) in every step, and falls below the tolerance in 15 steps.
+_SURFACE_STEPS = 60
+# Of a square, which is at least 11 px wide: 1e-7 px.
+_SURFACE_TOLERANCE = 1e-8
 
 
 class Specimen(Protocol):
@@ -42,6 +63,104 @@ class Specimen(Protocol):
         ...
 
 
+@runtime_checkable
+class UnevenSpecimen(Protocol):
+    """What the renderer needs, besides :class:`Specimen`, of one that is no drawing on a plane."""
+
+    def undeform(self, u_m: Array, v_m: Array, lift: Array) -> tuple[Array, Array]:
+        """Return the coordinates on the drawing of what rays show.
+
+        Parameters
+        ----------
+        u_m, v_m
+            Where the rays meet the plane in which the specimen would lie.
+        lift
+            (2, ...) by how much u and v of a ray change per height above this plane.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class GridFaults:
+    """How a grid differs from squares in a plane.
+
+    Attributes
+    ----------
+    stretch, shear
+        Relative difference of its axes (x longer), and how far x moves with y.
+    curvature
+        1/m.
+    wave, wave_squares
+        Amplitude of a displacement of the rows in parts of a square, and its period in squares.
+    squares_sigma
+        Spread of the relative error of each size of squares.
+    """
+
+    stretch: float = 0.0
+    shear: float = 0.0
+    curvature: float = 0.0
+    wave: float = 0.0
+    wave_squares: float = 12.0
+    squares_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        parts = ("stretch", "shear", "wave", "squares_sigma")
+        for name in parts:
+            value = getattr(self, name)
+            if not abs(value) <= _LARGEST_FAULT:
+                raise InvalidValueError(
+                    f"a grid with {name} {value:g}", expected=f"at most {_LARGEST_FAULT:g}"
+                )
+        if not abs(self.curvature) <= _LARGEST_CURVATURE:
+            radius_m = 1.0 / self.curvature
+            raise InvalidValueError(
+                f"a grid bowed to a radius of {1e3 * radius_m:g} mm",
+                expected=f"at least {1e3 / _LARGEST_CURVATURE:g} mm",
+            )
+        if self.squares_sigma < 0.0 or not (
+            math.isfinite(self.wave_squares) and self.wave_squares >= 2.0
+        ):
+            raise InvalidValueError(
+                f"grid {self}", expected="no negative spread, and waves of two squares or more"
+            )
+
+    @property
+    def is_flat_and_regular(self) -> bool:
+        """Whether no corner is displaced."""
+        return not (self.stretch or self.shear or self.curvature or self.wave)
+
+    def applied(self, x: Array, y: Array, square_m: float) -> Array:
+        """Return the (n, 3) corners of squares that should lie at x and y, (n,) each, m."""
+        return np.stack(
+            [
+                x * (1.0 + 0.5 * self.stretch) + self.shear * y + self._wave_m(y, square_m),
+                y * (1.0 - 0.5 * self.stretch),
+                0.5 * self.curvature * (x * x + y * y),
+            ],
+            axis=1,
+        )
+
+    def _wave_m(self, y: Array, square_m: float) -> Array:
+        wave: Array = np.sin(2.0 * np.pi * y / (self.wave_squares * square_m))
+        return self.wave * square_m * wave
+
+    def removed(self, a: Array, b: Array, square_m: float) -> tuple[Array, Array]:
+        """Return the x and y whose corners :meth:`applied` puts at a and b."""
+        y = b / (1.0 - 0.5 * self.stretch)
+        x = (a - self.shear * y - self._wave_m(y, square_m)) / (1.0 + 0.5 * self.stretch)
+        return x, y
+
+    def size_errors(self, seed: int) -> dict[float, float]:
+        """Draw the relative error of each size of squares, the same for the same seed."""
+        errors = np.random.default_rng((seed, 0x5155)).normal(size=len(SQUARES_M))
+        return dict(zip(SQUARES_M, (self.squares_sigma * errors).tolist(), strict=True))
+
+
+TYPICAL_GRID = GridFaults(stretch=2e-4, shear=1e-4, curvature=1.0, squares_sigma=2e-4)
+"""A grid as electron-beam lithography writes it on a chip: its axes are equal and at right angles to 1 part
+in 5000 to 10 000, its squares are as good, and the chip is bowed to a radius of a metre."""
+
+
 @dataclass(frozen=True)
 class FlatSpecimen:
     """A specimen with the same reflectivity everywhere."""
@@ -60,12 +179,21 @@ class FlatSpecimen:
 
 @dataclass(frozen=True)
 class ChessGrid:
-    """An endless chess board whose corners are at the integer multiples of ``square_m``.
+    """An endless chess board whose corners should be at the integer multiples of ``square_m``.
 
     The square between (0, 0) and (1, 1) squares is bright.
+
+    Attributes
+    ----------
+    square_m
+        Nominal size of the squares.
+    faults, size_error
+        How the grid differs from squares in a plane, and the relative error of this size.
     """
 
     square_m: float
+    faults: GridFaults = GridFaults()
+    size_error: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.square_m) and self.square_m > 0):
@@ -75,6 +203,31 @@ class ChessGrid:
     def supersampling(self) -> int:
         """Two: the filter is exact for edges along either axis, the samples handle the corners."""
         return 2
+
+    def undeform(self, u_m: Array, v_m: Array, lift: Array) -> tuple[Array, Array]:
+        """See :class:`UnevenSpecimen`.
+
+        Raises
+        ------
+        InvalidValueError
+            If rays do not meet the surface.
+        """
+        size = 1.0 + self.size_error
+        if self.faults.is_flat_and_regular:
+            return (u_m, v_m) if self.size_error == 0.0 else (u_m / size, v_m / size)
+        height = np.zeros_like(u_m)
+        for _ in range(_SURFACE_STEPS):
+            a, b = u_m + lift[0] * height, v_m + lift[1] * height
+            x, y = self.faults.removed(a / size, b / size, self.square_m)
+            before, height = height, 0.5 * size * self.faults.curvature * (x * x + y * y)
+            change = np.abs(lift * (height - before)).max()
+            if change <= _SURFACE_TOLERANCE * self.square_m:
+                return x, y
+        raise InvalidValueError(
+            f"a grid bowed to a radius of {1e3 / self.faults.curvature:g} mm, which rays only graze",
+            expected="a surface that every pixel's ray meets",
+            do="tilt it less, or bow it less",
+        )
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Array:
         """See :class:`Specimen`."""

@@ -92,7 +92,12 @@ class RayLattice:
                 expected="a plane that every pixel's ray meets in front of the scan pivot",
                 do="tilt it less",
             )
-        return PlaneLattice(self, u, v, inverse)
+        over_x = r[0, 2] - self.x_m * (rho * r[2, 2])
+        over_y = r[1, 2] - self.y_m * (rho * r[2, 2])
+        lift = -np.stack(
+            [inverse[0] * over_x + inverse[1] * over_y, inverse[2] * over_x + inverse[3] * over_y]
+        )
+        return PlaneLattice(self, u, v, inverse, lift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +113,15 @@ class PlaneLattice:
     inverse
         (4, lines, nodes) by how much a displacement (X, Y) of the specimen lowers them:
         -[du/dX, du/dY, dv/dX, dv/dY].
+    lift
+        (2, lines, nodes) by how much (u, v) of a ray change per height above the plane, along its normal.
     """
 
     rays: RayLattice
     u_m: Array
     v_m: Array
     inverse: Array
+    lift: Array
 
     def footprint_m(self) -> Array:
         """(2, 2) derivative of specimen (x, y) by one sample along columns and rows, mid-frame."""
