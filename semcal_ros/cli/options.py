@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import quantity
+from semcal_ros.files.tiff.values import plain_number, quantity
 
 __all__ = [
     "FIGURE_SUFFIXES",
@@ -24,6 +24,7 @@ __all__ = [
     "output_option",
     "overwrite_option",
     "parse_length",
+    "parse_ratio",
     "recording_argument",
     "recording_options",
     "require_folder",
@@ -94,13 +95,29 @@ def interpolation_option(default: str) -> Callable[[Command], Command]:
     )
 
 
-def parse_length(_context: click.Context, _parameter: click.Parameter, text: str) -> float:
+def parse_length(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | None:
     """Callback of an option for a length with its unit, such as ``10um``; a bare number is in m."""
+    if text is None:
+        return None
     length_m = quantity(text, "m", default_unit="m")
     if length_m is None or length_m < 0.0:
         raise click.BadParameter(f"{text!r} is not a length such as 10um or 1e-5 (m)")
     # Without the rounding error of the unit.
     return float(f"{length_m:.12g}")
+
+
+def parse_ratio(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | None:
+    """Callback of an option for a ratio, such as ``0.1%`` or 0.001."""
+    if text is None:
+        return None
+    ratio = plain_number(text.strip().removesuffix("%"))
+    if ratio is None:
+        raise click.BadParameter(f"{text!r} is not a ratio such as 0.1% or 0.001")
+    return float(f"{0.01 * ratio:.12g}") if text.strip().endswith("%") else ratio
 
 
 def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -> None:

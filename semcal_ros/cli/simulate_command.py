@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, overwrite_option
+from semcal_ros.cli.options import PATH, overwrite_option, parse_length, parse_ratio
 from semcal_ros.cli.output import show_progress
-from semcal_ros.synthetic import DRIFTS, PRESETS, SPECIMEN_KINDS
+from semcal_ros.synthetic import (
+    DRIFTS,
+    PRESETS,
+    SPECIMEN_KINDS,
+    STAGES,
+    TYPICAL_GRID,
+    make_stage,
+)
 from semcal_ros.workflows.simulate import PLAN_KINDS, simulate
 
 __all__ = ["command"]
@@ -58,6 +66,79 @@ __all__ = ["command"]
 )
 @click.option("--blur", type=click.FloatRange(0), help="Sigma of the beam in px.")
 @click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--stage",
+    "stage_name",
+    type=click.Choice(tuple(STAGES)),
+    default="one-axis",
+    show_default=True,
+    help="One tilt axis, which says its tilt; or tilts in every direction, as no stage does.",
+)
+@click.option(
+    "--eucentric-error",
+    "eucentric_error_m",
+    callback=parse_length,
+    metavar="LENGTH",
+    help="How far the axis of a one-axis stage misses the specimen.  [default: 100um]",
+)
+@click.option(
+    "--repeatability",
+    default="0.15%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="1-sigma of the scale, each time that a magnification is set.",
+)
+@click.option(
+    "--grid-stretch",
+    default="0.02%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="Difference of the grid's axes.",
+)
+@click.option(
+    "--grid-shear",
+    default="0.01%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="How far the grid's axes are from a right angle.",
+)
+@click.option(
+    "--grid-bow",
+    "grid_radius_m",
+    default="1m",
+    show_default=True,
+    callback=parse_length,
+    metavar="RADIUS",
+    help="Radius to which the grid is bowed; 0 for a flat one.",
+)
+@click.option(
+    "--grid-wave",
+    default="0%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="Amplitude of a wave in its rows, of a square.",
+)
+@click.option(
+    "--grid-squares",
+    "squares_sigma",
+    default="0.02%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="1-sigma of each size of its squares.",
+)
+@click.option(
+    "--line-jitter",
+    "line_jitter_px",
+    type=click.FloatRange(0),
+    default=0.05,
+    show_default=True,
+    help="1-sigma of the shift of each scan line in px.",
+)
 @overwrite_option
 def command(
     output: Path,
@@ -73,6 +154,15 @@ def command(
     electrons: float | None,
     blur: float | None,
     seed: int,
+    stage_name: str,
+    eucentric_error_m: float | None,
+    repeatability: float,
+    grid_stretch: float,
+    grid_shear: float,
+    grid_radius_m: float,
+    grid_wave: float,
+    squares_sigma: float,
+    line_jitter_px: float,
     overwrite: bool,
 ) -> None:
     """Record the virtual SEM to the bag OUTPUT, with truth.json (SI units) beside it.
@@ -80,8 +170,23 @@ def command(
     \b
     Example:
       semcal simulate grid --plan grid --preset jsm820
+      semcal simulate worn --eucentric-error 300um --repeatability 0.4% --grid-stretch 0.1%
       semcal simulate zoom --plan zoom --magnification 600 --magnification 6000
     """
+    stage = make_stage(
+        stage_name,
+        eucentric_error_m=eucentric_error_m,
+        repeatability=repeatability,
+        line_jitter_px=line_jitter_px,
+    )
+    grid = replace(
+        TYPICAL_GRID,
+        stretch=grid_stretch,
+        shear=grid_shear,
+        curvature=1.0 / grid_radius_m if grid_radius_m > 0.0 else 0.0,
+        wave=grid_wave,
+        squares_sigma=squares_sigma,
+    )
     with show_progress() as on_progress:
         count = simulate(
             output,
@@ -97,6 +202,8 @@ def command(
             electrons=electrons,
             blur_px=blur,
             seed=seed,
+            stage=stage,
+            grid=grid,
             overwrite=overwrite,
             on_progress=on_progress,
         )

@@ -12,8 +12,12 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
+    STAGES,
+    TYPICAL_GRID,
     Detector,
+    GridFaults,
     RecordingPlan,
+    SimulatedStage,
     VirtualMicroscope,
     calibration_plan,
     drift_plan,
@@ -36,6 +40,7 @@ __all__ = ["PLAN_KINDS", "plan_recording", "simulate"]
 PLAN_KINDS = ("grid", "drift", "steps", "zoom")
 # Numbers of magnifications of the plans that do not take any number of them.
 _MAGNIFICATIONS = {"drift": 1, "zoom": 2}
+_STAGE = STAGES["one-axis"]
 
 
 def plan_recording(
@@ -49,6 +54,8 @@ def plan_recording(
     views: int = 5,
     frames: int | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = _STAGE,
+    grid: GridFaults | None = TYPICAL_GRID,
 ) -> RecordingPlan:
     """Plan a recording.
 
@@ -71,6 +78,8 @@ def plan_recording(
         Number of frames, for ``steps`` at each magnification.
     seed
         Seed of poses, specimen and noise.
+    stage, grid
+        Faults of the stage and of the grid, or None for perfect ones.
 
     Raises
     ------
@@ -93,6 +102,8 @@ def plan_recording(
             views=views,
             detector=detector,
             seed=seed,
+            stage=stage,
+            grid=grid,
         )
     elif kind == "drift":
         plan = drift_plan(
@@ -103,6 +114,8 @@ def plan_recording(
             drift=drift_preset(drift or "settling"),
             detector=detector,
             seed=seed,
+            stage=stage,
+            grid=grid,
         )
     elif kind == "steps":
         plan = steps_plan(
@@ -112,6 +125,8 @@ def plan_recording(
             kind=specimen or "grid",
             detector=detector,
             seed=seed,
+            stage=stage,
+            grid=grid,
         )
     else:
         first, last = chosen or (600.0, 6000.0)
@@ -123,6 +138,8 @@ def plan_recording(
             kind=specimen or "grid",
             detector=detector,
             seed=seed,
+            stage=stage,
+            grid=grid,
         )
     return plan if drift is None else replace(plan, drift=drift_preset(drift))
 
@@ -142,6 +159,8 @@ def simulate(
     electrons: float | None = None,
     blur_px: float | None = None,
     seed: int = 0,
+    stage: SimulatedStage | None = _STAGE,
+    grid: GridFaults | None = TYPICAL_GRID,
     overwrite: bool = False,
     on_progress: OnProgress = ignore_progress,
 ) -> int:
@@ -151,7 +170,7 @@ def simulate(
     ----------
     output
         Bag to make.
-    plan, specimen, drift, magnifications, views, frames, seed
+    plan, specimen, drift, magnifications, views, frames, seed, stage, grid
         As for :func:`plan_recording`.
     microscope
         Name of the virtual microscope.
@@ -192,6 +211,8 @@ def simulate(
         views=views,
         frames=frames,
         seed=seed,
+        stage=stage,
+        grid=grid,
     )
     advance = count_frames(on_progress, "simulating", len(recording))
     write_simulated(

@@ -18,6 +18,7 @@ import yaml
 from semcal_ros import Calibration
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.files.bags.reader import open_bag
+from semcal_ros.workflows.simulate import simulate
 from tests.helpers.made_once import folder_once
 from tests.helpers.semcal_runs import refused, run
 
@@ -321,3 +322,52 @@ def test_evaluate_says_how_far_nm_per_pixel_is_off(folder, tmp_path, capsys):
     assert difference == pytest.approx(0.02, abs=0.002)
     # The reprojection error hardly sees it.
     assert errors["wrong"]["rms_px"] < 1.5 * errors["right"]["rms_px"]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--stage", "three-axis"), "three-axis"),
+        (("--eucentric-error", "wide"), "'wide' is not a length such as 10um"),
+        (("--eucentric-error", "-10um"), "'-10um' is not a length such as 10um"),
+        (("--eucentric-error", "2cm"), "'2cm' is not a length such as 10um"),
+        (("--eucentric-error", "20mm"), "misses the specimen by 20000 and 0 um"),
+        (
+            ("--stage", "two-axis", "--eucentric-error", "10um"),
+            "a eucentric error of 10 um of a two-axis stage",
+        ),
+        (("--repeatability", "good"), "'good' is not a ratio such as 0.1%"),
+        (("--repeatability", "15%"), "a repeatability of 15 %; expected 0 to 5 %"),
+        (("--grid-stretch", "0.2"), "a grid with stretch 0.2"),
+        (("--grid-bow", "1mm"), "a radius of 1 mm; expected at least 5 mm"),
+        (("--grid-squares", "-1%"), "no negative spread"),
+        (("--line-jitter", "9"), "a line jitter of 9 px; expected 0 to 4 px"),
+    ],
+)
+def test_a_stage_or_a_grid_that_does_not_exist_is_refused(tmp_path, capsys, options, reason):
+    command = ("simulate", tmp_path / "grid", "--size", 32, "--magnification", 1000)
+    assert reason in refused(capsys, *command, *options)
+    assert not (tmp_path / "grid").exists()
+
+
+def test_the_defaults_of_the_options_are_those_of_python(tmp_path):
+    assert run("simulate", tmp_path / "a", "--size", 32, "--magnification", 900, "--views", 1) == 0
+    simulate(tmp_path / "b", magnifications=(900.0,), views=1, size=32)
+    first, other = (json.loads((tmp_path / n / "truth.json").read_text()) for n in "ab")
+    assert first == other
+
+
+def test_options_of_stage_and_grid_reach_the_recording(tmp_path):
+    stage = ("--eucentric-error", "0.3mm", "--repeatability", "0.4%", "--line-jitter", 0.2)
+    grid = ("--grid-stretch", "0.1%", "--grid-shear", "-0.0005", "--grid-bow", "50mm")
+    rest = ("--grid-wave", "1%", "--grid-squares", "0%", "--magnification", 900, "--views", 1)
+    assert run("simulate", tmp_path / "a", "--size", 32, *stage, *grid, *rest) == 0
+    truth = json.loads((tmp_path / "a" / "truth.json").read_text())
+    assert truth["stage"]["miss_m"] == [3e-4, 0.0]
+    assert truth["stage"]["repeatability"] == 4e-3
+    assert truth["stage"]["line_jitter_px"] == 0.2
+    found = [truth["grid"][key] for key in ("stretch", "shear", "curvature_per_m", "wave")]
+    assert found == pytest.approx([1e-3, -5e-4, 20.0, 1e-2])
+    assert {row["error"] for row in truth["grid"]["square_errors"]} == {0.0}
+    assert run("simulate", tmp_path / "b", "--size", 32, "--grid-bow", 0, *rest) == 0
+    assert json.loads((tmp_path / "b" / "truth.json").read_text())["grid"]["curvature_per_m"] == 0.0
