@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Twist
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, Header
 
 from semcal_ros.bridge.headers import fill_header
@@ -24,12 +25,20 @@ from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
     SPECIMEN_KINDS,
+    STAGES,
+    TYPICAL_GRID,
     Detector,
+    GridFaults,
     LiveScene,
     Pose,
+    SimulatedStage,
+    StagePosition,
     VirtualMicroscope,
     drift_preset,
+    make_stage,
+    pose_on_stage,
     preset,
+    read_position,
 )
 
 __all__ = ["VirtualSem", "main"]
@@ -65,13 +74,92 @@ _PARAMETERS = (
     ParameterDeclaration(
         "height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3
     ),
+    ParameterDeclaration(
+        "stage",
+        "one-axis",
+        "One tilt axis, which says its tilt; or tilts about the specimen itself, as no stage does.",
+        choices=tuple(STAGES),
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "eucentric_error_m",
+        STAGES["one-axis"].miss_m[0],
+        "How far the axis of a one-axis stage misses the specimen.",
+        "m",
+        0.0,
+        5e-3,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "repeatability",
+        STAGES["one-axis"].scale_sigma,
+        "1-sigma of the scale, each time that a magnification is set.",
+        "",
+        0.0,
+        0.05,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "grid_stretch",
+        TYPICAL_GRID.stretch,
+        "Relative difference of the grid's axes.",
+        "",
+        -0.05,
+        0.05,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "grid_shear",
+        TYPICAL_GRID.shear,
+        "How far the grid's axes are from a right angle.",
+        "rad",
+        -0.05,
+        0.05,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "grid_bow_m",
+        1.0 / TYPICAL_GRID.curvature,
+        "Radius to which the grid is bowed, 0.005 or more; 0: flat.",
+        "m",
+        0.0,
+        1e6,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "grid_wave",
+        TYPICAL_GRID.wave,
+        "Amplitude of a wave in the grid's rows, of a square.",
+        "",
+        -0.05,
+        0.05,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "grid_squares",
+        TYPICAL_GRID.squares_sigma,
+        "1-sigma of each size of the grid's squares.",
+        "",
+        0.0,
+        0.05,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "line_jitter",
+        STAGES["one-axis"].line_jitter_px,
+        "1-sigma of the shift of each scan line.",
+        "px",
+        0.0,
+        4.0,
+        fixed=True,
+    ),
 )
 _POSE = ("tilt_deg", "tilt_axis_deg", "rotation_deg", "height_m")
 _ENCODINGS = {8: "mono8", 16: "mono16"}
 
 
 class VirtualSem(SemNode):
-    """Publishes ``image_raw`` and, whenever it changes, ``magnification``.
+    """Publishes ``image_raw`` and, whenever they change, ``magnification`` and ``stage``.
 
     Listens to ``~/stage`` and ``~/set_magnification``.
     """
@@ -79,14 +167,19 @@ class VirtualSem(SemNode):
     def __init__(self) -> None:
         super().__init__("virtual_sem", _PARAMETERS)
         self._start_ns = self.get_clock().now().nanoseconds
+        self._mechanics = self._stage_with_faults()
+        self._random = np.random.default_rng((self.parameters["seed"], 0x57A6))
+        pose, self._position = self._placed()
         self._scene = LiveScene(
             self._microscope(),
             self.parameters["specimen"],
             magnification=self.parameters["magnification"],
-            pose=self._pose(),
+            pose=pose,
             drift=drift_preset(self.parameters["drift"]),
             detector=self._detector(self.parameters["bits"]),
             seed=self.parameters["seed"],
+            faults=self._mechanics,
+            grid=self._grid_with_faults(),
         )
         for name in _POSE:
             self.parameters.on_change(name, self._set_pose)
@@ -97,6 +190,11 @@ class VirtualSem(SemNode):
         self._magnification = self.endpoints.latched_publisher(Float64, source)
         self._announced: float | None = None
         self._announce()
+        self._joints = None
+        self._said: dict[str, float] | None = None
+        if self._position is not None and self.config.stage is not None:
+            self._joints = self.endpoints.latched_publisher(JointState, self.config.stage.topic)
+            self._announce_stage()
         self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
         self._knob = self.create_subscription(
             Float64, "~/set_magnification", self._on_magnification, stream_output(10)
@@ -139,9 +237,34 @@ class VirtualSem(SemNode):
     def _detector(self, bits: int) -> Detector:
         return Detector(bits=bits, databar_rows=self.config.image.databar_rows)
 
-    def _pose(self) -> Pose:
+    def _stage_with_faults(self) -> SimulatedStage:
+        name = self.parameters["stage"]
+        one_axis = STAGES[name].axis_rad is not None
+        return make_stage(
+            name,
+            eucentric_error_m=self.parameters["eucentric_error_m"] if one_axis else None,
+            repeatability=self.parameters["repeatability"],
+            line_jitter_px=self.parameters["line_jitter"],
+        )
+
+    def _grid_with_faults(self) -> GridFaults:
+        radius_m = self.parameters["grid_bow_m"]
+        return GridFaults(
+            stretch=self.parameters["grid_stretch"],
+            shear=self.parameters["grid_shear"],
+            curvature=1.0 / radius_m if radius_m > 0.0 else 0.0,
+            wave=self.parameters["grid_wave"],
+            squares_sigma=self.parameters["grid_squares"],
+        )
+
+    def _placed(self) -> tuple[Pose, StagePosition | None]:
+        """Return where the specimen is, and what the stage says about it before it is moved."""
         tilt, axis, rotation = (math.radians(self.parameters[name]) for name in _POSE[:3])
-        return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, self.parameters["height_m"]))
+        height_m = self.parameters["height_m"]
+        if self._mechanics.axis_rad is None:
+            return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, height_m)), None
+        pose, position = pose_on_stage(self._mechanics, tilt, rotation, axis, height_m=height_m)
+        return pose, read_position(self._mechanics, position, self._random)
 
     def _period_s(self) -> float:
         rate = self.parameters["rate"]
@@ -150,7 +273,9 @@ class VirtualSem(SemNode):
     # -- control -----------------------------------------------------------------------------------
 
     def _set_pose(self, _value: float) -> None:
-        self._scene.pose = self._pose()
+        pose, self._position = self._placed()
+        self._scene.set_pose(pose, self._now_s())
+        self._announce_stage()
 
     def _set_bits(self, bits: int) -> None:
         self._scene.set_detector(bits=bits)
@@ -163,6 +288,7 @@ class VirtualSem(SemNode):
             self._scene.set_twist(
                 self._now_s(), (message.linear.x, message.linear.y), message.angular.z
             )
+            self._announce_stage()
         except SemcalError as error:
             self.reporter.reject(error)
 
@@ -185,12 +311,37 @@ class VirtualSem(SemNode):
             self._magnification.publish(Float64(data=self._announced))
             self.reporter.note("magnification", self._announced)
 
+    def _announce_stage(self) -> None:
+        """Publish where the stage is if it has moved."""
+        if self._joints is None or self._position is None or self.config.stage is None:
+            return
+        now_s, motion = self._now_s(), self._scene.stage
+        x, y = motion.position_at(now_s)[0]
+        position = replace(
+            self._position,
+            rotation_rad=self._position.rotation_rad + motion.rotation_at(now_s),
+            x_m=self._position.x_m + float(x),
+            y_m=self._position.y_m + float(y),
+        )
+        source = self.config.stage
+        said = {getattr(source, joint): value for joint, value in position.joints.items()}
+        if said == self._said:
+            return
+        first, self._said = self._said is None, said
+        message = JointState(name=list(said), position=list(said.values()))
+        # The frames that are being scanned when the node starts show the stage where it is now.
+        since_s = now_s - self._scene.microscope.timing.acquisition_time_s if first else now_s
+        fill_header(message.header, self._start_ns + round(since_s * 1e9), "")
+        self._joints.publish(message)
+        self.reporter.note("stage_tilt_rad", position.tilt_rad)
+
     def _take_frame(self) -> None:
         # The frame that has just been completed: the stamp is the time at which its first pixel was scanned.
         start_s = self._now_s() - self._scene.microscope.timing.acquisition_time_s
         try:
             frame = self._scene.frame(start_s)
             stamp_ns = self._start_ns + round((start_s - self.config.start_offset_s) * 1e9)
+            self._announce_stage()
             header, message = Header(), Image()
             fill_header(header, stamp_ns, self.config.frame_id)
             fill_image(message, frame.image, _ENCODINGS[8 * frame.image.dtype.itemsize], header)

@@ -288,6 +288,7 @@ def test_a_microscope_that_publishes_its_pixel_size_in_another_message(
         ("bag_player", {"bag": "/no/such/bag"}, "/no/such/bag"),
         ("virtual_sem", {"preset": "toaster"}, "toaster"),
         ("virtual_sem", {"config": "pixel_size_nm"}, "virtual_sem"),
+        ("virtual_sem", {"grid_bow_m": 0.001}, "a radius of 1 mm"),
     ],
 )
 def test_a_node_that_cannot_start_says_why_in_one_line(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
 from rcl_interfaces.msg import ParameterType, ParameterValue
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 
 from tests.helpers.node_scenes import stamp_of
@@ -56,6 +56,50 @@ def test_frames_follow_magnification_and_depth(peer: Peer) -> None:
         assert "8 or 16" in result.reason
         steep = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=85.0)
         assert not peer.set_parameter(SEM, "tilt_deg", steep).successful
+
+
+def test_the_stage_says_where_it_is_before_each_change(peer: Peer) -> None:
+    said = peer.collect(JointState, "stage", LATCHED)
+    images = peer.collect(Image, "image_raw")
+    twists = peer.node.create_publisher(Twist, f"{SEM}/stage", RELIABLE)
+    with running("virtual_sem", {**SETTINGS, "rotation_deg": 30.0}):
+        peer.wait_for(lambda: said and len(images) >= 2, "the stage and frames")
+        assert list(said[0].name) == ["tilt", "rotation", "x", "y", "z", "scan_rotation"]
+        # A constant error of 0.3 and 12 degrees, and a scatter of 0.1 and 0.2.
+        assert np.degrees(said[0].position[:2]) == pytest.approx([0.3, 42.0], abs=1.0)
+        assert stamp_of(said[0]) <= stamp_of(images[0])
+        # It stands still, so there is nothing more to say.
+        assert len(said) == 1
+
+        steep = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=25.0)
+        assert peer.set_parameter(SEM, "tilt_deg", steep).successful
+        peer.wait_for(lambda: len(said) == 2, "the new tilt")
+        assert np.degrees(said[1].position[0]) == pytest.approx(25.3, abs=0.5)
+        # Brought back to the beam on an axis that misses it by 0.1 mm.
+        travel_m = -1e-4 * (1.0 / np.cos(np.radians(25.0)) - 1.0)
+        assert said[1].position[3] == pytest.approx(travel_m, rel=1e-6)
+
+        peer.wait_for(lambda: twists.get_subscription_count() == 1, "the stage's input")
+        twists.publish(Twist())
+        move = Twist()
+        move.linear.x, move.angular.z = 2e-6, 0.02
+        before = len(said)
+        twists.publish(move)
+        peer.wait_for(lambda: len(said) >= before + 3, "the moving stage")
+        x = [message.position[2] for message in said[before:]]
+        turn = [message.position[1] for message in said[before:]]
+        assert x == sorted(x) and turn == sorted(turn)
+        stamps = [stamp_of(message) for message in said]
+        assert stamps == sorted(stamps)
+        seconds = float(np.dot(np.subtract(stamps[-1], stamps[-2]), (1.0, 1e-9)))
+        assert x[-1] - x[-2] == pytest.approx(2e-6 * seconds, rel=0.01)
+
+
+def test_a_two_axis_stage_says_nothing(peer: Peer) -> None:
+    images = peer.collect(Image, "image_raw")
+    with running("virtual_sem", {**SETTINGS, "stage": "two-axis"}):
+        peer.wait_for(lambda: images, "frames")
+        assert peer.node.count_publishers("/sem/stage") == 0
 
 
 def _pairs(raw: list[Any], held: list[Any]) -> list[tuple[Any, Any]]:
