@@ -21,6 +21,8 @@ from semcal_ros.files.calibration_file import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from semcal_ros.core.calibration.pda import FittedEquation
+
 __all__ = ["Calibration"]
 
 
@@ -82,6 +84,14 @@ class Calibration(CalibrationModel):
             If it cannot be written; an existing file is then untouched.
         """
         write_calibration(self, path)
+
+    @property
+    def equations(self) -> tuple[FittedEquation, ...]:
+        """The differential equation of each parameter, of method ``"pda"``; empty for the others."""
+        # Here, so that those who only ask for a camera do not wait for the calibration's modules.
+        from semcal_ros.core.calibration.pda import list_equations
+
+        return list_equations(self.functions)
 
     # -- cameras and images ---------------------------------------------------------------------
 

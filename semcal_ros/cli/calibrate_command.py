@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import (
     PATH,
     check_outputs,
@@ -22,6 +25,7 @@ from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
     MethodOptions,
 )
+from semcal_ros.core.calibration.pda import focal_length_and_skew, prime
 from semcal_ros.core.calibration.untilted import UNTILTED_MODES
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
 
@@ -45,6 +49,17 @@ def _parse_untilted(
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def _parse_step(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | str | None:
+    if text is None or text == "auto":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
+
+
 @click.command("calibrate")
 @recording_argument
 @output_option("Calibration file.")
@@ -56,6 +71,12 @@ def _parse_untilted(
     "--legendre",
     type=click.IntRange(0, 20),
     help="pda: fit Legendre polynomials of this degree instead of an ODE.",
+)
+@click.option(
+    "--pda-step",
+    callback=_parse_step,
+    metavar="auto|G",
+    help="pda: fit through magnifications G apart; auto tries all steps and takes that of the least error.",
 )
 @click.option(
     "--breakpoints",
@@ -103,6 +124,7 @@ def command(
     method: str,
     pda_order: int,
     legendre: int | None,
+    pda_step: float | str | None,
     breakpoints: tuple[float, ...],
     residual: str,
     untilted: str | tuple[str, ...],
@@ -117,6 +139,7 @@ def command(
     Example:
       semcal calibrate recordings/grid -o cal.yaml --report report.html
       semcal calibrate recordings/grid -o cal.yaml --untilted 0,5,10 --height-sigma 20um
+      semcal calibrate recordings/grid -o cal.yaml --method pda --pda-step auto
     """
     check_outputs([("-o", output, ()), ("--report", report, ())])
     with show_progress() as on_progress:
@@ -127,7 +150,7 @@ def command(
             magnification=magnification,
             options=CalibrationOptions(
                 method,
-                MethodOptions(pda_order, legendre, tau),
+                MethodOptions(pda_order, legendre, tau, pda_step),
                 breakpoints,
                 residual,
                 untilted,
@@ -172,6 +195,8 @@ def _echo_result(done: RecordingCalibration) -> None:
             else ""
         )
     )
+    _echo_steps(statistics["fit"])
+    _echo_equations(done.calibration)
     if done.calibration.residual is not None:
         click.echo("with a residual field for what the distortion parameters do not describe")
     told = sum(view.stage is not None for view in done.result.views)
@@ -184,6 +209,71 @@ def _echo_result(done: RecordingCalibration) -> None:
     echo_notes(done.notes)
     for warning in done.result.warnings:
         click.echo(f"warning: {warning}", err=True)
+
+
+def _echo_steps(fit: dict[str, Any]) -> None:
+    if not fit.get("steps"):
+        return
+    echo_table(
+        ["step G", "magnifications", "error of (19)", "RMS px", ""],
+        [
+            [
+                f"{row['step']:g}",
+                str(row["magnifications"]),
+                "-" if row["equation_error"] is None else f"{row['equation_error']:.3f}",
+                f"{row['rms_px']:.4f}",
+                "chosen" if row["step"] == fit["step"] else "",
+            ]
+            for row in fit["steps"]
+        ],
+    )
+    click.echo(
+        "RMS px: of all views, poses fitted; its least value chooses. "
+        "Error of (19): 1 if the equations explain nothing"
+    )
+
+
+# Of the parameters that have one; the others are ratios.
+_UNITS = {"px": "px", "py": "px", "rho": "1/m", "ex": "px", "ey": "px"}
+
+
+def _echo_equations(calibration: Calibration) -> None:
+    equations = calibration.equations
+    if not equations:
+        return
+    low, high = equations[0].g_range
+    # Two conditions belong to an equation of second order; the others need derivatives too.
+    inner = range(1, equations[0].order - 1)
+    echo_table(
+        ["x", "unit", "equation", f"x({low:g})", f"x({high:g})"]
+        + [f"{prime(j)}({low:g})" for j in inner],
+        [
+            [
+                e.name,
+                _UNITS.get(e.name, ""),
+                str(e),
+                *_format_values([e.start[0], e.end, *(e.start[j] for j in inner)]),
+            ]
+            for e in equations
+        ]
+        + [
+            [name, "px", "", *_format_values([at_low, at_high]), *("" for _ in inner)]
+            for name, at_low, at_high in zip(
+                ("f = m/rho", "s = skew f"),
+                focal_length_and_skew(calibration, low),
+                focal_length_and_skew(calibration, high),
+                strict=True,
+            )
+        ],
+    )
+    click.echo(
+        f"x' = dx/du with u = (g - {low:g}) / {high - low:g}, from 0 to 1; scale is m over nominal, "
+        f"{calibration.nominal_px_per_m(1.0):.6g} g px per m"
+    )
+
+
+def _format_values(values: Sequence[float]) -> list[str]:
+    return [f"{value:.8g}" for value in values]
 
 
 def _write_report(done: RecordingCalibration, path: Path, title: str) -> None:

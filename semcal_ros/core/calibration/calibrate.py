@@ -27,6 +27,12 @@ from semcal_ros.core.calibration.outliers import (
     find_wrong_tilts,
 )
 from semcal_ros.core.calibration.pda import pda_functions
+from semcal_ros.core.calibration.pda_step import (
+    StepTrial,
+    choose_step,
+    select_magnifications,
+    try_steps,
+)
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.scale_checks import estimate_repeatability, scale_warnings
@@ -79,11 +85,29 @@ class MethodOptions:
         With a value, ``"pda"`` fits Legendre polynomials of this degree instead.
     tau_px
         With a value, Algorithm 1 uses this fixed threshold instead of a statistical test.
+    pda_step
+        With a value G, ``"pda"`` fits through the magnifications nearest to multiples of G above
+        the lowest one, instead of through all; ``"auto"`` takes the G with the least error.
+
+    Raises
+    ------
+    InvalidValueError
+        For a step that is neither positive nor ``"auto"``.
     """
 
     pda_order: int = 2
     legendre_degree: int | None = None
     tau_px: float | None = None
+    pda_step: float | str | None = None
+
+    def __post_init__(self) -> None:
+        step = self.pda_step
+        if step is None or step == "auto":
+            return
+        if isinstance(step, str) or not (np.isfinite(step) and step > 0.0):
+            raise InvalidValueError(
+                f"pda_step {step!r}", expected='"auto" or a positive step in magnification'
+            )
 
 
 @dataclass(frozen=True)
@@ -416,19 +440,17 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodF
     discrete = fit_discrete(setup, tau_px=options.tau_px)
 
     def functions_of(keep: Mask) -> tuple[Functions, Array]:
-        part = DiscreteFit(
-            discrete.magnifications[keep],
-            discrete.parameters[keep],
-            discrete.covariances[keep],
-            discrete.centres,
-            discrete.results,
-        )
+        part = discrete.select(keep)
         if method == "discrete":
             return table_functions(part.magnifications, part.parameters, part.covariances)
         return pda_functions(part, order=options.pda_order, legendre_degree=options.legendre_degree)
 
     count = len(setup.magnifications)
-    functions, covariance = functions_of(np.ones(count, dtype=bool))
+    used = np.ones(count, dtype=bool)
+    chosen: dict[str, Any] = {}
+    if method == "pda" and options.pda_step is not None:
+        used, chosen = _select_by_step(setup, discrete, options)
+    functions, covariance = functions_of(used)
     failed = [
         f"{g:g}"
         for g, r in zip(setup.magnifications, discrete.results, strict=True)
@@ -438,6 +460,7 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodF
     details = {
         "converged": not failed,
         "options": asdict(options),
+        **chosen,
         "separate": [
             _describe_separate(float(g), centre, result)
             for g, centre, result in zip(
@@ -448,12 +471,33 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodF
     return _MethodFit(
         functions,
         covariance,
-        lambda index: (functions_of(np.arange(count) != index)[0], None),
+        lambda index: (functions_of(used & (np.arange(count) != index))[0], None),
         np.full(len(setup.views), setup.priors.height_sigma_m),
         None,
         details,
         tuple(warnings),
     )
+
+
+def _select_by_step(
+    setup: Setup, discrete: DiscreteFit, options: MethodOptions
+) -> tuple[Mask, dict[str, Any]]:
+    """Return which magnifications the step selects, and how it was chosen, for the statistics."""
+
+    def rms_px(functions: Functions, covariance: Array) -> float:
+        model = _make_model(setup, functions, covariance, "pda")
+        height_m = setup.priors.height_sigma_m
+        return fit_poses(setup.views, model.at, height_sigma_m=height_m).rms_px()
+
+    trials: tuple[StepTrial, ...] = ()
+    step = options.pda_step
+    if step is None or isinstance(step, str):
+        trials = try_steps(
+            discrete, rms_px, order=options.pda_order, legendre_degree=options.legendre_degree
+        )
+        step = choose_step(trials)
+    used = select_magnifications(setup.magnifications, step)
+    return used, {"step": step, "steps": [asdict(trial) for trial in trials]}
 
 
 def _describe_separate(g: float, centre: Any, result: BundleResult) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.distortion_centre import DistortionCentre, find_distortion_centre
 from semcal_ros.core.calibration.initial_values import initial_values
@@ -56,6 +56,16 @@ class DiscreteFit:
     covariances: Array
     centres: tuple[DistortionCentre, ...]
     results: tuple[BundleResult, ...]
+
+    def select(self, keep: Mask) -> DiscreteFit:
+        """Return the calibrations of those magnifications where ``keep``, (M,), is true."""
+        return DiscreteFit(
+            self.magnifications[keep],
+            self.parameters[keep],
+            self.covariances[keep],
+            tuple(c for c, kept in zip(self.centres, keep, strict=True) if kept),
+            tuple(r for r, kept in zip(self.results, keep, strict=True) if kept),
+        )
 
 
 def _hold(problem: Problem, values: Mapping[str, float]) -> Problem:

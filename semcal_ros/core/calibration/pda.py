@@ -10,15 +10,106 @@ oscillate; all of these can be selected here so that the comparison can be repea
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.discrete import DiscreteFit
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-__all__ = ["ode_weights", "pda_functions"]
+__all__ = [
+    "FittedEquation",
+    "equation_error",
+    "focal_length_and_skew",
+    "list_equations",
+    "ode_weights",
+    "pda_functions",
+    "prime",
+]
+
+
+@dataclass(frozen=True)
+class FittedEquation:
+    """The differential equation of one parameter x, and the solution of it that was fitted.
+
+    ``D^k x = -w_(k-1) D^(k-1) x - ... - w_0 x``, (17)-(18), with D = d/du. The magnification is
+    rescaled: ``u = (g - low) / (high - low)`` goes from 0 to 1, so that the weights are plain
+    numbers. For derivatives with respect to g, divide w_j by ``(high - low)^(k - j)``. ``str``
+    gives the equation with six significant digits.
+
+    Attributes
+    ----------
+    name
+        The parameter, one of ``FUNCTION_NAMES``; ``scale`` is m over its nominal value.
+    weights
+        w_0 ... w_(k-1).
+    g_range
+        (low, high) magnification.
+    start
+        x and its first k - 1 derivatives with respect to u at ``low``.
+    end
+        x at ``high``.
+    """
+
+    name: str
+    weights: tuple[float, ...]
+    g_range: tuple[float, float]
+    start: tuple[float, ...]
+    end: float
+
+    @property
+    def order(self) -> int:
+        """Order k of the equation."""
+        return len(self.weights)
+
+    def __str__(self) -> str:
+        terms = [f"{-w:+.6g} {prime(j)}" for j, w in enumerate(self.weights)]
+        return f"{prime(self.order)} = {' '.join(reversed(terms))}"
+
+
+def list_equations(functions: Mapping[str, ContinuousFunction]) -> tuple[FittedEquation, ...]:
+    """List the equations of those functions that solve one, in the order of ``FUNCTION_NAMES``."""
+    return tuple(
+        FittedEquation(
+            name,
+            tuple(float(w) for w in function.shape),
+            function.g_range,
+            tuple(float(c) for c in function.coefficients),
+            function(function.g_range[1]),
+        )
+        for name in FUNCTION_NAMES
+        if (function := functions[name]).kind == "ode"
+    )
+
+
+def focal_length_and_skew(model: CalibrationModel, g: float) -> tuple[float, float]:
+    """Return the paper's f = m / rho and s = skew f of (9) at the magnification ``g``, px.
+
+    They are infinite for a parallel projection, rho = 0, and negative below.
+    """
+    camera = model.at(g)
+    f = camera.m / camera.rho if camera.rho != 0.0 else float("inf")
+    return f, camera.skew * f
+
+
+def prime(order: int) -> str:
+    """Return the derivative of x of this order as text: x, x', x'' and so on."""
+    return "x" + "'" * order
+
+
+def _equation_system(
+    position: Array, values: Array, weight: Array, order: int
+) -> tuple[Array, Array]:
+    """Return A and b of (20), each row times its weight: (n, order) and (n,)."""
+    derivatives = [values]
+    for _ in range(order):
+        derivatives.append(np.gradient(derivatives[-1], position, edge_order=1))
+    a = np.stack(derivatives[:order], axis=1) * weight[:, None]
+    return a, derivatives[order] * weight
 
 
 def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Array:
@@ -31,15 +122,46 @@ def ode_weights(position: Array, values: Array, weight: Array, order: int) -> Ar
     values, weight
         (n,) samples and their least-squares weights (1 / sigma).
     """
-    derivatives = [values]
-    for _ in range(order):
-        derivatives.append(np.gradient(derivatives[-1], position, edge_order=1))
-    a = np.stack(derivatives[:order], axis=1) * weight[:, None]
-    b = derivatives[order] * weight
+    a, b = _equation_system(position, values, weight, order)
     # Column scaling: the derivatives differ by orders of magnitude, and lstsq cuts small singular
     # values.
     scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     return -np.linalg.lstsq(a / scale, b, rcond=1e-10)[0] / scale
+
+
+def equation_error(discrete: DiscreteFit, order: int) -> float:
+    """Return the least-squares error of (19), relative: 1 if the equations explain nothing.
+
+    For each parameter it is ``|A w + b| / |b|``, with n - order degrees of freedom in the first
+    and n in the second norm; the result is its RMS over the parameters. A parameter whose
+    derivative of this order is zero everywhere counts as zero.
+    """
+    position = _rescale(discrete.magnifications)
+    count = len(position)
+    squares = []
+    for values, sigma in _list_samples(discrete):
+        a, b = _equation_system(position, values, 1.0 / sigma, order)
+        left = b + a @ ode_weights(position, values, 1.0 / sigma, order)
+        size = float(b @ b)
+        squares.append(float(left @ left) / size * count / (count - order) if size > 0.0 else 0.0)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _rescale(magnifications: Array) -> Array:
+    """Return (n,) positions from 0 to 1."""
+    low, high = magnifications[0], magnifications[-1]
+    return (magnifications - low) / (high - low)
+
+
+def _list_samples(discrete: DiscreteFit) -> list[tuple[Array, Array]]:
+    """Return (n,) values and (n,) sigmas of each parameter, in the order of ``FUNCTION_NAMES``."""
+    out = []
+    for i in range(len(FUNCTION_NAMES)):
+        values = discrete.parameters[:, i]
+        # Parameters held by their prior have no scatter of their own; all nodes then count equally.
+        floor = 1e-8 * (1.0 + np.abs(values))
+        out.append((values, np.maximum(np.sqrt(discrete.covariances[:, i, i]), floor)))
+    return out
 
 
 def _fit_curve(
@@ -105,13 +227,10 @@ def pda_functions(
             expected=f"at least {needed} for this method",
             do='record more magnifications or use method "joint"',
         )
-    position = (g - g[0]) / (g[-1] - g[0])
+    position = _rescale(g)
     functions: dict[str, ContinuousFunction] = {}
     blocks = []
-    for i, name in enumerate(FUNCTION_NAMES):
-        values = discrete.parameters[:, i]
-        # Parameters held by their prior have no scatter of their own; all nodes then count equally.
-        sigma = np.maximum(np.sqrt(discrete.covariances[:, i, i]), 1e-8 * (1.0 + np.abs(values)))
+    for name, (values, sigma) in zip(FUNCTION_NAMES, _list_samples(discrete), strict=True):
         if legendre_degree is None:
             weights = ode_weights(position, values, 1.0 / sigma, order)
             fitted = _fit_curve(name, "ode", order, weights, g, values, sigma)
