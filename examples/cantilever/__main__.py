@@ -8,6 +8,9 @@
 At a display width of 0.12 m, 35 um are more than the field (18.6 um at 6450x). So there are two experiments: `end` has
 the display width of the JSM-820 and only the free end in view; `whole` has one of 0.4 m and all of the cantilever.
 
+`--figure-16a` adds the comparison of the paper: the same frames, measured with separate calibrations that were made at
+exactly 6450x, 7760x and 8890x.
+
 Everything lands in cantilever_output/. `--quick` takes fewer frames and magnifications.
 """
 
@@ -27,6 +30,12 @@ from typing import Any
 
 import numpy as np
 
+from examples.cantilever.figure_16a import (
+    SCALES,
+    compare_calibrations,
+    draw_comparison,
+    show_comparison,
+)
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
     Drift,
@@ -37,6 +46,7 @@ from semcal_ros.synthetic import (
     truth_of,
 )
 from semcal_ros.synthetic.specimens.cantilever import (
+    CANTILEVER_MAGNIFICATIONS,
     CANTILEVER_PUSHES,
     CantileverPlan,
     cantilever_plan,
@@ -120,7 +130,9 @@ def compare(folder: Path) -> dict[str, float]:
     return out
 
 
-def run(experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: str) -> None:
+def run(
+    experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: str, figure_16a: bool
+) -> None:
     folder = output / experiment.name
     folder.mkdir(parents=True)
     microscope = experiment.microscope
@@ -142,10 +154,11 @@ def run(experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: 
     )
     record(plan, folder / "bending")
     poses = len({frame.pose for frame in plan.frames})
-    measured = ("measure", "cantilever", folder / "bending", "--calibration", calibration)
+    measured = ("measure", "cantilever", folder / "bending")
     where = ("--config", config, "--length", LENGTH_M, "--poses", poses, "--shape", shape)
     outputs = ("-o", folder / "bending.csv", "--plot", folder / "poses.png")
-    semcal(*measured, *where, *outputs, "--strip", folder / "strip.png")
+    drawn = (*outputs, "--strip", folder / "strip.png")
+    semcal(*measured, "--calibration", calibration, *where, *drawn)
     errors = compare(folder)
     for name in ("calibrated", "length"):
         if np.isfinite(errors[name]):
@@ -154,11 +167,33 @@ def run(experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: 
                 f"{1e9 * errors[name]:.2f} nm RMS, {1e9 * errors[name + '_largest']:.2f} nm at most, "
                 f"mean {1e9 * errors[name + '_bias']:.2f} nm; error over sigma {errors[name + '_z']:.2f}"
             )
+    if not figure_16a:
+        return
+    exactly = calibration_plan(
+        microscope,
+        magnifications=CANTILEVER_MAGNIFICATIONS,
+        views=3 if quick else 5,
+        seed=seed + 1,
+    )
+    record(exactly, folder / "grid_exactly")
+    separate = folder / "separate.yaml"
+    how = ("--config", config, "--method", "discrete")
+    semcal("calibrate", folder / "grid_exactly", *how, "-o", separate)
+    table = folder / "bending_separate.csv"
+    semcal(*measured, "--calibration", separate, *where, "-o", table)
+    truth = folder / "bending" / "truth.json"
+    for scale in SCALES if experiment.view == "whole" else ("calibration",):
+        compared = compare_calibrations(folder / "bending.csv", table, truth, scale=scale)
+        show_comparison(compared)
+        (folder / f"figure_16a_{scale}.png").write_bytes(draw_comparison(compared))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer frames and magnifications")
+    parser.add_argument(
+        "--figure-16a", action="store_true", help="also measure with separate calibrations"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--shape", default="free")
     parser.add_argument("--only", choices=[e.name for e in EXPERIMENTS])
@@ -168,7 +203,14 @@ def main() -> int:
     shutil.rmtree(given.output, ignore_errors=True)
     for experiment in EXPERIMENTS:
         if given.only in (None, experiment.name):
-            run(experiment, given.output, quick=given.quick, seed=given.seed, shape=given.shape)
+            run(
+                experiment,
+                given.output,
+                quick=given.quick,
+                seed=given.seed,
+                shape=given.shape,
+                figure_16a=given.figure_16a,
+            )
     print(
         f"\nLook at {given.output}/*/poses.png and strip.png ({time.monotonic() - started:.0f} s)"
     )
