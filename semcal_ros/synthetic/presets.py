@@ -14,8 +14,9 @@ __all__ = ["PRESETS", "preset"]
 
 
 def _jsm820() -> VirtualMicroscope:
-    # Ends and shapes after tables 2-4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, as
-    # read in design section 5.
+    # Only the distortion centre has the values of the tables of Malti et al. (2012),
+    # doi:10.1117/1.JEI.21.3.033020 (section 4.1.1). The others have the shapes that its text
+    # states, and values of a plausible microscope: doc/paper.md lists both.
     return VirtualMicroscope(
         name="jsm820",
         display_width_m=0.12,

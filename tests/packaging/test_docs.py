@@ -23,6 +23,7 @@ with warnings.catch_warnings():
 from semcal_ros.bridge.continuous_parameters import PARAMETER_KINDS
 from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.synthetic import preset
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.project import NODES, ROOT
 
@@ -215,6 +216,26 @@ def test_every_key_of_the_calibration_file_is_described() -> None:
     }
     text = _text("calibration_file.md")
     assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+def test_the_preset_beside_the_paper_is_that_of_the_code() -> None:
+    section = _section(_text("paper.md"), "The preset `jsm820`")
+    stated = {
+        name: [float(number) for number in re.findall(r"\d+\.?\d*", cell.rpartition(": ")[2])]
+        for name, cell in re.findall(r"^\| (\w+)[^|]*\|[^|]*\| ([^|]*?) \|$", section, re.MULTILINE)
+    }
+    low, high = (preset("jsm820").camera_at(g) for g in (100.0, 10000.0))
+    for name, field, digits in (
+        ("e_x", "ex", 2),
+        ("e_y", "ey", 2),
+        ("xi_r", "xi_r", 5),
+        ("xi_t", "xi_t", 6),
+        ("a", "aspect", 4),
+        ("s", "skew", 5),
+    ):
+        assert stated[name] == [round(getattr(camera, field), digits) for camera in (low, high)]
+    assert stated["f"] == [round(camera.m / camera.rho) for camera in (low, high)]
+    assert stated["p_x"] == [low.px, low.py] == [high.px, high.py]
 
 
 def test_the_notebook_snippet_runs(tmp_path: Path) -> None:
