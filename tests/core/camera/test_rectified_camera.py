@@ -139,7 +139,8 @@ def test_resizing_and_rectifying_commute(size):
     expected = s * (camera.rectified.project(POINTS) - MIDDLE) + 0.5 * (np.array(size) - 1.0)
     np.testing.assert_allclose(one.project(POINTS), expected, atol=1e-9)
     sigma = s * camera.rectified.project_sigma(POINTS)
-    np.testing.assert_allclose(one.project_sigma(POINTS), sigma, rtol=1e-9)
+    for resized in (one, other):
+        np.testing.assert_allclose(resized.project_sigma(POINTS), sigma, rtol=1e-9)
 
 
 # -- its uncertainty ------------------------------------------------------------------------------
