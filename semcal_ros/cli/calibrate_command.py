@@ -167,7 +167,7 @@ def command(
 
 
 def _echo_result(done: RecordingCalibration) -> None:
-    statistics = done.calibration.statistics
+    statistics, method = done.calibration.statistics, done.calibration.method
     rejected = done.collected.rejected
     total = statistics["views"] + len(rejected)
     echo_table(
@@ -188,7 +188,7 @@ def _echo_result(done: RecordingCalibration) -> None:
         click.echo("held out: calibrated without that magnification; * is extrapolated")
     click.echo(
         f"{statistics['views']} of {total} views, {statistics['corners']} corners, "
-        f"method {done.calibration.method}: RMS {statistics['rms_px']:.4f} px"
+        f"method {method}: RMS {statistics['rms_px']:.4f} px"
         + (
             f", held out {statistics['held_out_rms_px']:.4f} px"
             if statistics["held_out_rms_px"] is not None
@@ -201,7 +201,8 @@ def _echo_result(done: RecordingCalibration) -> None:
         click.echo("with a residual field for what the distortion parameters do not describe")
     told = sum(view.stage is not None for view in done.result.views)
     if told:
-        click.echo(f"the stage is known for {told} of {statistics['views']} views")
+        unused = "" if method == "joint" else f", but method {method} does not use it"
+        click.echo(f"the stage is known for {told} of {statistics['views']} views{unused}")
     for view in rejected[:10]:
         click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
     if len(rejected) > 10:

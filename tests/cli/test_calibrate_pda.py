@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.integrate import solve_ivp
 from semcal_ros import Calibration
 from semcal_ros.cli import calibrate_command
 from semcal_ros.core.calibration.calibrate import CalibrationOptions
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import SquareAssignment
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.workflows.calibrate import RecordingCalibration
@@ -120,6 +122,19 @@ def test_other_methods_print_no_equations(printed):
         out, cal = printed(*arguments)
         assert cal.equations == ()
         assert "dx/du" not in out
+
+
+def test_readings_of_a_stage_that_are_not_used_are_called_so(printed, monkeypatch):
+    plain = calibrate_command.calibrate_recording
+
+    def with_stage(*args, **given):
+        done = plain(*args, **given)
+        views = tuple(replace(v, stage=StageReading()) for v in done.result.views)
+        return replace(done, result=replace(done.result, views=views))
+
+    monkeypatch.setattr(calibrate_command, "calibrate_recording", with_stage)
+    out, _ = printed("--method", "pda", "--pda-order", 1)
+    assert "the stage is known for 28 of 28 views, but method pda does not use it" in out
 
 
 def test_the_choice_of_the_step_is_printed(printed):
