@@ -87,6 +87,9 @@ _COARSE = 1e-6
 # Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
 # change; with both fixed the turns converge.
 _MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
+# Part of the misfit that a field must explain: distortion of the scan that none of the other
+# parameters describes is explained to nine tenths, the waves of a grid to a sixth.
+_LEAST_EXPLAINED = 1.0 / 3.0
 # RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
 # the noise of good corners.
 _FIELD_CONVERGED_PX = 1e-3
@@ -403,13 +406,22 @@ def _largest_change(before: VarianceComponents, after: VarianceComponents) -> fl
     return float(np.max(np.abs(np.log(b / a))))
 
 
+def _grid_pattern(setup: Setup, adjustment: Adjustment, field: ResidualField) -> GridPattern | None:
+    """Return the pattern of displacements that turns with the grid, or None if there is none."""
+    system = field_system(setup, adjustment.problem, adjustment.result, field, of_grid=True)
+    choice = choose_field(setup, system, field)
+    return GridPattern(system, choice) if choice.worthwhile else None
+
+
 def _add_field(
     setup: Setup, adjustment: Adjustment, always: bool
 ) -> tuple[Adjustment, FittedField | None, GridPattern | None]:
     """Add a residual field, or return the adjustment unchanged where it is not worthwhile.
 
     What stays with the image is the microscope's; what turns with the grid is the grid's, and no
-    field is added for it. The one that predicts views that were left out better decides.
+    field is added for it. The one that predicts views that were left out better decides. Nor is a
+    field added that leaves most of the misfit: the lattices of the views may differ by quarter
+    turns and by whole squares, so that an irregular grid has no pattern of its own either.
 
     Each turn solves for camera and field together, and then adjusts poses and camera to
     observations that the field has corrected. In the first turns the strength of the field and the
@@ -424,12 +436,10 @@ def _add_field(
             if not (choice.worthwhile or always):
                 return start, None, None
             if turn == 0 and setup.shared and not always:
-                of_grid = field_system(
-                    setup, adjustment.problem, adjustment.result, field, of_grid=True
-                )
-                pattern = choose_field(setup, of_grid, blank)
-                if pattern.worthwhile and pattern.gain > choice.gain:
-                    return start, None, GridPattern(of_grid, pattern)
+                pattern = _grid_pattern(setup, adjustment, field)
+                of_grid = pattern is not None and pattern.choice.gain > choice.gain
+                if of_grid or choice.explained < _LEAST_EXPLAINED:
+                    return start, None, pattern
         theta, field = solve_field(system, choice.prior, blank)
         after = undo_field(setup, field)
         adjustment = _readjust(after, adjustment, theta, choosing=turn < _CHOOSING_TURNS)

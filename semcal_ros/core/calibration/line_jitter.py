@@ -28,9 +28,9 @@ from semcal_ros.core.calibration.normal_equations import (
 
 __all__ = ["LineJitter", "estimate_jitter", "jitter_covariance"]
 
-# Lengths of correlation that are tried, lines: that of one corner's window, and multiples of it up
-# to a quarter of a small image. Longer ones look like a drift.
-_LENGTHS = (1.5, 6.0, 24.0)
+# Lengths of correlation that are tried, lines: hardly more than one line, that of one corner's window,
+# and multiples of it up to a quarter of a small image. Longer ones look like a drift.
+_LENGTHS = (0.4, 1.5, 6.0, 24.0)
 # Products of residuals are compared up to this many lines apart.
 _MOST_LAG = 64
 # Improvement in chi-squares below which there is no jitter: three standard deviations.
@@ -73,8 +73,8 @@ def _views(problem: Problem) -> Iterator[slice]:
 
 
 def _lines(problem: Problem, part: slice) -> Indices:
-    """Return the line of each corner of a view, from 0."""
-    line = np.floor(problem.observed_px[part, 1]).astype(np.intp)
+    """Return the line of each corner of a view, from 0; pixel centres are at whole numbers."""
+    line = np.round(problem.observed_px[part, 1]).astype(np.intp)
     return np.asarray(line - line.min(), dtype=np.intp)
 
 

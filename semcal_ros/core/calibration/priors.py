@@ -54,9 +54,9 @@ class Priors:
     axis_miss_sigma_m
         How far the tilt axis misses the specimen, per direction.
     grid_stretch_sigma, grid_shear_sigma, grid_curvature_sigma, square_ratio_sigma
-        Shape of the grid: lithography keeps its axes equal and at right angles to about 1 part in
-        5000 and the sizes of its squares to 1 in 2000, and a chip has a radius of curvature of a
-        metre and more. Views override these by far where they say something else.
+        Shape of the grid: lithography keeps its axes equal and at right angles, and the sizes of its
+        squares, to about 1 part in 2000, and a chip has a radius of curvature of a metre and more.
+        Views override these by far where they say something else.
     stage_tilt_sigma, stage_axis_sigma, stage_wedge_sigma, untilted_sigma_rad
         Constant error of the tilt of a stage (half a degree) and of the direction of its axis (two
         degrees), the wedge between specimen and stage, and the tilt of an untilted view.
@@ -85,8 +85,8 @@ class Priors:
     visit_height_sigma_m: float = 2e-5
     drift_sigma_px: float = 0.1
     axis_miss_sigma_m: float = 3e-4
-    grid_stretch_sigma: float = 2e-4
-    grid_shear_sigma: float = 2e-4
+    grid_stretch_sigma: float = 5e-4
+    grid_shear_sigma: float = 5e-4
     grid_curvature_sigma: float = 1.0
     square_ratio_sigma: float = 5e-4
     stage_tilt_sigma: float = 0.0087

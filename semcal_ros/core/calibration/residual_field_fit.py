@@ -81,6 +81,8 @@ class FieldSystem:
         (M, ng): slice of the field per coefficient in log g.
     theta_mean, theta_precision
         (K,) prior of theta.
+    excess
+        Half chi-squares of the residuals beyond those that the corners' own noise explains.
     """
 
     information: Array
@@ -90,6 +92,7 @@ class FieldSystem:
     weights: Array
     theta_mean: Array
     theta_precision: Array
+    excess: float
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
         """Assemble the normal equations of theta and the field, which has precision ``prior``."""
@@ -151,6 +154,8 @@ class FieldChoice:
         Held-out half chi-squares that the field gains, and their standard error.
     worthwhile
         Whether the gain is significant.
+    explained
+        Part of the misfit that the field explains; infinite where there is no misfit.
     prior
         Prior precision of the coefficients.
     """
@@ -159,6 +164,7 @@ class FieldChoice:
     gain: float
     gain_sigma: float
     worthwhile: bool
+    explained: float
     prior: Array
 
 
@@ -252,6 +258,7 @@ def field_system(
         weights,
         problem.prior_mean,
         problem.prior_sigma**-2.0,
+        float(np.sum(result.huber_weight)) * (1.0 - 1.0 / variance),
     )
 
 
@@ -346,6 +353,7 @@ def choose_field(
         gain=gain,
         gain_sigma=sigma,
         worthwhile=gain > max(_LEAST_GAIN, _CLEARLY * sigma),
+        explained=gain / system.excess if system.excess > 0.0 else np.inf,
         prior=prior,
     )
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy import stats
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.joint import JointFit
@@ -19,12 +20,12 @@ __all__ = ["Hysteresis", "estimate_hysteresis", "estimate_repeatability", "scale
 _ONE_DIRECTION = 0.01
 # Part of the prior's 1-sigma of its change above which a parameter is not determined.
 _UNDETERMINED = 0.8
-# Fewer determined visits than this do not tell a spread: its own 1-sigma is half of it.
+# Fewer visits than this that show their effect do not tell a spread: its own 1-sigma is half of it.
 _ENOUGH_VISITS = 2.0
 # Constant error of a stage, in 1-sigmas of its prior, that says that the configuration is wrong.
 _SURPRISING = 4.0
-# Difference of the scale between magnifications reached from below and from above, in sigmas.
-_SIGNIFICANT = 3.0
+# Probability with which chance alone gives as large a hysteresis: that of three sigmas.
+_CHANCE = 0.0027
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Hysteresis:
     Attributes
     ----------
     relative, sigma
-        Scale from below minus scale from above, and its 1-sigma.
+        Scale from below minus scale from above: the mean over the magnifications, and its 1-sigma
+        from their scatter.
     pairs
         Number of magnifications that were reached from both.
     """
@@ -43,11 +45,18 @@ class Hysteresis:
     sigma: float
     pairs: int
 
+    @property
+    def is_significant(self) -> bool:
+        """Whether chance hardly explains it, by Student's t-test."""
+        limit = stats.t.ppf(1.0 - 0.5 * _CHANCE, self.pairs - 1)
+        return bool(abs(self.relative) > limit * self.sigma)
+
 
 def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
     """Compare the visits of magnifications that were reached from below and from above.
 
-    Returns None where no magnification was.
+    The scatter is that of the differences about their mean, since the spread of the visits holds the
+    hysteresis itself. Returns None where fewer than two magnifications were reached from both.
     """
     visit, groups = setup.visits
     number = np.zeros(len(groups), dtype=int)
@@ -63,16 +72,15 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
             kind = upward if groups[own] > groups[before] else downward
             kind.setdefault(int(groups[own]), []).append(float(effects[own]))
     both = sorted(set(upward) & set(downward))
-    if not both:
+    if len(both) < 2:
         return None
     difference = np.array([np.mean(upward[k]) - np.mean(downward[k]) for k in both])
-    counts = np.array([1.0 / len(upward[k]) + 1.0 / len(downward[k]) for k in both])
-    sigma = fit.adjustment.spread.scale.sigma * np.sqrt(np.sum(counts)) / len(both)
+    sigma = np.std(difference, ddof=1) / np.sqrt(len(both))
     return Hysteresis(float(np.mean(difference)), float(sigma), len(both))
 
 
 def _is_repeatability_known(fit: JointFit) -> bool:
-    return fit.adjustment.spread.scale.determined >= _ENOUGH_VISITS
+    return fit.adjustment.spread.scale.visible >= _ENOUGH_VISITS
 
 
 def estimate_repeatability(setup: Setup, fit: JointFit) -> float:
@@ -156,7 +164,7 @@ def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list
             "regular. No residual field is added for it; use another part of the grid, or another one"
         )
     hysteresis = estimate_hysteresis(setup, fit)
-    if hysteresis and abs(hysteresis.relative) > _SIGNIFICANT * hysteresis.sigma:
+    if hysteresis and hysteresis.is_significant:
         out.append(
             f"scale: magnifications reached from below show {100.0 * hysteresis.relative:+.2g} +- "
             f"{100.0 * hysteresis.sigma:.1g} % of the scale of those reached from above (hysteresis); "

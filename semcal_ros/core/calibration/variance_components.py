@@ -44,10 +44,14 @@ class Spread:
     determined
         How many of the effects the data determine; the relative 1-sigma of ``sigma`` is
         ``1 / sqrt(2 determined)``.
+    visible
+        How many of them the data would determine if the spread were the usual one: few where the
+        data say nothing about the spread, and many where they say that it is small.
     """
 
     sigma: float
     determined: float
+    visible: float = 0.0
 
     @property
     def sigma_of_sigma(self) -> float:
@@ -90,10 +94,15 @@ def initial_components(setup: Setup) -> VarianceComponents:
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
     """Update a spread from the residuals of its prior, in sigmas, and their posterior variances."""
-    determined = float(np.sum(np.maximum(1.0 - variance, 0.0)))
+    known_part = np.maximum(1.0 - variance, 0.0)
+    determined = float(np.sum(known_part))
+    # The information of the data on an effect is (1 / variance - 1) / sigma^2.
+    visible = float(np.sum(known_part / (known_part + variance * (sigma / usual) ** 2)))
     known = _WEIGHT_OF_USUAL
     square = (sigma**2 * float(np.sum(residuals**2)) + known * usual**2) / (determined + known)
-    return Spread(float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined)
+    return Spread(
+        float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined, visible
+    )
 
 
 def update_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
@@ -145,8 +154,9 @@ def _drift_sigma(problem: Problem, result: BundleResult, priors: Priors) -> Arra
     design = np.stack([np.ones_like(scale), scale**2], axis=1)
     determined = np.sum(np.maximum(1.0 - result.prior_variance[:, 1:3], 0.0), axis=1)
     square = sigma**2 * np.sum(result.prior_residuals[:, 1:3] ** 2, axis=1)
-    # The weights are those of chi-squares of the spread before; the last row is the usual one.
-    known = np.sqrt(_WEIGHT_OF_USUAL)
-    rows = np.vstack([design * (determined / sigma**2)[:, None], [known * usual**-2.0, 0.0]])
-    found, _ = nnls(rows, np.append(square / sigma**2, known))
+    # The weights are those of chi-squares of the spread before, with as many degrees of freedom as
+    # are determined; the last row is the usual one.
+    root, known = np.sqrt(np.maximum(determined, 1e-6)), np.sqrt(_WEIGHT_OF_USUAL)
+    rows = np.vstack([design * (root / sigma**2)[:, None], [known * usual**-2.0, 0.0]])
+    found, _ = nnls(rows, np.append(square / (root * sigma**2), known))
     return np.sqrt(np.clip(design @ found, (_LEAST * usual) ** 2, (_MOST * usual) ** 2))

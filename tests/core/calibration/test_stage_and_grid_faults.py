@@ -1,0 +1,204 @@
+"""Calibrations on stages, grids and scans with faults, from views that share no equations with the fit.
+
+What a fault does must come out, or the stated sigma must hold it, or a warning must name it. Truth is what the
+microscope would show at a next visit of magnifications between the calibrated ones.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.stage import StageAxis, StageReading
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
+
+MICROSCOPE = preset("jsm820")
+UPWARDS = (100.0, 500.0, 1500.0, 4000.0, 7000.0, 10000.0)
+VISITS = (*UPWARDS, *UPWARDS[-2::-1])
+BETWEEN = (200.0, 900.0, 2500.0, 5500.0, 8500.0)
+ANY_WAY = SimulatedStage(tilts_rad=(0.0, 0.45, 0.65), axis_rad=None)
+ONE_AXIS = replace(ANY_WAY, axis_rad=0.2)
+
+
+def views_of(stage, grid=None, *, camera_at=MICROSCOPE.camera_at, **options):
+    return stage_views(camera_at, VISITS, stage, grid, **options)
+
+
+def calibrated(views, **options):
+    return calibrate_views(
+        views,
+        image_size=MICROSCOPE.image_size,
+        display_width_m=MICROSCOPE.display_width_m,
+        options=CalibrationOptions(**options),
+    )
+
+
+def scale_scores(result):
+    """Errors of nm per pixel in stated sigmas, of both axes."""
+    scores = []
+    for g in BETWEEN:
+        camera, truth = result.model.at(g), np.array(MICROSCOPE.camera_at(g).pixel_size_m)
+        scores.append((np.array(camera.pixel_size_m) - truth) / camera.pixel_size_sigma_m)
+    return np.array(scores)
+
+
+def point_scores(result):
+    """Errors of projected points in stated sigmas."""
+    rng = np.random.default_rng(7)
+    scores = []
+    for g in BETWEEN:
+        camera, truth = result.model.at(g), MICROSCOPE.camera_at(g)
+        points = truth.sem_from_ideal(truth.undistort(rng.uniform(0.0, 511.0, (20, 2))))
+        error = camera.project(points) - truth.distort(truth.project_ideal(points))
+        scores.append(error / camera.project_sigma(points))
+    return np.concatenate(scores)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def assert_honest(result):
+    """The points and scales of one calibration share its errors: 2.5 stands for few independent cases."""
+    assert rms(scale_scores(result)) < 2.0
+    assert rms(point_scores(result)) < 2.5
+
+
+def shared(result):
+    return result.model.statistics["fit"]["grid_and_stage"]
+
+
+def estimated(result, name, truth):
+    """Deviation of a shared unknown from the truth, in its stated sigmas."""
+    return (shared(result)[name] - truth) / shared(result)[f"{name}_sigma"]
+
+
+def scale_notes(result):
+    return [w for w in result.warnings if w.startswith("scale:")]
+
+
+@pytest.mark.slow
+def test_a_wavy_grid_is_the_grids_and_no_residual_field():
+    result = calibrated(views_of(ANY_WAY, GridFaults(wave=1e-2), seed=1))
+    assert result.model.residual is None
+    assert any("grid is not regular" in note for note in scale_notes(result))
+    assert_honest(result)
+
+
+@pytest.mark.slow
+def test_a_bowed_stretched_and_sheared_grid_is_estimated():
+    grid = GridFaults(stretch=2e-3, shear=1e-3, curvature=20.0)
+    stage = replace(ONE_AXIS, reading_sigma_rad=0.003)
+    result = calibrated(views_of(stage, grid, seed=2, readings=True), axis=StageAxis(0.2))
+    truths = {"grid_stretch": 2e-3, "grid_shear": 1e-3, "grid_curvature_m": 20.0}
+    for name, truth in truths.items():
+        assert abs(estimated(result, name, truth)) < 3.0
+        # Known far better than its prior says.
+        assert shared(result)[f"{name}_sigma"] < 0.2 * truth
+    assert_honest(result)
+
+
+@pytest.mark.slow
+def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
+    result = calibrated(views_of(replace(ANY_WAY, line_jitter_px=0.05), seed=3))
+    # From some 12 000 corners of 33 images.
+    assert result.model.statistics["fit"]["line_jitter_px"] == pytest.approx(0.05, rel=0.25)
+    assert_honest(result)
+    quiet = calibrated(views_of(ANY_WAY, seed=3))
+    assert quiet.model.statistics["fit"]["line_jitter_px"] < 0.02
+
+
+@pytest.mark.slow
+def test_drift_within_images_does_not_become_skew_and_aspect():
+    result = calibrated(views_of(replace(ANY_WAY, drift_sigma_px=0.3), seed=4))
+    low, high = result.model.statistics["fit"]["drift_sigma_px"]
+    # Most of it looks like tilts: 20 of the 66 components are determined, and tell the spread to 16 %. Functions
+    # with fewer coefficients are preferred to a smaller drift, so that it comes out large rather than small.
+    assert 0.2 < low <= high < 0.6
+    assert_honest(result)
+
+
+@pytest.mark.slow
+def test_the_spread_of_visits_comes_out():
+    stage = replace(ANY_WAY, scale_sigma=3e-3)
+    result = calibrated(views_of(stage, seed=5))
+    said = result.model.statistics["fit"]
+    assert abs(said["repeatability"] - 3e-3) < 3.0 * said["repeatability_sigma"]
+    assert said["repeatability_sigma"] < 2e-3
+    # The next visit is less certain than the function.
+    camera = result.model.at(2500.0)
+    assert min(np.array(camera.pixel_size_sigma_m) / camera.pixel_size_m) > said["repeatability"]
+
+
+@pytest.mark.slow
+def test_hysteresis_is_named():
+    """Magnifications reached from below show 0.5 % more than from above."""
+    count = len(UPWARDS)
+    number = iter(range(len(VISITS)))
+
+    def camera_at(g):
+        camera = MICROSCOPE.camera_at(g)
+        return replace(camera, m=camera.m * (1.0025 if next(number) < count else 0.9975))
+
+    result = calibrated(views_of(replace(ANY_WAY, scale_sigma=2e-4), camera_at=camera_at, seed=6))
+    (note,) = (note for note in scale_notes(result) if "hysteresis" in note)
+    percent, sigma = (float(x) for x in re.search(r"show (\S+) \+- (\S+) %", note).groups())
+    assert abs(percent - 0.5) < 3.0 * sigma < 0.3
+
+
+@pytest.mark.slow
+def test_one_axis_without_a_stage_is_warned_of_and_untilted_views_help():
+    views = views_of(ONE_AXIS, seed=8)
+    free = calibrated(views, untilted="none")
+    assert any("about one axis" in note for note in scale_notes(free))
+    known = calibrated(views, untilted=tuple(v.name for v in views if v.name.endswith("/0")))
+    worse, better = (r.model.at(8500.0).covariance[1, 1] ** 0.5 for r in (free, known))
+    assert better < 0.2 * worse
+    assert rms(scale_scores(free)) < 2.0
+    assert rms(scale_scores(known)) < 2.0
+
+
+def _read(views, **changed):
+    """The views with one of them (the 20th) read differently."""
+    out = list(views)
+    out[20] = replace(views[20], stage=replace(views[20].stage, **changed))
+    return out
+
+
+@pytest.mark.slow
+def test_a_tilt_that_contradicts_the_image_is_named_and_not_used():
+    stage = replace(ONE_AXIS, reading_sigma_rad=0.003, miss_m=(1.6e-4, 0.0))
+    views = views_of(stage, seed=9, readings=True)
+    result = calibrated(_read(views, tilt_rad=views[20].stage.tilt_rad + 0.1), axis=StageAxis(0.2))
+    (note,) = (note for note in scale_notes(result) if "contradicts" in note)
+    assert f"view {views[20].name} at magnification" in note
+    assert_honest(result)
+    # The axis: beside the beam, across its direction of 0.2 rad.
+    truth = 1.6e-4 * np.array([-np.sin(0.2), np.cos(0.2)])
+    assert abs(estimated(result, "axis_x_m", truth[0])) < 3.0
+    assert abs(estimated(result, "axis_y_m", truth[1])) < 3.0
+
+
+@pytest.mark.slow
+def test_an_axis_the_wrong_way_round_is_said():
+    views = views_of(replace(ONE_AXIS, reading_sigma_rad=0.003), seed=10, readings=True)
+    result = calibrated(views, axis=StageAxis(0.2 + np.pi))
+    assert any("add 180 to stage.tilt_axis_deg" in note for note in scale_notes(result))
+
+
+@pytest.mark.slow
+def test_a_constant_error_of_the_stage_beyond_belief_is_said():
+    stage = replace(ONE_AXIS, reading_sigma_rad=0.003, tilt_error_rad=0.06)
+    result = calibrated(views_of(stage, seed=11, readings=True), axis=StageAxis(0.2))
+    (note,) = (note for note in scale_notes(result) if "degrees off" in note)
+    assert "the tilt of the stage is +3" in note or "the tilt of the stage is -3" in note
+
+
+def test_readings_must_be_numbers():
+    with pytest.raises(ValueError, match="tilt_rad"):
+        StageReading(float("nan"))
