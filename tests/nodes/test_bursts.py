@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rcl_interfaces.msg import ParameterType, ParameterValue
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64, Float64MultiArray
@@ -168,6 +169,19 @@ def test_ten_times_too_many_frames(peer: Peer, kind: Kind, calibration_file: Pat
         assert bench.watch.wait_fresh(kind.full_name)["level"] in ("0", "1")
 
 
+def publish_patiently(publisher: Any, message: bytes) -> None:
+    """Publish, and again where the middleware refuses for lack of room within its 100 ms.
+
+    Kilted does so now and then when nothing is left between the messages. It is the receiver that is tested here.
+    """
+    for _ in range(100):
+        with suppress(RCLError):
+            publisher.publish(message)
+            return
+        time.sleep(0.01)
+    raise AssertionError("the middleware takes no message")
+
+
 def test_ten_times_too_many_frames_for_the_calibration_server(peer: Peer) -> None:
     """It only keeps the newest one."""
     node = "/sem/calibration_server"
@@ -182,7 +196,7 @@ def test_ten_times_too_many_frames_for_the_calibration_server(peer: Peer) -> Non
         peer.wait_for(lambda: watch.count(node, "received") == 1, "a frame")
         before_kib = resident_kib(process.process.pid)
         for _ in range(3000):
-            image.publish(frame)
+            publish_patiently(image, frame)
         peer.wait_for(
             lambda: watch.count(node, "received") + watch.count(node, "dropped") == 3001,
             "all frames to be counted",
