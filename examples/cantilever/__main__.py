@@ -38,6 +38,8 @@ from examples.cantilever.figure_16a import (
 )
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
+    STAGES,
+    TYPICAL_GRID,
     Drift,
     RecordingPlan,
     VirtualMicroscope,
@@ -137,9 +139,10 @@ def run(
     folder.mkdir(parents=True)
     microscope = experiment.microscope
     config = config_of(microscope, folder)
-    grid = calibration_plan(
-        microscope, magnifications=QUICK_GRID if quick else GRID, views=3 if quick else 5, seed=seed
-    )
+    # As from a real stage: one tilt axis, which misses the specimen, and magnifications that do not quite come back.
+    recorded = {"views": 3 if quick else 5, "stage": STAGES["one-axis"], "grid": TYPICAL_GRID}
+    shown = QUICK_GRID if quick else GRID
+    grid = calibration_plan(microscope, magnifications=shown, seed=seed, **recorded)
     record(grid, folder / "grid")
     calibration = folder / "cal.yaml"
     semcal("calibrate", folder / "grid", "--config", config, "-o", calibration)
@@ -169,12 +172,8 @@ def run(
             )
     if not figure_16a:
         return
-    exactly = calibration_plan(
-        microscope,
-        magnifications=CANTILEVER_MAGNIFICATIONS,
-        views=3 if quick else 5,
-        seed=seed + 1,
-    )
+    shown = CANTILEVER_MAGNIFICATIONS
+    exactly = calibration_plan(microscope, magnifications=shown, seed=seed + 1, **recorded)
     record(exactly, folder / "grid_exactly")
     separate = folder / "separate.yaml"
     how = ("--config", config, "--method", "discrete")

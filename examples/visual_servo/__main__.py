@@ -1,7 +1,8 @@
 """Visual servoing of the virtual SEM's stage while the magnification is stepped from 500x to 5000x.
 
-1. The microscope is calibrated on a simulated recording of a chess grid: once with the continuous model over all
-   magnifications, once with the magnifications 500, 1000, 2000 and 5000 one by one, linear in between.
+1. The microscope is calibrated on a simulated recording of a chess grid, on a stage with one tilt axis that misses the
+   specimen: once with the continuous model over all magnifications, once with the magnifications 500, 1000, 2000 and
+   5000 one by one, linear in between.
 2. The same controller brings the same target to the same place of the sem frame, three times: on raw images with the
    scale of the display, with the interpolated calibration, and with the continuous one.
 3. What is judged is where the target really is.
@@ -20,6 +21,8 @@ import json
 import math
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +32,23 @@ from joblib import Parallel, cpu_count, delayed
 from examples.visual_servo.loop import Case, Run, Task, servo_run
 from semcal_ros import Calibration
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
-from semcal_ros.core.calibration.calibrate import CalibrationOptions
+from semcal_ros.config.config import load_config
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
     SQUARES_M,
+    STAGES,
+    TYPICAL_GRID,
     Pose,
+    RecordingPlan,
     VirtualMicroscope,
     calibration_plan,
     preset,
 )
-from semcal_ros.workflows.calibrate import calibrate_found
-from semcal_ros.workflows.find_grid import find_views
+from semcal_ros.workflows.calibrate import calibrate_found, options_for
+from semcal_ros.workflows.find_grid import NamedFrame, find_views
 
 CONTINUOUS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0, 7500.0, 10000.0)
 DISCRETE = (500.0, 1000.0, 2000.0, 5000.0)
@@ -57,22 +64,35 @@ NEAR_PX = 1.0
 LAST = 5
 
 
+def named_frames(plan: RecordingPlan) -> Iterator[NamedFrame]:
+    """Frames of the grid, with what the stage says about each."""
+    for index, frame in enumerate(plan.frames):
+        said = frame.position_read
+        stage = said and StageReading(said.tilt_rad, said.rotation_rad, said.scan_rotation_rad)
+        yield NamedFrame(f"frame {index}", plan.render(index), frame.magnification, stage)
+
+
 def calibrations(
     microscope: VirtualMicroscope, seed: int, *, quick: bool
 ) -> tuple[Calibration, Calibration]:
     """The continuous and the discrete calibration from one recording."""
     shown, views = (QUICK, QUICK_VIEWS) if quick else (CONTINUOUS, VIEWS)
-    plan = calibration_plan(microscope, magnifications=shown, views=views, seed=seed)
-    frames = (
-        (f"frame {i}", plan.render(i), frame.magnification) for i, frame in enumerate(plan.frames)
+    plan = calibration_plan(
+        microscope,
+        magnifications=shown,
+        views=views,
+        seed=seed,
+        stage=STAGES["one-axis"],
+        grid=TYPICAL_GRID,
     )
-    found, rejected = find_views(frames)
+    found, rejected = find_views(named_frames(plan))
     common = {"display_width_m": microscope.display_width_m, "squares_m": SQUARES_M}
-    continuous = calibrate_found(found, rejected, **common).calibration
+    # The direction of the tilt axis, as `semcal calibrate --config virtual_sem` takes it.
+    options = options_for(load_config("virtual_sem"))
+    continuous = calibrate_found(found, rejected, options=options, **common).calibration
     some = [view for view in found if view.magnification in DISCRETE]
-    discrete = calibrate_found(
-        some, [], options=CalibrationOptions(method="discrete"), **common
-    ).calibration
+    alone = replace(options, method="discrete")
+    discrete = calibrate_found(some, [], options=alone, **common).calibration
     return continuous, discrete
 
 
