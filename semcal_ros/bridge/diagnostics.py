@@ -105,6 +105,10 @@ class StreamStatistics:
         """Show one more key/value pair, such as a residual; the latest value of a key stays."""
         self._extra[key] = f"{value:.6g}" if isinstance(value, float) else str(value)
 
+    def forget(self, key: str) -> None:
+        """Show a key of :meth:`note` no longer, if it is shown."""
+        self._extra.pop(key, None)
+
     def _forget(self, now_s: float) -> None:
         while self._recent and self._recent[0][0] < now_s - self._window_s:
             self._recent.popleft()

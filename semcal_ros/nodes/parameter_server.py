@@ -77,9 +77,8 @@ class ParameterServer(SemNode):
         return True
 
     def conditions(self) -> list[str]:
-        """Extend the base class: also report a missing calibration."""
-        missing = self._calibration.current is None
-        return super().conditions() + ["uncalibrated"] * missing
+        """Extend the base class: also report a calibration that is missing, or whose scale is in doubt."""
+        return super().conditions() + self._calibration.conditions()
 
     # -- topics ------------------------------------------------------------------------------------
 

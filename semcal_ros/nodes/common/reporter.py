@@ -46,6 +46,10 @@ class Reporter:
         """Keep a value for the diagnostics."""
         self.statistics.note(key, value)
 
+    def forget(self, key: str) -> None:
+        """Leave a value out of the diagnostics from now on."""
+        self.statistics.forget(key)
+
     def info(self, text: str) -> None:
         """Log what a user may want to know."""
         self._logger.info(text)

@@ -62,10 +62,10 @@ class CalibratedStreamNode(StreamNode):
         return camera
 
     def conditions(self) -> list[str]:
-        """Extend the base class: also report a missing calibration, or one that does not cover the magnification."""
+        """Extend the base class: also report a calibration that is missing, or that does not cover the
+        magnification, or whose scale is in doubt.
+        """
         found = super().conditions()
-        if self.calibration.current is None:
-            found.append("uncalibrated")
-        elif self._out_of_range:
+        if self.calibration.current is not None and self._out_of_range:
             found.append("magnification outside the calibrated range")
-        return found
+        return found + self.calibration.conditions()

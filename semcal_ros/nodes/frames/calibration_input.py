@@ -15,6 +15,7 @@ from semcal_ros.bridge.calibration_text import (
     calibration_text_from_message,
     fill_calibration_text,
 )
+from semcal_ros.bridge.calibration_warnings import ScaleWarnings, read_scale_warnings
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -114,6 +115,7 @@ class CalibrationInput:
         self._on_change = on_change
         self._checked: tuple[str, _Loaded] | None = None
         self._loaded: _Loaded | None = None
+        self._warnings = ScaleWarnings()
         self._node_config = self._config = config
         self._published_digests: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_DIGESTS)
         self._parser = LatestWorker(endpoints.guard, _parse, self._on_parsed)
@@ -132,6 +134,12 @@ class CalibrationInput:
     def config(self) -> MicroscopeConfig:
         """The node's configuration with the display width of the calibration in force."""
         return self._config
+
+    def conditions(self) -> list[str]:
+        """Return what the diagnostics should say about the calibration in force, a few words each."""
+        if self._loaded is None:
+            return ["uncalibrated"]
+        return [self._warnings.summary] if self._warnings.count else []
 
     @property
     def has_published(self) -> bool:
@@ -229,3 +237,9 @@ class CalibrationInput:
         )
         self._reporter.note("calibration", source)
         self._reporter.note("calibration_digest", digest)
+        self._warnings = read_scale_warnings(calibration.statistics)
+        if self._warnings.count:
+            self._reporter.warn(self._warnings.summary)
+            self._reporter.note("calibration_warnings", self._warnings.details)
+        else:
+            self._reporter.forget("calibration_warnings")

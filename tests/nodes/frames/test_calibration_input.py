@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from semcal_ros.config.config import load_config
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
-from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter
+from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import make_calibration
 
 TIMEOUT_S = 30.0
@@ -30,12 +30,12 @@ class Bench:
         self.endpoints: Any = FakeEndpoints()
         self.parameters: Any = FakeParameters({"calibration": path})
         self.changes: list[float] = []
-        reporter, self.log = fake_reporter()
+        self.reporter, self.log = fake_reporter()
         self.input = CalibrationInput(
             load_config("generic"),
             self.parameters,
             self.endpoints,
-            reporter,
+            self.reporter,
             on_change=lambda: self.changes.append(self.width_m),
         )
 
@@ -144,3 +144,28 @@ def test_a_bad_text_is_refused_and_the_old_calibration_stays() -> None:
     callback(String(data=""), info)
     assert bench.width_m == 0.11
     assert any("calibration message with 0 bytes" in line for line in bench.log)
+
+
+def test_doubts_about_the_scale_are_logged_once_and_last_as_long_as_their_calibration(
+    tmp_path: Path,
+) -> None:
+    doubted = replace(
+        make_calibration(),
+        display_width_m=0.05,
+        statistics={"warnings": ["scale: the grid is worn", "few views", "scale: the tilt is off"]},
+    )
+    doubted.save(tmp_path / "cal.yaml")
+    bench = Bench(str(tmp_path / "cal.yaml"))
+    summary = "scale of the calibration: 2 warnings, the first: the grid is worn"
+    for _ in range(3):
+        assert bench.input.conditions() == [summary]
+    assert [line for line in bench.log if "grid is worn" in line] == [summary]
+    assert notes(bench.reporter)["calibration_warnings"] == "the grid is worn | the tilt is off"
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+    assert bench.input.conditions() == []
+    assert "calibration_warnings" not in notes(bench.reporter)
+
+
+def test_without_a_calibration_that_is_the_condition() -> None:
+    assert Bench().input.conditions() == ["uncalibrated"]
