@@ -20,8 +20,8 @@ __all__ = ["Hysteresis", "estimate_hysteresis", "estimate_repeatability", "scale
 _ONE_DIRECTION = 0.01
 # Part of the prior's 1-sigma of its change above which a parameter is not determined.
 _UNDETERMINED = 0.8
-# Fewer visits than this that show their effect do not tell a spread: its own 1-sigma is half of it.
-_ENOUGH_VISITS = 2.0
+# Fewer visits than this that show their effect do not tell a spread: its own 1-sigma is a third of it.
+_ENOUGH_VISITS = 4.0
 # Constant error of a stage, in 1-sigmas of its prior, that says that the configuration is wrong.
 _SURPRISING = 4.0
 # Probability with which chance alone gives as large a hysteresis: that of three sigmas.

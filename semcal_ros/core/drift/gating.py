@@ -1,12 +1,15 @@
-"""Gating: which unexpected shifts to use, and when to trust the prediction less."""
+"""Gating: which measured shifts to believe, and when to trust the prediction less."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
-from semcal_ros.core.drift.operations import Inflate
+from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.operations import Inflate, Measure
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
 
 __all__ = [
     "GATE",
@@ -14,12 +17,15 @@ __all__ = [
     "inflate_after_pause",
     "inflate_if_contradicted",
     "inflate_when_lost",
+    "judge_shift",
 ]
 
 
 #: Innovations beyond this normalised square occur in a correct filter once in a million frames
 #: (chi-square with 2 degrees of freedom).
 GATE = 27.6
+# Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
+_REACH_SIGMAS = 2.0
 # Divisions by intervals stay finite; no stream has frames that are nearer to each other.
 _MIN_INTERVAL_S = 1e-9
 # Keeps the scaled covariance invertible where a shift is predicted exactly.
@@ -95,6 +101,68 @@ def _inflate(position: Array, velocity: Array) -> Inflate:
     covariance = np.zeros((6, 6))
     covariance[:2, :2], covariance[2:4, 2:4] = position, velocity
     return Inflate(covariance)
+
+
+def judge_shift(
+    tests: OutlierTest,
+    state: DriftState,
+    measure: Measure,
+    nis: float,
+    frame: ScanFrame,
+    *,
+    is_first: bool,
+    last_s: float,
+    first_step_px: float,
+    max_jump: float,
+) -> Rejection[MatchFailure] | Inflate | None:
+    """Decide whether a measured shift is believed.
+
+    Parameters
+    ----------
+    tests
+        The test of unexpected shifts of this stream.
+    state
+        Prediction.
+    measure
+        The measured shift.
+    nis
+        Its innovation's normalised square.
+    frame
+        The frame that was measured.
+    is_first
+        Whether nothing was measured before: the first step has only a guessed prior, which must not
+        refuse what was registered well.
+    last_s
+        Time of the frame before.
+    first_step_px
+        1-sigma of the drift between the first two frames, px.
+    max_jump
+        Largest unexpected shift of a drift, in image sizes.
+
+    Returns
+    -------
+    Why the shift is not used, or the covariance inflation with which it is, or None where it is
+    used as it is.
+    """
+    expected, _ = state.predict_shift(measure.key)
+    x_px, y_px = np.abs(frame.px_from_unit @ (measure.shift[:2] - expected))
+    width, height = frame.size
+    is_outlier = nis > GATE
+    if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
+        reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
+        return Rejection(MatchFailure.STAGE_MOVE, reason)
+    if is_first or not is_outlier:
+        return None
+    position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
+    # What moves fast may also turn fast.
+    step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * (state.time_s - last_s)
+    reach_px = max(_REACH_SIGMAS * first_step_px, step_px)
+    reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
+    inflation = tests.explain(state, position, reach, last_s)
+    if inflation is None:
+        reason = f"shift is {np.sqrt(nis):.0f} deviations from the prediction"
+        return Rejection(MatchFailure.OUTLIER, reason)
+    return inflation
 
 
 def inflate_after_pause(speed: float, pause_s: float) -> Inflate:

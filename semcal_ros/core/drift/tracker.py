@@ -37,6 +37,7 @@ from semcal_ros.core.drift.gating import (
     inflate_after_pause,
     inflate_if_contradicted,
     inflate_when_lost,
+    judge_shift,
 )
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.keyframe import make_keyframe
@@ -59,8 +60,6 @@ from semcal_ros.core.registration.register import Registration, register
 __all__ = ["DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 
-# Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
-_REACH_SIGMAS = 2.0
 # The velocity is expected to change by this part of the first step per frame, to begin with.
 _VELOCITY_CHANGE = 0.1
 # A disputed position counts as three standard deviations away.
@@ -416,39 +415,32 @@ class DriftTracker:
         if match.candidate.rescaled:
             zoomed = add_zoom_uncertainty(measure, keyframe.frame, frame)
         outcome = zoomed(state, drift_filter.process_noise)
-        is_first, is_outlier = drift_filter.measured == 0, outcome.nis > GATE
         deviation = innovation / _DISPUTED_SIGMAS
-        disputed = np.outer(deviation, deviation)
-        x_px, y_px = np.abs(frame.px_from_unit @ innovation)
-        width, height = frame.size
-        max_jump = self.settings.max_jump
-        if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
-            reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
-            rejection = Rejection(MatchFailure.STAGE_MOVE, reason)
-            return _RejectedMatch(rejection, match.registration, disputed)
+        judged = judge_shift(
+            track.outliers,
+            state,
+            measure,
+            outcome.nis,
+            frame,
+            is_first=drift_filter.measured == 0,
+            last_s=track.time_s,
+            first_step_px=self.settings.first_step_px,
+            max_jump=self.settings.max_jump,
+        )
+        if isinstance(judged, Rejection):
+            disputed = np.outer(deviation, deviation)
+            return _RejectedMatch(judged, match.registration, disputed)
+        if judged is not None:
+            drift_filter.apply(judged)
         if outcome.shear_nis > GATE:
             measure = measure.without_shear()
-        since_s = state.time_s - track.time_s
-        # The first step has only a guessed prior, which must not refuse what was registered well.
-        if is_outlier and not is_first:
-            position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
-            # What moves fast may also turn fast.
-            step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * since_s
-            reach_px = max(_REACH_SIGMAS * self.settings.first_step_px, step_px)
-            reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
-            inflation = track.outliers.explain(state, position, reach, track.time_s)
-            if inflation is None:
-                deviations = np.sqrt(outcome.nis)
-                reason = f"shift is {deviations:.0f} deviations from the prediction"
-                rejection = Rejection(MatchFailure.OUTLIER, reason)
-                return _RejectedMatch(rejection, match.registration, disputed)
-            drift_filter.apply(inflation)
         if match.candidate.ratio > _SMALL_ZOOM:
             measure = self._change_scale(track, frame, match, replace(measure, zoom=zoomed.zoom))
         elif match.candidate.rescaled:
             # A zoom in small steps would make a long chain of keyframes.
             measure = zoomed
         drift_filter.update(measure)
+        since_s = state.time_s - track.time_s
         drift_filter.adapt_process_noise(outcome.nis, measure.covariance[:2, :2], since_s)
         return None
 

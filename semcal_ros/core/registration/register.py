@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.registration.acceptance import find_failure
 from semcal_ros.core.registration.ambiguity import NOTHING_TO_COMPARE, choose_peak
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
@@ -32,7 +33,6 @@ from semcal_ros.core.registration.noise_spectrum import (
     measure_image,
 )
 from semcal_ros.core.registration.normalised_correlation import (
-    CoarsePeak,
     CoarseReference,
     find_coarse_peaks,
 )
@@ -63,12 +63,6 @@ _MIN_SIGNAL = 0.06
 # The variance of the structure is at least this part of the whole, however large the noise is
 # estimated: the correlation stays finite.
 _MIN_SIGNAL_SHARE = 0.02
-# The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
-# textures whose reduced images alias.
-_STAGE_TOLERANCE_PX = 1.0
-# The two halves may differ by chance, and by what distortion is left in the images: 0.3 px is a
-# change of scale of 1 part in 1000 over the 300 px between the middles of halves of 600 px.
-_HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -321,7 +315,7 @@ def register(
     if alignment is None:
         return _reject(MatchFailure.UNDETERMINED, NOTHING_TO_COMPARE)
     correlation = _correct_correlation(reference, gray, alignment)
-    rejection = _check(reference.settings, peak, alignment, correlation, max_shear_px)
+    rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     moved = replace(
         alignment,
         shift_px=alignment.shift_px + origin,
@@ -343,44 +337,3 @@ def _correct_correlation(reference: Reference, gray: AnyImage, alignment: Alignm
     signal = max(whole - noise, _MIN_SIGNAL_SHARE * whole)
     image_signal = max(image_whole - image_noise, _MIN_SIGNAL_SHARE * image_whole)
     return float(min(alignment.common_covariance / np.sqrt(signal * image_signal), 1.0))
-
-
-def _check(
-    limits: RegistrationSettings,
-    peak: CoarsePeak,
-    alignment: Alignment,
-    correlation: float,
-    max_shear_px: float,
-) -> Rejection[MatchFailure] | None:
-    """Why an alignment must not be used, or None."""
-    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(alignment.covariance))))
-    if not worst <= limits.max_sigma_px:
-        return Rejection(
-            MatchFailure.UNDETERMINED, f"featureless in one direction (sigma {worst:.2f} px)"
-        )
-    if not alignment.converged:
-        return Rejection(
-            MatchFailure.NOT_CONVERGED,
-            f"refinement did not converge in {alignment.iterations} steps",
-        )
-    apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
-    if apart > peak.step_px + _STAGE_TOLERANCE_PX:
-        return Rejection(
-            MatchFailure.STAGES_DISAGREE, f"coarse and fine shift differ by {apart:.1f} px"
-        )
-    if correlation < limits.min_correlation:
-        return Rejection(
-            MatchFailure.DISSIMILAR,
-            f"images differ (noise-corrected correlation {correlation:.2f})",
-        )
-    allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
-    shear = np.abs(alignment.joint_px[2:])
-    if np.all(shear <= max_shear_px):
-        # Between the upper and the lower half, only the departure from one line counts.
-        allowed[1] += shear
-    if np.any(np.abs(alignment.half_difference_px) > allowed):
-        apart = float(np.max(np.abs(alignment.half_difference_px)))
-        return Rejection(
-            MatchFailure.HALVES_DISAGREE, f"halves of the image disagree by {apart:.1f} px"
-        )
-    return None

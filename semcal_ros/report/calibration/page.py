@@ -45,8 +45,8 @@ from semcal_ros.report.calibration.numbers import (
 from semcal_ros.report.calibration.paper import tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import plot_parameters
 from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes
-from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
 from semcal_ros.report.calibration.rms_figures import plot_residual_histogram, plot_rms
+from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
 from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters

@@ -34,8 +34,8 @@ from semcal_ros.report.calibration.numbers import (
 )
 from semcal_ros.report.calibration.paper import compute_median_px, tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
-from semcal_ros.report.calibration.prediction_figures import plot_predicted_errors
 from semcal_ros.report.calibration.rms_figures import plot_rms
+from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
 from semcal_ros.report.html.text import (
     format_length,
     format_magnification,

@@ -1,0 +1,77 @@
+"""Whether an alignment of two images is believed: tests that a wrong shift does not pass."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.inverse_compositional import Alignment
+from semcal_ros.core.registration.normalised_correlation import CoarsePeak
+from semcal_ros.core.registration.reference import RegistrationSettings
+
+__all__ = ["find_failure"]
+
+
+# The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
+# textures whose reduced images alias.
+_STAGE_TOLERANCE_PX = 1.0
+# The two halves may differ by chance, and by what distortion is left in the images: 0.3 px is a
+# change of scale of 1 part in 1000 over the 300 px between the middles of halves of 600 px.
+_HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
+
+
+def find_failure(
+    limits: RegistrationSettings,
+    peak: CoarsePeak,
+    alignment: Alignment,
+    correlation: float,
+    max_shear_px: float,
+) -> Rejection[MatchFailure] | None:
+    """Return why an alignment must not be used, or None.
+
+    Parameters
+    ----------
+    limits
+        The settings of the registration.
+    peak
+        The coarse shift at which the alignment started.
+    alignment
+        The fine shift.
+    correlation
+        That of the images over their overlap, after their noise has been accounted for.
+    max_shear_px
+        Largest difference between the upper and the lower end of the image that a drift during the
+        scan explains, px.
+    """
+    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(alignment.covariance))))
+    if not worst <= limits.max_sigma_px:
+        return Rejection(
+            MatchFailure.UNDETERMINED, f"featureless in one direction (sigma {worst:.2f} px)"
+        )
+    if not alignment.converged:
+        return Rejection(
+            MatchFailure.NOT_CONVERGED,
+            f"refinement did not converge in {alignment.iterations} steps",
+        )
+    apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
+    if apart > peak.step_px + _STAGE_TOLERANCE_PX:
+        return Rejection(
+            MatchFailure.STAGES_DISAGREE, f"coarse and fine shift differ by {apart:.1f} px"
+        )
+    if correlation < limits.min_correlation:
+        return Rejection(
+            MatchFailure.DISSIMILAR,
+            f"images differ (noise-corrected correlation {correlation:.2f})",
+        )
+    allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
+    shear = np.abs(alignment.joint_px[2:])
+    if np.all(shear <= max_shear_px):
+        # Between the upper and the lower half, only the departure from one line counts.
+        allowed[1] += shear
+    if np.any(np.abs(alignment.half_difference_px) > allowed):
+        apart = float(np.max(np.abs(alignment.half_difference_px)))
+        return Rejection(
+            MatchFailure.HALVES_DISAGREE, f"halves of the image disagree by {apart:.1f} px"
+        )
+    return None
