@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from semcal_ros.bridge.fields import require_fields
@@ -10,12 +11,15 @@ from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["doubt_unit", "read_stage"]
+__all__ = ["doubt_unit", "missing_joints", "read_stage", "require_radians", "tilt_jump_rad"]
 
 # A specimen that is tilted by a right angle is seen edge-on; some stages reach a degree or so more.
 _MAX_TILT_RAD = 1.6
 # No stage turns further than twice round, and angles of a scan end at half a turn or a turn.
 _MAX_TURN_RAD = 4.0 * math.pi
+# Motorised stages tilt by some degrees per second. A faster change of more than a small step is a
+# wrong reading, or the time of a message is.
+_STEP_RAD, _RATE_RAD_S = math.radians(10.0), math.radians(60.0)
 
 
 def read_stage(message: Any, source: StageConfig) -> StageReading:
@@ -69,3 +73,43 @@ def doubt_unit(reading: StageReading, source: StageConfig) -> str:
         if angle is not None and abs(angle) > limit:
             return f"{joint} {angle:g} rad"
     return ""
+
+
+def require_radians(reading: StageReading, source: StageConfig) -> None:
+    """Raise :class:`MessageError` for an angle that no stage has in rad."""
+    if doubt := doubt_unit(reading, source):
+        raise MessageError(
+            f"a stage with {doubt}",
+            expected="radians; this looks like degrees",
+            do="publish radians",
+        )
+
+
+def missing_joints(readings: Sequence[StageReading], source: StageConfig) -> list[str]:
+    """Return the joints that should be there and are in no reading.
+
+    These are the tilt in any case, and other angles to which the configuration gives a name of its own.
+    """
+    usual = StageConfig()
+    joints = (
+        (source.tilt, True, "tilt_rad"),
+        (source.rotation, source.rotation != usual.rotation, "rotation_rad"),
+        (
+            source.scan_rotation,
+            source.scan_rotation != usual.scan_rotation,
+            "scan_rotation_rad",
+        ),
+    )
+    return [
+        joint
+        for joint, wanted, name in joints
+        if wanted and all(getattr(reading, name) is None for reading in readings)
+    ]
+
+
+def tilt_jump_rad(before: StageReading | None, after: StageReading | None, time_s: float) -> float:
+    """Return the change of the tilt within ``time_s`` if no stage can make it, else zero."""
+    if before is None or after is None or before.tilt_rad is None or after.tilt_rad is None:
+        return 0.0
+    change = abs(after.tilt_rad - before.tilt_rad)
+    return change if change > _STEP_RAD and change > _RATE_RAD_S * abs(time_s) else 0.0

@@ -31,6 +31,7 @@ from semcal_ros.doctor.stream_checks import (
     check_large_images,
     check_magnification,
     check_output_rate,
+    check_stage,
     check_stamps,
     check_transport_time,
     describe_magnifications,
@@ -123,6 +124,9 @@ def evaluate(
         if output.type == "sensor_msgs/msg/Image":
             found += check_output_rate(images, output, session)
     found += _judge_calibrations(session, magnification, config, given)
+    for topic in topics:
+        if topic.keys == "stage":
+            found += check_stage(topic, session, config)
     return found + check_diagnostics(session, namespace)
 
 

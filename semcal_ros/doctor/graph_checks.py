@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 
@@ -40,6 +40,8 @@ class Topic:
         Whether two publishers would contradict each other.
     keys
         Keys of the configuration that name the topic; empty for fixed names.
+    optional
+        Whether an input may be missing.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Topic:
     is_input: bool = False
     single: bool = True
     keys: str = ""
+    optional: bool = False
 
 
 def resolve_topic(topic: str, namespace: str) -> str:
@@ -57,7 +60,7 @@ def resolve_topic(topic: str, namespace: str) -> str:
 
 def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
     """The topics of the suite for one microscope, the inputs first."""
-    images, g = config.image, config.magnification
+    images, g, stage = config.image, config.magnification, config.stage
     outputs = (
         ("image_rect", _IMAGE, "rectified images", True),
         ("image_stabilized", _IMAGE, "images without drift", True),
@@ -71,11 +74,17 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
     return (
         Topic(resolve_topic(images.topic, namespace), images.type, "images", True, keys="image"),
         Topic(resolve_topic(g.topic, namespace), g.type, g.quantity, True, keys="magnification"),
+        *([] if stage is None else [_stage_topic(stage, namespace)]),
         *(
             Topic(resolve_topic(name, namespace), kind, what, single=one)
             for name, kind, what, one in outputs
         ),
     )
+
+
+def _stage_topic(stage: StageConfig, namespace: str) -> Topic:
+    name = resolve_topic(stage.topic, namespace)
+    return Topic(name, stage.type, "stage", is_input=True, keys="stage", optional=True)
 
 
 def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
@@ -135,7 +144,8 @@ def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
     if not found:
         heard = f"heard by {_format_nodes(listeners)}" if listeners else "nobody listens"
         sent = f"{topic.type} by {_format_nodes(senders)} ({senders[0].quality})"
-        made = note if topic.is_input and not listeners else ok
+        # Only a calibration needs the stage.
+        made = note if topic.is_input and not topic.optional and not listeners else ok
         found.append(made(topic.name, f"{sent}, {heard}"))
     return found
 
@@ -147,11 +157,11 @@ def _format_nodes(endpoints: list[Endpoint]) -> str:
 def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
     for end in ends:
         if end.type != topic.type:
-            change = (
-                f"correct {topic.keys}.type in the configuration, or the node"
-                if topic.keys
-                else "correct the node"
-            )
+            change = "correct the node"
+            if topic.keys:
+                # No other type can be a stage.
+                key = "topic" if topic.keys == "stage" else "type"
+                change = f"correct {topic.keys}.{key} in the configuration, or the node"
             yield problem(
                 topic.name,
                 f"{end.type} is {verb} by {end.node}; types that differ never meet",
@@ -168,6 +178,13 @@ def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
         if any(e.type == topic.type for e in ends) and name.rpartition("/")[2] == last
     ]
     seen = "nobody publishes on it" + (f", but on {', '.join(sorted(same))}" if same else "")
+    if topic.optional:
+        return note(
+            topic.name,
+            f"{seen}; calibrations do without the {topic.what}",
+            expected=f"{topic.type} ({topic.what})",
+            do=f"publish it if there is one, or name its topic in a configuration ({topic.keys}.topic, --config)",
+        )
     return problem(
         topic.name,
         seen,
@@ -206,7 +223,7 @@ def _check_qualities(
                 expected="reliable",
                 do="change the quality of service of the publisher",
             )
-        if topic.keys == "magnification" and not sender.transient_local:
+        if topic.keys in ("magnification", "stage") and not sender.transient_local:
             yield note(
                 topic.name,
                 f"{sender.node} publishes {sender.quality}: a node that starts later gets the {topic.what} only with"

@@ -21,7 +21,9 @@ from rclpy.signals import SignalHandlerOptions
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
+from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import (
@@ -58,8 +60,8 @@ def observe(
     config
         The microscope.
     topics
-        The topics to check, image and magnification first; it subscribes to the images among them and to
-        `calibration`.
+        The topics to check, image and magnification first; it subscribes to the images among them, to the stage
+        and to `calibration`.
     namespace
         Namespace of the suite.
     seconds
@@ -97,6 +99,7 @@ class _Observer:
         self._arrivals: dict[str, list[Arrival]] = {}
         self._image: Any = None
         self._magnification: Any = None
+        self._stage: Any = None
         self._calibration: str | None = None
         self._statuses: dict[str, Status] = {}
         images, magnification = topics[:2]
@@ -109,6 +112,7 @@ class _Observer:
             f"{namespace}/image_stabilized": lambda _message: None,
             f"{namespace}/projection_stamped": lambda _message: None,
         }
+        self._takes.update({t.name: self._take_stage for t in topics if t.keys == "stage"})
         self._classes = {t.name: message_class(t.type) for t in topics if t.name in self._takes}
         self._subscribed: set[str] = set()
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEPTH)
@@ -125,6 +129,7 @@ class _Observer:
             if answer is None or len(answer) == len(_PARAMETERS)
         }
         reading, trouble = self._reading()
+        stage, stage_trouble = self._stage_reading()
         return Session(
             seconds=seconds,
             graph=replace(graph, parameters=values),
@@ -132,6 +137,8 @@ class _Observer:
             image=self._describe_image(),
             reading=reading,
             reading_trouble=trouble,
+            stage=stage,
+            stage_trouble=stage_trouble,
             calibration_text=self._calibration,
             statuses=tuple(self._statuses.values()),
         )
@@ -188,6 +195,9 @@ class _Observer:
     def _take_magnification(self, message: Any) -> None:
         self._magnification = message
 
+    def _take_stage(self, message: Any) -> None:
+        self._stage = message
+
     def _take_calibration(self, message: Any) -> None:
         self._calibration = message.data
 
@@ -217,6 +227,17 @@ class _Observer:
             return read_magnification(self._magnification, self._config), ""
         except SemcalError as error:
             return None, str(error)
+
+    def _stage_reading(self) -> tuple[StageReading | None, str]:
+        source = self._config.stage
+        if self._stage is None or source is None:
+            return None, ""
+        try:
+            reading = read_stage(self._stage, source)
+            require_radians(reading, source)
+        except SemcalError as error:
+            return None, str(error)
+        return reading, ""
 
     # -- graph -------------------------------------------------------------------------------------
 

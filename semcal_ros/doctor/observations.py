@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.core.calibration.stage import StageReading
 
 __all__ = [
     "SUITE",
@@ -190,6 +191,8 @@ class Session:
         The last one of the microscope; None where none came, or where it has to be decoded first.
     reading, reading_trouble
         The last magnification, and why it could not be read; None where none came.
+    stage, stage_trouble
+        The last reading of the stage, and why the last message could not be used; None where none came.
     calibration_text
         Of the topic; None where none came.
     statuses
@@ -202,5 +205,7 @@ class Session:
     image: ImageSeen | None = None
     reading: MagnificationReading | None = None
     reading_trouble: str = ""
+    stage: StageReading | None = None
+    stage_trouble: str = ""
     calibration_text: str | None = None
     statuses: tuple[Status, ...] = ()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 
+from semcal_ros.bridge.stage import missing_joints
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
@@ -21,6 +24,7 @@ __all__ = [
     "check_large_images",
     "check_magnification",
     "check_output_rate",
+    "check_stage",
     "check_stamps",
     "check_transport_time",
     "describe_magnifications",
@@ -123,6 +127,44 @@ def check_magnification(
     if seen.value is None:
         return [problem("magnification", seen.trouble)]
     return [ok("magnification", f"{seen.value:g}")]
+
+
+def check_stage(topic: Topic, session: Session, config: MicroscopeConfig) -> list[Finding]:
+    """Check whether the stage says its angles; empty without a publisher of the right type."""
+    senders = session.graph.publishers.get(topic.name, ())
+    if config.stage is None or not any(sender.type == topic.type for sender in senders):
+        return []
+    if session.stage_trouble:
+        return [problem("stage", session.stage_trouble)]
+    if session.stage is None:
+        return [
+            note(
+                "stage",
+                f"{topic.name} has a publisher, but nothing arrived within {session.seconds:g} s; views have no tilt"
+                " before it is known",
+                do="move the stage once, or make the publisher transient local",
+            )
+        ]
+    missing = missing_joints([session.stage], config.stage)
+    if missing:
+        return [
+            note(
+                "stage",
+                f"no joint {', '.join(missing)} on {topic.name}",
+                expected="the joints that the configuration names",
+                do="correct the names in the configuration (stage.tilt and the like), or the node",
+            )
+        ]
+    return [ok("stage", _format_angles(session.stage))]
+
+
+def _format_angles(stage: StageReading) -> str:
+    angles = (
+        ("tilt", stage.tilt_rad),
+        ("rotation", stage.rotation_rad),
+        ("scan rotation", stage.scan_rotation_rad),
+    )
+    return ", ".join(f"{name} {math.degrees(a):.1f} degrees" for name, a in angles if a is not None)
 
 
 def check_stamps(topic: Topic, session: Session) -> list[Finding]:

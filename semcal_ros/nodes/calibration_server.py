@@ -100,6 +100,10 @@ class CalibrationServer(StreamNode):
         self.closing.callback(self._end_calibration)
         self._report_progress("no views yet")
 
+    def conditions(self) -> list[str]:
+        """Extend the base class: also report what is wrong with the stage."""
+        return super().conditions() + self._position.conditions()
+
     def _end_calibration(self) -> None:
         with self._lock:
             running = self._running
@@ -179,6 +183,7 @@ class CalibrationServer(StreamNode):
             count = len(self._views)
             self._views.clear()
             self._added = None
+            self._position.forget_doubt()
         return f"{count} views removed"
 
     def _calibrate(self) -> str:
@@ -211,6 +216,11 @@ class CalibrationServer(StreamNode):
             if not self._views:
                 raise CalibrationError("no usable view yet", do="call ~/add_view first")
             views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
+            notes: tuple[str, ...] = ()
+            if (doubt := self._position.doubt) and any(v.stage is not None for v in views):
+                # As from a recording: small angles in degrees have passed for radians.
+                views = tuple(replace(v, stage=None) for v in views)
+                notes = (f"stage: {doubt} looks like degrees: the stage is not used",)
             config, values = self.config, self.parameters
             job = CalibrationJob(
                 views,
@@ -221,6 +231,7 @@ class CalibrationServer(StreamNode):
                     CalibrationOptions(method=values["method"], residual=values["residual"]),
                 ),
                 config.grid_certificate,
+                notes,
             )
             self._running = CalibrationProcess(job)
             return self._running

@@ -15,7 +15,8 @@ import pytest
 
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
-from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, StageConfig
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.doctor import environment_checks as checks
 from semcal_ros.doctor.calibration_checks import check_calibration, describe_calibration
 from semcal_ros.doctor.diagnosis import evaluate
@@ -43,6 +44,7 @@ from semcal_ros.doctor.stream_checks import (
     check_large_images,
     check_magnification,
     check_output_rate,
+    check_stage,
     check_stamps,
     check_transport_time,
     describe_magnifications,
@@ -55,7 +57,7 @@ OK, NOTE, PROBLEM = Severity.OK, Severity.NOTE, Severity.PROBLEM
 MIB = 1024**2
 CONFIG = MicroscopeConfig("test", 0.12)
 CALIBRATION = make_calibration()
-IMAGES, MAGNIFICATION, RECT, *_ = suite_topics(CONFIG, "/sem")
+IMAGES, MAGNIFICATION, STAGE, RECT, *_ = suite_topics(CONFIG, "/sem")
 NOW_NS = 1_800_000_000_000_000_000
 AROUND = Environment(
     python=(3, 12),
@@ -372,6 +374,7 @@ def session(**changes: Any) -> Session:
             publishers={
                 IMAGES.name: (SEM,),
                 MAGNIFICATION.name: (Endpoint("/driver", MAGNIFICATION.type, True, True),),
+                STAGE.name: (Endpoint("/driver", STAGE.type, True, True),),
             },
             subscriptions={
                 IMAGES.name: (HEAR,),
@@ -381,6 +384,7 @@ def session(**changes: Any) -> Session:
         arrivals={IMAGES.name: arrivals()},
         image=ImageSeen(96, 96, "mono8", 96 * 96),
         reading=MagnificationReading(1000.0, None, CONFIG),
+        stage=StageReading(0.1, 0.2),
         statuses=(Status("/sem/rectifier", 0, "10 Hz"),),
     )
     return replace(made, **changes)
@@ -459,6 +463,35 @@ def test_magnification() -> None:
     # 96 px of 1 um on a display of 0.12 m.
     only(found(session(reading=reading), pixel), OK, "1250")
     only(found(session(reading=reading, image=None), pixel), PROBLEM, "width")
+
+
+def test_a_stage_is_not_needed_but_must_be_of_its_type() -> None:
+    knob = Endpoint("/driver", STAGE.type, True, True)
+    # Nobody has to listen before something is calibrated.
+    only(check_topic(STAGE, Graph(publishers={STAGE.name: (knob,)})), OK, "/driver")
+    only(check_topic(STAGE, Graph()), NOTE, "nobody publishes", "stage.topic", "do without")
+    twist = Graph(publishers={STAGE.name: (replace(knob, type="geometry_msgs/msg/Twist"),)})
+    only(check_topic(STAGE, twist), PROBLEM, "Twist", STAGE.type, "stage.topic")
+    assert check_stage(STAGE, session(graph=twist), CONFIG) == []
+    volatile = Graph(publishers={STAGE.name: (replace(knob, transient_local=False),)})
+    only(check_topic(STAGE, volatile), NOTE, "starts later gets the stage only")
+    without = suite_topics(replace(CONFIG, stage=None), "/sem")
+    assert STAGE.name not in [topic.name for topic in without]
+    own = replace(CONFIG, stage=StageConfig(topic="/axes"))
+    assert "/axes" in [topic.name for topic in suite_topics(own, "/sem")]
+
+
+def test_what_the_stage_says() -> None:
+    only(check_stage(STAGE, session(), CONFIG), OK, "tilt 5.7 degrees, rotation 11.5 degrees")
+    only(check_stage(STAGE, session(stage=None), CONFIG), NOTE, "nothing arrived within 3 s")
+    doubted = session(stage=None, stage_trouble="tilt 30 rad; expected radians; publish radians")
+    only(check_stage(STAGE, doubted, CONFIG), PROBLEM, "tilt 30 rad")
+    named = replace(CONFIG, stage=StageConfig(rotation="R"))
+    heard = session(stage=StageReading(None, None, 0.1))
+    only(check_stage(STAGE, heard, CONFIG), NOTE, "no joint tilt on /sem/stage", "stage.tilt")
+    only(check_stage(STAGE, heard, named), NOTE, "no joint tilt, R")
+    assert check_stage(STAGE, session(), replace(CONFIG, stage=None)) == []
+    assert check_stage(STAGE, session(graph=Graph()), CONFIG) == []
 
 
 def test_diagnostics() -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Twist
+from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import JointState
 
 from semcal_ros.calibration import Calibration
@@ -87,15 +89,49 @@ def test_a_view_keeps_what_the_stage_said(session: Session) -> None:
         return "looks like degrees" in session.peer.state(SERVER).get("last_rejection", "")
 
     session.peer.wait_for(rejected, "the rejection")
+    assert "tilt 17.2 rad on stage: degrees?" in session.peer.state(SERVER)["message"]
     session.show(PLAN.render(1), PLAN.frames[1].magnification)
     assert "tilted" not in session.call("add_view").message
+    publisher.publish(JointState(name=["alpha"], position=[0.3]))
+    session.peer.wait_for(
+        lambda: "no joint tilt on stage" in session.peer.state(SERVER)["message"], "the joint"
+    )
+    session.peer.node.destroy_publisher(publisher)
+
+
+def test_a_stage_of_another_type_is_named_and_views_are_taken_without_it(session: Session) -> None:
+    silent = PublisherEventCallbacks(use_default_callbacks=False)
+    publisher = session.peer.node.create_publisher(Twist, "stage", LATCHED, event_callbacks=silent)
+    session.peer.wait_for(
+        lambda: "geometry_msgs/msg/Twist on stage" in session.peer.state(SERVER)["message"],
+        "the type",
+    )
+    session.show(PLAN.render(2), PLAN.frames[2].magnification)
+    answer = session.call("add_view")
+    assert answer.success
+    assert "tilted" not in answer.message
     session.peer.node.destroy_publisher(publisher)
 
 
 def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path: Path) -> None:
     assert session.call("clear").success
+    # Degrees that pass for radians, until one does not.
+    stage = session.peer.node.create_publisher(JointState, "stage", LATCHED)
+    stage.publish(JointState(name=["tilt"], position=[1.0]))
+
+    def tilted() -> bool:
+        session.show(PLAN.render(0), PLAN.frames[0].magnification)
+        return session.peer.state(SERVER).get("stage_tilt_rad") == "1"
+
+    session.peer.wait_for(tilted, "the stage")
+    assert "degrees?" not in session.peer.state(SERVER)["message"]
     for index in range(len(PLAN.frames)):
         session.add_view(index)
+    stage.publish(JointState(name=["tilt"], position=[30.0]))
+    session.peer.wait_for(
+        lambda: "tilt 30 rad on stage" in session.peer.state(SERVER)["message"], "the doubt"
+    )
+    session.peer.node.destroy_publisher(stage)
     assert not session.call("add_view").success  # the same frame again
     overlay = session.peer.wait_for(lambda: session.overlays[-1], "the overlay")
     assert (overlay.encoding, overlay.width, overlay.height) == ("bgr8", SIZE, SIZE)
@@ -123,6 +159,8 @@ def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path
             asked_during.add(stage)
         session.wait_seen(MAGNIFICATIONS[0])
     assert calibrated.result().success, calibrated.result().message
+    doubt = "stage: tilt 30 rad looks like degrees: the stage is not used"
+    assert doubt in calibrated.result().message
     # Not only before it has begun in earnest.
     assert asked_during - {"", "start", "done"}
     # By the latched topic, it has reached even the server that answered from another one.
@@ -130,6 +168,7 @@ def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path
     calibration = Calibration.loads(text)
     assert calibration.magnifications == MAGNIFICATIONS
     assert calibration.method == "joint"
+    assert not [w for w in calibration.statistics["warnings"] if "contradicts the tilt" in w]
 
     shown = [{v.key: v.value for v in status.values} for status in session.progress[start:]]
     fractions = [float(values["fraction"]) for values in shown if "fraction" in values]

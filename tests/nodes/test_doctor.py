@@ -16,7 +16,7 @@ import pytest
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 
 from semcal_ros.bridge.headers import fill_stamp
@@ -133,6 +133,8 @@ def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> Non
     assert report.has("ok", "stamps", "ms old")
     assert report.has("ok", "clocks", "from publisher to here")
     assert report.has("ok", "magnification", "1000")
+    assert report.has("ok", "/sem/stage", "sensor_msgs/msg/JointState by /sem/virtual_sem")
+    assert report.has("ok", "stage", " tilt ", " degrees, rotation ")
     assert report.has("ok", "calibration", "topic calibration", "500x to 8000x", "1-sigma")
     assert report.has("ok", "parameters", "all nodes answer")
     assert report.has("ok", "time", "real")
@@ -145,6 +147,7 @@ def test_wrong_types_weak_and_doubled_publishers_and_clocks_are_named(peer: Peer
         Image, "/sem/image_raw", BEST_EFFORT, event_callbacks=silent
     )
     peer.node.create_publisher(String, "/sem/magnification", LATCHED, event_callbacks=silent)
+    peer.node.create_publisher(String, "/sem/stage", LATCHED, event_callbacks=silent)
     # A viewer that insists on what this publisher does not offer.
     viewer = Peer("viewer", namespace="lab")
     viewer.collect(Image, "/sem/image_raw", RELIABLE)
@@ -162,6 +165,7 @@ def test_wrong_types_weak_and_doubled_publishers_and_clocks_are_named(peer: Peer
     assert report.status == 1
     assert report.has("problem", "2 nodes have the name /sem/rectifier")
     assert report.has("problem", "/sem/magnification", "std_msgs/msg/String", "/lab/driver")
+    assert report.has("problem", "/sem/stage", "std_msgs/msg/String", "sensor_msgs/msg/JointState")
     assert report.has("problem", "/lab/viewer asks for reliable", "/lab/driver offers best effort")
     assert report.has("problem", "stamps", "in the future")
     assert report.has("note", "/sem/image_raw", "best effort", "lost")
@@ -174,6 +178,8 @@ def test_a_calibration_that_does_not_fit_and_a_clock_nobody_uses_are_named(
 ) -> None:
     images = peer.node.create_publisher(Image, "/sem/image_raw", RELIABLE)
     magnification = peer.node.create_publisher(Float64, "/sem/magnification", LATCHED)
+    stage = peer.node.create_publisher(JointState, "/sem/stage", LATCHED)
+    stage.publish(JointState(name=["alpha"], position=[0.1]))
     clock = peer.node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
     magnification.publish(magnification_message(50.0))
     message = image_message(np.ascontiguousarray(texture()[:80]))
@@ -198,6 +204,7 @@ def test_a_calibration_that_does_not_fit_and_a_clock_nobody_uses_are_named(
     assert report.has(
         "note", "time", "/lab/driver publishes /clock", "/sem/rectifier", "use_sim_time"
     )
+    assert report.has("note", "stage", "no joint tilt on /sem/stage")
     assert report.has("note", "/sem/rectifier", "outside the calibrated range")
 
 
@@ -206,4 +213,5 @@ def test_nothing_but_an_image_elsewhere(peer: Peer) -> None:
     report = examine(peer)
     assert report.status == 1
     assert report.has("problem", "/sem/image_raw", "nobody publishes", "/camera/image_raw")
+    assert report.has("note", "/sem/stage", "nobody publishes", "without the stage")
     assert report.has("note", "no node of the suite runs in /sem")

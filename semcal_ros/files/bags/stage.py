@@ -10,7 +10,7 @@ import math
 from itertools import pairwise
 
 from semcal_ros.bridge.scan_interval import scan_interval_ns
-from semcal_ros.bridge.stage import doubt_unit, read_stage
+from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt_jump_rad
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
@@ -20,9 +20,6 @@ from semcal_ros.files.bags.topics import topic_matches
 
 __all__ = ["StageTrack", "find_stage"]
 
-# Motorised stages tilt by some degrees per second. A faster change of more than a small step is a
-# wrong reading, or the time of a message is.
-_STEP_RAD, _RATE_RAD_S = math.radians(10.0), math.radians(60.0)
 _UNUSED = "the stage is not used"
 
 
@@ -73,8 +70,19 @@ class StageTrack(HeldValues[StageReading]):
                 f"{len(self.bad)} messages on {self._topic} are ignored, the first: {self.bad[0]}"
             )
         notes += [
-            f"no message on {self._topic} has the joint {joint}" for joint in self._missing_joints()
+            f"no message on {self._topic} has the joint {joint}"
+            for joint in missing_joints(self._readings, self._source)
         ]
+        for joint, name in (
+            (self._source.tilt, "tilt_rad"),
+            (self._source.rotation, "rotation_rad"),
+            (self._source.scan_rotation, "scan_rotation_rad"),
+        ):
+            without = sum(getattr(reading, name) is None for reading in self._readings)
+            if 0 < without < len(self._readings):
+                notes.append(
+                    f"{without} of {len(self._readings)} messages on {self._topic} lack the joint {joint}"
+                )
         jumps = list(self._jumps())
         if jumps:
             degrees, seconds, at_ns = jumps[0]
@@ -84,36 +92,21 @@ class StageTrack(HeldValues[StageReading]):
             )
         return notes
 
-    def _missing_joints(self) -> list[str]:
-        """Joints that the configuration names and no message has; the tilt in any case."""
-        source, usual = self._source, StageConfig()
-        joints = (
-            (source.tilt, True, "tilt_rad"),
-            (source.rotation, source.rotation != usual.rotation, "rotation_rad"),
-            (
-                source.scan_rotation,
-                source.scan_rotation != usual.scan_rotation,
-                "scan_rotation_rad",
-            ),
-        )
-        return [
-            joint
-            for joint, wanted, name in joints
-            if wanted and all(getattr(reading, name) is None for reading in self._readings)
-        ]
-
     def _jumps(self) -> list[tuple[float, float, int]]:
         """(degrees, seconds, time in ns) of each change of the tilt that no stage can make."""
         tilts = [
-            (time_ns, reading.tilt_rad)
+            (time_ns, reading)
             for time_ns, reading in self.timed
             if reading is not None and reading.tilt_rad is not None
         ]
-        return [
-            (math.degrees(abs(after - before)), (end_ns - start_ns) * 1e-9, end_ns)
+        seen = (
+            (tilt_jump_rad(before, after, (end_ns - start_ns) * 1e-9), start_ns, end_ns)
             for (start_ns, before), (end_ns, after) in pairwise(tilts)
-            if abs(after - before) > _STEP_RAD
-            and abs(after - before) > _RATE_RAD_S * (end_ns - start_ns) * 1e-9
+        )
+        return [
+            (math.degrees(change), (end_ns - start_ns) * 1e-9, end_ns)
+            for change, start_ns, end_ns in seen
+            if change
         ]
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.stage import doubt_unit, read_stage
+from semcal_ros.bridge.stage import (
+    doubt_unit,
+    missing_joints,
+    read_stage,
+    require_radians,
+    tilt_jump_rad,
+)
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.errors import MessageError, SemcalError
+from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import value_input
@@ -22,13 +29,15 @@ __all__ = ["StageInput"]
 
 # More changes than can precede a late frame.
 _KEPT = 4096
+# Names of joints in a warning, enough to see what there is instead.
+_NAMES = 8
 
 
 class StageInput:
     """History of the topic of the stage; a reading is valid from its stamp to the next one.
 
     Messages without a stamp count when they arrive. An unusable message makes the stage unknown until
-    the next usable one.
+    the next usable one. A tilt that jumps is used, with a warning.
 
     Parameters
     ----------
@@ -51,6 +60,10 @@ class StageInput:
         self._reporter = reporter
         self._history: ZeroOrderHold[StageReading | None] = ZeroOrderHold(_KEPT)
         self._stamped = True
+        self._doubt = ""
+        self._missing: list[str] = []
+        self._last: tuple[int, StageReading] | None = None
+        self._jumps = 0
         if source is not None:
             self._subscription = endpoints.subscribe(
                 message_class(source.type), source.topic, self._on_message, value_input(), group
@@ -66,20 +79,59 @@ class StageInput:
         stamped = stamp_ns != 0
         if stamped != self._stamped:
             self._history.clear()
+            self._last = None
             self._stamped = stamped
-        self._history.insert(stamp_ns or published_ns(info), reading)
+        time_ns = stamp_ns or published_ns(info)
+        self._history.insert(time_ns, reading)
+        if reading is not None:
+            self._look_for_jump(time_ns, reading)
 
     def _read(self, message: Any) -> StageReading | None:
         if self._source is None:
             return None
         reading = read_stage(message, self._source)
-        if doubt := doubt_unit(reading, self._source):
-            raise MessageError(
-                f"a stage with {doubt}",
-                expected="radians; this looks like degrees",
-                do="publish radians",
+        self._doubt = self._doubt or doubt_unit(reading, self._source)
+        require_radians(reading, self._source)
+        missing = missing_joints([reading], self._source)
+        if missing and missing != self._missing:
+            names = ", ".join(str(name) for name in message.name[:_NAMES]) or "none"
+            self._reporter.warn(
+                f"no joint {', '.join(missing)} on {self._source.topic}; its joints: {names}"
             )
+        self._missing = missing
         return reading
+
+    def _look_for_jump(self, time_ns: int, reading: StageReading) -> None:
+        last, self._last = self._last, (time_ns, reading)
+        if last is None or self._source is None:
+            return
+        seconds = (time_ns - last[0]) * 1e-9
+        if change := tilt_jump_rad(last[1], reading, seconds):
+            self._jumps += 1
+            self._reporter.note("stage_jumps", self._jumps)
+            self._reporter.warn_seldom(
+                f"the tilt on {self._source.topic} jumps by {math.degrees(change):.1f} degrees within "
+                f"{seconds:.3g} s: a wrong reading, or a wrong stamp"
+            )
+
+    @property
+    def doubt(self) -> str:
+        """The first angle that no stage has in rad, such as ``"tilt 30 rad"``; empty if there was none.
+
+        The readings before it are doubtful too: small angles in degrees pass for radians.
+        """
+        return self._doubt
+
+    def forget_doubt(self) -> None:
+        """Trust the readings again, until the next doubtful one."""
+        self._doubt = ""
+
+    def conditions(self) -> list[str]:
+        """Return what is wrong with the stage, a few words each."""
+        if self._source is None:
+            return []
+        doubt = [f"{self._doubt} on {self._source.topic}: degrees?"] if self._doubt else []
+        return doubt + [f"no joint {joint} on {self._source.topic}" for joint in self._missing]
 
     def at(self, stamp_ns: int) -> StageReading | None:
         """Return the reading of a frame with this stamp, or None while it is unknown."""

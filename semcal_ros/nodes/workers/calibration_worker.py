@@ -42,13 +42,14 @@ _NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 @dataclass(frozen=True)
 class CalibrationJob:
-    """Everything that a calibration needs; the images of the views are not needed."""
+    """Everything that a calibration needs; the images of the views are not needed. Notes go into the summary."""
 
     views: tuple[FoundView, ...]
     display_width_m: float
     squares_m: tuple[float, ...]
     options: CalibrationOptions
     grid_certificate: str = ""
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
         f"{job.options.method} calibration from {len(done.collected.views)} views, {low:g}x to {high:g}x{worst}"
         f", in {time.monotonic() - started_s:.1f} s"
     )
-    notes = "".join(f"; {warning}" for warning in done.result.warnings)
+    notes = "".join(f"; {warning}" for warning in (*job.notes, *done.result.warnings))
     return JobResult(done.calibration.dumps(), summary + notes)
 
 

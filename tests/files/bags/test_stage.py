@@ -191,6 +191,13 @@ def test_joints_that_the_configuration_renames_must_be_there(tmp_path: Path) -> 
     assert "has the joint S" in notes
 
 
+def test_joints_that_come_and_go_are_named(tmp_path: Path) -> None:
+    messages = [stage_at(0.0, tilt=0.1), image_at(1.0), stage_at(20.0, z=1e-3), image_at(21.0)]
+    frames, notes = read(tmp_path / "bag", messages)
+    assert tilts(frames) == [0.1, None]
+    assert notes == "1 of 2 messages on /sem/stage lack the joint tilt"
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_value_that_is_not_finite_ends_the_reading_before(tmp_path: Path, value: float) -> None:
     frames, notes = read(

@@ -93,8 +93,58 @@ def test_a_bad_message_makes_the_stage_unknown_and_is_counted(
     assert bench.tilt_at(9.0) == 0.2
 
 
+def test_missing_joints_are_a_condition_and_logged_when_that_changes() -> None:
+    bench = Bench(StageConfig(tilt="T", rotation="R"))
+    for second in range(1, 4):
+        bench.publish(joints(second, T=0.1, R=0.2))
+        assert bench.input.conditions() == []
+    for second in range(4, 8):
+        bench.publish(joints(second, tilt=0.1, R=0.2))
+    assert bench.input.conditions() == ["no joint T on stage"]
+    assert bench.log == ["no joint T on stage; its joints: tilt, R"]
+    assert bench.input.at(7 * S) == StageReading(None, 0.2)
+    bench.publish(joints(8))
+    assert bench.input.conditions() == ["no joint T on stage", "no joint R on stage"]
+    bench.publish(joints(9, T=0.1, R=0.2))
+    assert bench.input.conditions() == []
+    # Rotations by their usual names need not be there.
+    plain = Bench()
+    plain.publish(joints(1, tilt=0.1))
+    assert (plain.input.conditions(), plain.log) == ([], [])
+
+
+def test_a_jump_of_the_tilt_is_told_and_used() -> None:
+    bench = Bench()
+    bench.publish(joints(10, tilt=0.1))
+    bench.publish(joints(20, tilt=0.7))
+    assert bench.log == []
+    late = joints(20, tilt=0.1)
+    late.header.stamp.nanosec = 10**8
+    bench.publish(late)
+    assert bench.log == [
+        "the tilt on stage jumps by 34.4 degrees within 0.1 s: a wrong reading, or a wrong stamp"
+    ]
+    assert notes(bench.reporter)["stage_jumps"] == "1"
+    assert bench.tilt_at(21.0) == 0.1
+    assert bench.input.conditions() == []
+
+
+def test_degrees_leave_a_doubt_until_it_is_taken_back() -> None:
+    bench = Bench()
+    bench.publish(joints(1, tilt=1.0))
+    assert (bench.input.doubt, bench.input.conditions()) == ("", [])
+    bench.publish(joints(2, tilt=30.0))
+    bench.publish(joints(3, tilt=0.1))
+    bench.publish(joints(4, rotation=90.0, tilt=0.1))
+    assert bench.input.doubt == "tilt 30 rad"
+    assert bench.input.conditions() == ["tilt 30 rad on stage: degrees?"]
+    bench.input.forget_doubt()
+    assert (bench.input.doubt, bench.input.conditions()) == ("", [])
+
+
 def test_without_a_section_nothing_is_subscribed() -> None:
     endpoints: Any = FakeEndpoints()
     stage = StageInput(None, endpoints, fake_reporter()[0])
+    assert stage.conditions() == []
     assert stage.at(S) is None
     assert endpoints.subscriptions == {}
