@@ -17,7 +17,7 @@ from semcal_ros.core.calibration.calibrate import (
     calibrate_views,
 )
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.views import FoundView, RejectedView
+from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
@@ -70,6 +70,10 @@ class RecordingCalibration:
     notes: tuple[str, ...] = ()
 
 
+# One wrong reading in two leaves it open which of them are the wrong ones.
+_MOST_REFUSED = 0.5
+
+
 def _check_factor(factor: float, display_width_m: float) -> None:
     """Refuse a scale that results from confusing the side of a square with the grid's period."""
     if abs(abs(np.log2(factor)) - 1.0) < _TWICE:
@@ -79,6 +83,19 @@ def _check_factor(factor: float, display_width_m: float) -> None:
             expected="squares_m to hold the sides of single squares, not the period of the grid",
             do=f"correct squares_m, or if that is right, set display_width_m to {display_width_m / factor:.4g} m",
         )
+
+
+def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[str]:
+    """Return a warning if the calibration refused the tilts of most views that have one, else nothing."""
+    told = {v.name for v in views if v.stage is not None and v.stage.tilt_rad is not None}
+    refused = sum(v.name in told and v.stage is None for v in result.views)
+    if refused <= _MOST_REFUSED * len(told):
+        return []
+    # The tilts that were not refused are wrong too, by less; they have pulled the scale with them.
+    return [
+        f"scale: {refused} of {len(told)} views contradict the tilt of the stage: the stage is not used; check the "
+        "unit of its angles, and its stamps"
+    ]
 
 
 def _remove_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
@@ -154,16 +171,23 @@ def calibrate_found(
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
     factor = collected.assignment.scale_factor
     _check_factor(factor, display_width_m)
-    result = calibrate_views(
-        collected.views,
-        image_size=collected.image_size,
-        display_width_m=display_width_m,
-        options=options,
-        on_stage=lambda name, part: on_stage(name, 0.95 * part),
-    )
+
+    def calibrated(views: Sequence[GridView]) -> CalibrationResult:
+        return calibrate_views(
+            views,
+            image_size=collected.image_size,
+            display_width_m=display_width_m,
+            options=options,
+            on_stage=lambda name, part: on_stage(name, 0.95 * part),
+        )
+
+    result = calibrated(collected.views)
+    contradiction = _find_contradiction(collected.views, result)
+    if contradiction:
+        result = calibrated([replace(view, stage=None) for view in collected.views])
     on_stage("summary", 0.95)
     collected = _remove_outliers(collected, result)
-    warnings = list(result.warnings)
+    warnings = [*contradiction, *result.warnings]
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         warnings.append(
             f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "

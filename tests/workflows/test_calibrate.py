@@ -252,11 +252,20 @@ def test_options_win_over_the_configuration():
 
 @pytest.mark.slow
 def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
-    plain = calibrate_recording(_recorded(tmp_path / "plain"))
+    off = CalibrationOptions(residual="off")
+    plain = calibrate_recording(_recorded(tmp_path / "plain"), options=off)
     wrong = _recorded(tmp_path / "wrong", lambda i: {"tilt": 10.0 * i})
-    done = calibrate_recording(wrong)
+    done = calibrate_recording(wrong, options=off)
     assert done.calibration.dumps() == plain.calibration.dumps()
     assert any("looks like degrees" in note for note in done.notes)
+    # Small angles in degrees could be radians: only the views tell.
+    small = calibrate_recording(_recorded(tmp_path / "small", lambda _: {"tilt": 1.0}), options=off)
+    (told, *others) = small.result.warnings
+    count = len(PLAN.frames)
+    assert told.startswith(f"scale: {count} of {count} views contradict the tilt of the stage")
+    assert tuple(others) == plain.result.warnings
+    np.testing.assert_array_equal(small.calibration.at(1000.0).P, plain.calibration.at(1000.0).P)
+    assert small.calibration.statistics["warnings"] == list(small.result.warnings)
 
 
 @pytest.mark.slow
