@@ -109,8 +109,6 @@ def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
     # From some 12 000 corners of 33 images.
     assert result.model.statistics["fit"]["line_jitter_px"] == pytest.approx(0.05, rel=0.25)
     assert_honest(result)
-    quiet = calibrated(views_of(ANY_WAY, seed=3))
-    assert quiet.model.statistics["fit"]["line_jitter_px"] < 0.02
 
 
 @pytest.mark.slow
@@ -128,6 +126,7 @@ def test_the_spread_of_visits_comes_out():
     stage = replace(ANY_WAY, scale_sigma=3e-3)
     result = calibrated(views_of(stage, seed=5))
     said = result.model.statistics["fit"]
+    assert said["line_jitter_px"] < 0.02
     assert abs(said["repeatability"] - 3e-3) < 3.0 * said["repeatability_sigma"]
     assert said["repeatability_sigma"] < 2e-3
     # The next visit is less certain than the function.
