@@ -24,8 +24,8 @@ _UNDETERMINED = 0.8
 _ENOUGH_VISITS = 4.0
 # Constant error of a stage, in 1-sigmas of its prior, that says that the configuration is wrong.
 _SURPRISING = 4.0
-# Probability with which chance alone gives as large a hysteresis: that of three sigmas.
-_CHANCE = 0.0027
+# Probability with which chance alone gives as large a hysteresis: a false alarm in 3000 calibrations.
+_CHANCE = 3e-4
 
 
 @dataclass(frozen=True)
