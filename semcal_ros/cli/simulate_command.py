@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, overwrite_option, parse_length, parse_ratio
+from semcal_ros.cli.options import PATH, Command, overwrite_option, parse_length, parse_ratio
 from semcal_ros.cli.output import show_progress
 from semcal_ros.synthetic import (
     DRIFTS,
@@ -20,6 +21,13 @@ from semcal_ros.synthetic import (
 from semcal_ros.workflows.simulate import PLAN_KINDS, simulate
 
 __all__ = ["command"]
+
+
+def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], Command]:
+    """Return an option that takes a ratio such as ``0.1%``."""
+    return click.option(
+        *names, default=default, show_default=True, callback=parse_ratio, metavar="RATIO", help=text
+    )
 
 
 @click.command("simulate")
@@ -81,29 +89,14 @@ __all__ = ["command"]
     metavar="LENGTH",
     help="How far the axis of a one-axis stage misses the specimen.  [default: 100um]",
 )
-@click.option(
+@_ratio_option(
     "--repeatability",
     default="0.15%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="1-sigma of the scale, each time that a magnification is set.",
+    text="1-sigma of the scale, each time that a magnification is set.",
 )
-@click.option(
-    "--grid-stretch",
-    default="0.02%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="Difference of the grid's axes.",
-)
-@click.option(
-    "--grid-shear",
-    default="0.01%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="How far the grid's axes are from a right angle.",
+@_ratio_option("--grid-stretch", default="0.02%", text="Difference of the grid's axes.")
+@_ratio_option(
+    "--grid-shear", default="0.01%", text="How far the grid's axes are from a right angle."
 )
 @click.option(
     "--grid-bow",
@@ -114,22 +107,9 @@ __all__ = ["command"]
     metavar="RADIUS",
     help="Radius to which the grid is bowed; 0 for a flat one.",
 )
-@click.option(
-    "--grid-wave",
-    default="0%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="Amplitude of a wave in its rows, of a square.",
-)
-@click.option(
-    "--grid-squares",
-    "squares_sigma",
-    default="0.02%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="1-sigma of each size of its squares.",
+@_ratio_option("--grid-wave", default="0%", text="Amplitude of a wave in its rows, of a square.")
+@_ratio_option(
+    "--grid-squares", "squares_sigma", default="0.02%", text="1-sigma of each size of its squares."
 )
 @click.option(
     "--line-jitter",

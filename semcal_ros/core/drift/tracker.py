@@ -415,7 +415,6 @@ class DriftTracker:
         if match.candidate.rescaled:
             zoomed = add_zoom_uncertainty(measure, keyframe.frame, frame)
         outcome = zoomed(state, drift_filter.process_noise)
-        deviation = innovation / _DISPUTED_SIGMAS
         judged = judge_shift(
             track.outliers,
             state,
@@ -428,6 +427,7 @@ class DriftTracker:
             max_jump=self.settings.max_jump,
         )
         if isinstance(judged, Rejection):
+            deviation = innovation / _DISPUTED_SIGMAS
             disputed = np.outer(deviation, deviation)
             return _RejectedMatch(judged, match.registration, disputed)
         if judged is not None:
