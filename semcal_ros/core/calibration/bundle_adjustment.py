@@ -5,7 +5,7 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -26,8 +26,10 @@ from semcal_ros.core.calibration.normal_equations import (
     retract,
     schur_complement,
     select_views,
+    states_of,
     view_costs,
     visit_sigmas,
+    with_states_of,
 )
 
 __all__ = ["BundleResult", "BundleStatus", "refine"]
@@ -218,22 +220,10 @@ def _refine_following_poses(
     if not np.any(short):
         return trial, trial_costs
     part = select_views(problem, short)
-    drift = len(trial.drift_px) > 0
-    start = replace(
-        trial,
-        rotations=trial.rotations[short],
-        translations_m=trial.translations_m[short],
-        drift_px=trial.drift_px[short] if drift else trial.drift_px,
-    )
+    start = states_of(trial, short)
     own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
-    rotations, translations = trial.rotations.copy(), trial.translations_m.copy()
-    rotations[short], translations[short] = own.rotations, own.translations_m
-    drift_px = trial.drift_px.copy()
-    if drift:
-        drift_px[short] = own.drift_px
-    trial = replace(trial, rotations=rotations, translations_m=translations, drift_px=drift_px)
     trial_costs[short] = own_costs
-    return trial, trial_costs
+    return with_states_of(trial, short, own), trial_costs
 
 
 def _refine_poses(

@@ -400,7 +400,14 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
 def _largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
     """Return the largest relative change of the variance components."""
     a, b = (
-        np.concatenate([[c.scale.sigma, c.visit_height.sigma], c.height_sigma_m, c.drift_sigma_px])
+        np.concatenate(
+            [
+                [c.scale.sigma, c.visit_height.sigma],
+                c.height_sigma_m,
+                c.drift_sigma_px,
+                () if c.lattice_sigma is None else c.lattice_sigma,
+            ]
+        )
         for c in (before, after)
     )
     return float(np.max(np.abs(np.log(b / a))))

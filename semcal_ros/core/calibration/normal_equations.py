@@ -5,7 +5,8 @@ The unknowns are nested:
 - one vector ``theta``, from which the camera of each magnification and what all views share (the
   shape of the grid, the errors of the stage) follow linearly (``camera = design @ theta``);
 - for each visit of a magnification, how far the scale and the height did not come back;
-- for each view, its pose and the drift within the image.
+- for each view, its pose, the drift within the image, and, where the lattices of the views do not
+  have the same axes, how far the stretch and shear of its own lattice differ from the shared ones.
 
 They are eliminated from the inside out (Schur complements), so the reduced system has the size of
 ``theta`` for any number of views; what is left is an information matrix on the camera of each
@@ -52,12 +53,14 @@ __all__ = [
     "retract",
     "schur_complement",
     "select_views",
+    "states_of",
     "sum_by",
     "view_costs",
     "visit_sigmas",
     "whiten",
     "whitened_norm",
     "whitened_rows",
+    "with_states_of",
 ]
 
 
@@ -87,6 +90,9 @@ class Effects:
         (V,) prior 1-sigma per axis of the drift during one frame.
     frame_time
         (N,) when each point was scanned, in frames from the middle of the frame.
+    lattice_sigma
+        (2,) prior 1-sigma of a view's own stretch and shear of the grid, or None where all lattices
+        have the same axes.
     """
 
     visit: Indices
@@ -95,6 +101,7 @@ class Effects:
     height_sigma_m: float
     drift_sigma_px: Array
     frame_time: Array
+    lattice_sigma: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -168,8 +175,10 @@ class Problem:
 
     @property
     def pose_columns(self) -> int:
-        """Number of unknowns of a view: turn, shift and drift."""
-        return 6 if self.effects is None else 8
+        """Number of unknowns of a view: turn, shift, drift, and the shape of its lattice."""
+        if self.effects is None:
+            return 6
+        return 8 if self.effects.lattice_sigma is None else 10
 
     def shared_values(self, theta: Array, names: Sequence[str]) -> Array:
         """Return the values of shared unknowns, zero for those that the problem does not have."""
@@ -191,6 +200,8 @@ class State:
         (J, 2) relative scale and height in m of each visit; empty without effects.
     drift_px
         (V, 2) drift during the frame; empty without effects.
+    lattices
+        (V, 2) own stretch and shear of each view; empty where all lattices have the same axes.
     """
 
     theta: Array
@@ -198,6 +209,7 @@ class State:
     translations_m: Array
     visits: Array = field(default_factory=lambda: np.zeros((0, 2)))
     drift_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    lattices: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def make_problem(
@@ -233,16 +245,19 @@ def make_problem(
     )
 
 
-def _shaped_grid(problem: Problem, theta: Array) -> Array:
+def _shaped_grid(problem: Problem, state: State) -> Array:
     """Return the (N, 3) grid points with the shape of the grid."""
     if not problem.shared:
         return problem.board_m
     x, y, _ = problem.board_m.T
-    stretch, shear, curvature = problem.shared_values(theta, GRID_NAMES)
+    stretch, shear, curvature = problem.shared_values(state.theta, GRID_NAMES)
+    if len(state.lattices):
+        own = state.lattices[problem.view_of_point]
+        stretch, shear = stretch + own[:, 0], shear + own[:, 1]
     size = np.zeros(len(x))
     for k, column in _square_columns(problem):
         assert problem.square_class is not None
-        size += (problem.square_class == k)[problem.view_of_point] * theta[
+        size += (problem.square_class == k)[problem.view_of_point] * state.theta[
             column - 10 - len(problem.shared)
         ]
     grid = np.stack(
@@ -267,7 +282,7 @@ def _square_columns(problem: Problem) -> list[tuple[int, int]]:
 
 def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
     view = problem.view_of_point
-    rotated = np.einsum("nij,nj->ni", state.rotations[view], _shaped_grid(problem, state.theta))
+    rotated = np.einsum("nij,nj->ni", state.rotations[view], _shaped_grid(problem, state))
     cameras = (problem.designs[:, :10] @ state.theta)[problem.group]
     if problem.effects is not None:
         cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
@@ -383,12 +398,14 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
         visit = range(first, first + problem.visit_columns // 2)
         columns = [*range(10), *_grid_columns(problem), *visit, *columns]
     rows = np.empty((2, len(columns), len(points)))
+    by_grid = np.zeros((2, 3, 0))
+    if len(state.lattices) or (not poses_only and len(_grid_columns(problem)) > 0):
+        by_grid = np.einsum("kin,nij->kjn", shift, state.rotations[view])
     if not poses_only:
         rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
         at = 10
         if len(_grid_columns(problem)) > 0:
-            by_grid = np.einsum("kin,nij->kjn", shift, state.rotations[view])
-            for derivative in _by_grid_shape(problem, state.theta, by_grid):
+            for derivative in _by_grid_shape(problem, state, by_grid):
                 rows[:, at] = derivative
                 at += 1
         if problem.effects is not None:
@@ -402,6 +419,8 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
     if problem.effects is not None:
         rows[:, at + 6 : at + 8] = 0.0
         rows[0, at + 6] = rows[1, at + 7] = problem.effects.frame_time
+    if len(state.lattices):
+        rows[:, at + 8], rows[:, at + 9] = _by_stretch(problem, by_grid), _by_shear(problem, by_grid)
     rows[:, -1] = miss.T
     whiten(problem.whitening, rows, huber)
     return WhitenedRows(np.array(columns, dtype=np.intp), rows, miss, huber)
@@ -413,7 +432,20 @@ def _grid_columns(problem: Problem) -> list[int]:
     return own + [column for _, column in _square_columns(problem)]
 
 
-def _by_grid_shape(problem: Problem, theta: Array, by_grid: Array) -> Iterator[Array]:
+def _by_stretch(problem: Problem, by_grid: Array) -> Array:
+    """Return the (2, N) derivative of the pixels by the stretch of the grid."""
+    x, y, _ = problem.board_m.T
+    out: Array = 0.5 * (x * by_grid[:, 0] - y * by_grid[:, 1])
+    return out
+
+
+def _by_shear(problem: Problem, by_grid: Array) -> Array:
+    """Return the (2, N) derivative of the pixels by the shear of the grid."""
+    out: Array = problem.board_m[:, 1] * by_grid[:, 0]
+    return out
+
+
+def _by_grid_shape(problem: Problem, state: State, by_grid: Array) -> Iterator[Array]:
     """Yield the (2, N) derivative of the pixels by the unknown of each of ``_grid_columns``.
 
     ``by_grid`` (2, 3, N) is that by the points of the grid.
@@ -424,15 +456,15 @@ def _by_grid_shape(problem: Problem, theta: Array, by_grid: Array) -> Iterator[A
     for column in _grid_columns(problem):
         name = problem.shared[column - 10]
         if name == "grid_stretch":
-            yield 0.5 * (x * by_grid[:, 0] - y * by_grid[:, 1])
+            yield _by_stretch(problem, by_grid)
         elif name == "grid_shear":
-            yield y * by_grid[:, 0]
+            yield _by_shear(problem, by_grid)
         elif name == "grid_curvature_m":
             yield 0.5 * (x * x + y * y) * by_grid[:, 2]
         else:
             assert problem.square_class is not None
             if along_shape is None:
-                along_shape = np.einsum("kjn,nj->kn", by_grid, _shaped_grid(problem, theta))
+                along_shape = np.einsum("kjn,nj->kn", by_grid, _shaped_grid(problem, state))
             yield along_shape * (problem.square_class == squares[column])[problem.view_of_point]
 
 
@@ -448,11 +480,12 @@ def whiten(whitening: Array, rows: Array, huber: Array) -> None:
 def pose_priors(problem: Problem, state: State) -> Array:
     """Return the priors of the poses as whitened rows (V, r, P + 1), the residual last.
 
-    They are those of the height, of the drift within the image and of the orientation.
+    They are those of the height, of the drift within the image, of the shape of the lattice and of
+    the orientation.
     """
     first, width = problem.shared_columns, problem.visit_columns + problem.pose_columns
     pose = first + problem.visit_columns
-    count = 1 + (0 if problem.effects is None else 2) + (0 if problem.attitudes is None else 3)
+    count = problem.pose_columns - 5 + (0 if problem.attitudes is None else 3)
     rows = np.zeros((len(problem.group), count, first + width + 1))
     scan = np.zeros(len(problem.group))
     if problem.attitudes is not None:
@@ -468,6 +501,10 @@ def pose_priors(problem: Problem, state: State) -> Array:
         sigma = problem.effects.drift_sigma_px
         rows[:, 1, pose + 6] = rows[:, 2, pose + 7] = 1.0 / sigma
         rows[:, 1:3, -1] = -state.drift_px / sigma[:, None]
+        own_sigma = problem.effects.lattice_sigma
+        if own_sigma is not None:
+            rows[:, 3, pose + 8], rows[:, 4, pose + 9] = 1.0 / own_sigma
+            rows[:, 3:5, -1] = -state.lattices / own_sigma
     rows[:, 0, -1] = -height
     rows[:, 0] /= problem.height_sigma_m[:, None]
     if problem.attitudes is not None:
@@ -627,29 +664,54 @@ def retract(problem: Problem, state: State, change: Array, pose: Array, visits: 
         rotations_from_vectors(pose[:, :3]) @ state.rotations,
         state.translations_m + pose[:, 3:6] * problem.unit_m[:, None],
         state.visits + visits if len(state.visits) else state.visits,
-        state.drift_px + pose[:, 6:] if len(state.drift_px) else state.drift_px,
+        state.drift_px + pose[:, 6:8] if len(state.drift_px) else state.drift_px,
+        state.lattices + pose[:, 8:] if len(state.lattices) else state.lattices,
     )
 
 
 def pick_views(pick: Mask, chosen: State, other: State) -> State:
-    """Return ``other`` with the poses and drifts of ``chosen`` for the views in ``pick`` (V,)."""
+    """Return ``other`` with what ``chosen`` has of the views in ``pick`` (V,)."""
     rows = pick[:, None]
-    drift = len(other.drift_px) > 0
+    drift, lattices = other.drift_px, other.lattices
     return replace(
         other,
         rotations=np.where(rows[:, :, None], chosen.rotations, other.rotations),
         translations_m=np.where(rows, chosen.translations_m, other.translations_m),
-        drift_px=np.where(rows, chosen.drift_px, other.drift_px) if drift else other.drift_px,
+        drift_px=np.where(rows, chosen.drift_px, drift) if len(drift) else drift,
+        lattices=np.where(rows, chosen.lattices, lattices) if len(lattices) else lattices,
     )
+
+
+def states_of(state: State, chosen: Mask) -> State:
+    """Return the state of some of the views (V,)."""
+    return replace(
+        state,
+        rotations=state.rotations[chosen],
+        translations_m=state.translations_m[chosen],
+        drift_px=state.drift_px[chosen] if len(state.drift_px) else state.drift_px,
+        lattices=state.lattices[chosen] if len(state.lattices) else state.lattices,
+    )
+
+
+def with_states_of(state: State, chosen: Mask, own: State) -> State:
+    """Return the state with that of some of the views (V,), as :func:`states_of` gives it."""
+    out = {}
+    for name in ("rotations", "translations_m", "drift_px", "lattices"):
+        values = getattr(state, name).copy()
+        if len(values):
+            values[chosen] = getattr(own, name)
+        out[name] = values
+    return replace(state, **out)
 
 
 def empty_effects(problem: Problem, state: State) -> State:
     """Return the state with effects of zero, as many as the problem has."""
-    effects = problem.effects
+    effects, none = problem.effects, np.zeros((0, 2))
     if effects is None:
-        return replace(state, visits=np.zeros((0, 2)), drift_px=np.zeros((0, 2)))
-    shape = len(effects.visit_group), len(problem.group)
-    return replace(state, visits=np.zeros((shape[0], 2)), drift_px=np.zeros((shape[1], 2)))
+        return replace(state, visits=none, drift_px=none, lattices=none)
+    visits, own = np.zeros((len(effects.visit_group), 2)), np.zeros((len(problem.group), 2))
+    lattices = none if effects.lattice_sigma is None else own
+    return replace(state, visits=visits, drift_px=own, lattices=lattices)
 
 
 def select_views(problem: Problem, chosen: Mask) -> Problem:

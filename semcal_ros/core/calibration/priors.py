@@ -145,6 +145,14 @@ class Setup:
         return visit, np.searchsorted(self.magnifications, [g for g, _ in known]).astype(np.intp)
 
     @property
+    def is_rotation_known(self) -> bool:
+        """Whether the stage says of every view how far it is turned."""
+        return all(
+            v.has_stage_tilt and v.stage is not None and v.stage.rotation_rad is not None
+            for v in self.views
+        )
+
+    @property
     def squares_m(self) -> tuple[float, ...]:
         """Sizes of squares, the most frequent one first: the others are compared with it."""
         counts = Counter(v.square_m for v in self.views)

@@ -94,6 +94,7 @@ def build_problem(
         spread.visit_height.sigma,
         spread.drift_sigma_px,
         (y - 0.5 * (height - 1)) / height,
+        spread.lattice_sigma,
     )
     known = attitudes(
         [v.stage for v in views],

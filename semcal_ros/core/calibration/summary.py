@@ -52,6 +52,7 @@ def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
         "repeatability_sigma": _finite_or_none(spread.scale.sigma_of_sigma),
         "visit_height_sigma_m": spread.visit_height.sigma,
         "drift_sigma_px": [float(spread.drift_sigma_px.min()), float(spread.drift_sigma_px.max())],
+        "lattice_sigma": None if spread.lattice_sigma is None else spread.lattice_sigma.tolist(),
         "line_jitter_px": fit.jitter.sigma_px,
     }
 

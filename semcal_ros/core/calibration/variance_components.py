@@ -10,7 +10,7 @@ so that a spread which the views do not determine stays at its usual value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
@@ -73,12 +73,16 @@ class VarianceComponents:
         (V,) height of each view, m.
     drift_sigma_px
         (V,) drift within each image, px per axis.
+    lattice_sigma
+        (2,) stretch and shear of the grid in the lattice of a view, which has one of four
+        directions by chance; None where the stage's rotation tells which.
     """
 
     scale: Spread
     visit_height: Spread
     height_sigma_m: Array
     drift_sigma_px: Array
+    lattice_sigma: Array | None = None
 
 
 def initial_components(setup: Setup) -> VarianceComponents:
@@ -89,7 +93,12 @@ def initial_components(setup: Setup) -> VarianceComponents:
         Spread(priors.visit_height_sigma_m, 0.0),
         np.full(count, priors.height_sigma_m),
         np.full(count, priors.drift_sigma_px),
+        None if setup.is_rotation_known else _usual_lattice(priors),
     )
+
+
+def _usual_lattice(priors: Priors) -> Array:
+    return np.array([priors.grid_stretch_sigma, priors.grid_shear_sigma])
 
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
@@ -126,7 +135,7 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
     effects = problem.effects
     if effects is None:
         start = initial_components(setup)
-        return VarianceComponents(start.scale, start.visit_height, height, start.drift_sigma_px)
+        return replace(start, height_sigma_m=height)
     sigmas = (effects.scale_sigma, effects.height_sigma_m)
     usual = (priors.visit_scale_sigma, priors.visit_height_sigma_m)
     visits = [
@@ -138,7 +147,25 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
         )
         for k, (sigma, own) in enumerate(zip(sigmas, usual, strict=True))
     ]
-    return VarianceComponents(visits[0], visits[1], height, _drift_sigma(problem, result, priors))
+    return VarianceComponents(
+        visits[0],
+        visits[1],
+        height,
+        _drift_sigma(problem, result, priors),
+        _lattice_sigma(effects.lattice_sigma, result, priors),
+    )
+
+
+def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) -> Array | None:
+    if sigma is None:
+        return None
+    own = zip(sigma, _usual_lattice(priors), (3, 4), strict=True)
+    return np.array(
+        [
+            _update(s, usual, result.prior_residuals[:, k], result.prior_variance[:, k]).sigma
+            for s, usual, k in own
+        ]
+    )
 
 
 def _drift_sigma(problem: Problem, result: BundleResult, priors: Priors) -> Array:

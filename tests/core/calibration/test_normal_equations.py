@@ -38,8 +38,8 @@ from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
 MICROSCOPE = preset("strong_perspective")
 
 
-@pytest.fixture(scope="module")
-def system():
+@pytest.fixture(scope="module", params=[None, (7e-4, 4e-4)], ids=["same axes", "own lattices"])
+def system(request):
     """The problem, and a state near its optimum, with every effect there is."""
     stage, grid = SimulatedStage(miss_m=(1e-4, -6e-5)), GridFaults(1e-3, -5e-4, 10.0)
     views = stage_views(
@@ -59,7 +59,11 @@ def system():
     functions = constant_functions(setup, {})
     count = len(setup.views)
     spread = VarianceComponents(
-        Spread(2e-3, 0.0), Spread(3e-5, 0.0), np.full(count, 4e-5), np.full(count, 0.2)
+        Spread(2e-3, 0.0),
+        Spread(3e-5, 0.0),
+        np.full(count, 4e-5),
+        np.full(count, 0.2),
+        None if request.param is None else np.array(request.param),
     )
     problem = build_problem(setup, functions, setup.views, spread)
     rng = np.random.default_rng(0)
@@ -71,6 +75,7 @@ def system():
         theta=state.theta + 0.3 * rng.normal(size=len(state.theta)) * _theta_scale(setup),
         visits=rng.normal(size=state.visits.shape) * [1e-3, 2e-5],
         drift_px=rng.normal(size=state.drift_px.shape) * 0.2,
+        lattices=rng.normal(size=state.lattices.shape) * 5e-4,
     )
     return problem, state
 
@@ -126,11 +131,12 @@ def dense(system):
     size = len(state.theta) + state.visits.size + problem.pose_columns * len(problem.group)
     # Steps small enough for the curvature and large enough for rounding, in units of the priors.
     own = np.minimum(problem.prior_sigma, 1.0)
+    own_steps = [1e-6] * (problem.pose_columns - 8)
     steps = np.concatenate(
         [
             1e-4 * own,
             np.tile(visit_sigmas(problem) * 1e-2, len(state.visits)),
-            np.tile([1e-5] * 3 + [1e-3] * 3 + [1e-3] * 2, len(problem.group)),
+            np.tile([*[1e-5] * 3, *[1e-3] * 3, *[1e-3] * 2, *own_steps], len(problem.group)),
         ]
     )
     columns = []

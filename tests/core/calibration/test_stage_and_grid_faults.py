@@ -104,6 +104,20 @@ def test_a_bowed_stretched_and_sheared_grid_is_estimated():
 
 
 @pytest.mark.slow
+def test_a_stretched_grid_whose_lattices_lie_anyhow_is_stated():
+    """Without the stage's rotation each lattice has one of four directions, and its stretch a sign, by chance.
+
+    Taken for one stretch of all views, the principal point is 12 px off with 5 px stated.
+    """
+    result = calibrated(views_of(ANY_WAY, GridFaults(stretch=2e-3), seed=1))
+    stretch, shear = result.model.statistics["fit"]["lattice_sigma"]
+    # That of 33 views that each tell something; the lithography's usual 5e-4 is clearly below it.
+    assert stretch == pytest.approx(2e-3, rel=0.5)
+    assert shear < 1e-3
+    assert_honest(result)
+
+
+@pytest.mark.slow
 def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
     result = calibrated(views_of(replace(ANY_WAY, line_jitter_px=0.05), seed=3))
     # From some 12 000 corners of 33 images.
