@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from semcal_ros.bridge.calibration_text import fill_calibration_text
+from semcal_ros.bridge.calibration_warnings import ScaleWarnings
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
@@ -24,7 +25,7 @@ from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.frames.calibration_input import calibration_digest
+from semcal_ros.nodes.frames.calibration_input import calibration_digest, report_scale_warnings
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stage import StageInput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
@@ -77,6 +78,7 @@ class CalibrationServer(StreamNode):
         self._calibration: Calibration | None = None
         self._running: CalibrationProcess | None = None
         self._stage: Stage | None = None
+        self._warnings = ScaleWarnings()
         self._text = self.endpoints.latched_publisher(String, "calibration")
         self._progress = self.endpoints.latched_publisher(DiagnosticStatus, "~/progress")
         self._overlay = self.endpoints.stream_publisher(Image, "~/overlay")
@@ -101,8 +103,9 @@ class CalibrationServer(StreamNode):
         self._report_progress("no views yet")
 
     def conditions(self) -> list[str]:
-        """Extend the base class: also report what is wrong with the stage."""
-        return super().conditions() + self._position.conditions()
+        """Extend the base class: also report what is wrong with the stage and with the last calibration."""
+        doubts = [self._warnings.summary] if self._warnings.count else []
+        return super().conditions() + self._position.conditions() + doubts
 
     def _end_calibration(self) -> None:
         with self._lock:
@@ -205,6 +208,7 @@ class CalibrationServer(StreamNode):
         fill_calibration_text(message, text)
         self._text.publish(message)
         self.reporter.note("calibration_digest", calibration_digest(text))
+        self._warnings = report_scale_warnings(self.reporter, calibration)
         return result.summary
 
     def _begin(self) -> CalibrationProcess:

@@ -179,6 +179,15 @@ def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path
     assert shown[-1]["views at 2000x"] == str(VIEWS)
     assert session.shown()["message"] == calibrated.result().message
 
+    # No magnification was set twice, so that nothing tells how well it comes back.
+    doubts = [w for w in calibration.statistics["warnings"] if w.startswith("scale: ")]
+    assert doubts
+    session.peer.wait_for(
+        lambda: doubts[0][7:50] in session.peer.state(SERVER).get("calibration_warnings", ""),
+        "the doubts about nm per pixel",
+    )
+    assert "scale of the calibration: " in session.peer.state(SERVER)["message"]
+
     for g in MAGNIFICATIONS:
         camera, truth = calibration.at(g), PLAN.microscope.camera_at(g)
         # 16 views of 384 px leave 0.2 % (1-sigma) of scale at worst, since tilt and scale trade off.

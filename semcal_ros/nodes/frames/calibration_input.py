@@ -28,7 +28,7 @@ from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
-__all__ = ["CalibrationInput", "calibration_digest"]
+__all__ = ["CalibrationInput", "calibration_digest", "report_scale_warnings"]
 
 _TOPIC = "topic"
 # Largest accepted difference between the middleware's clock and that of this process.
@@ -74,6 +74,17 @@ def _parse(arrived: _Arrived) -> _Loaded | SemcalError:
         return error
     except (MemoryError, RecursionError) as error:
         return CalibrationFileError(f"topic calibration: {type(error).__name__}")
+
+
+def report_scale_warnings(reporter: Reporter, calibration: Calibration) -> ScaleWarnings:
+    """Log the warnings about nm per pixel, show them among the values of the node, and return them."""
+    warnings = read_scale_warnings(calibration.statistics)
+    if warnings.count:
+        reporter.warn(warnings.summary)
+        reporter.note("calibration_warnings", warnings.details)
+    else:
+        reporter.forget("calibration_warnings")
+    return warnings
 
 
 class CalibrationInput:
@@ -237,9 +248,4 @@ class CalibrationInput:
         )
         self._reporter.note("calibration", source)
         self._reporter.note("calibration_digest", digest)
-        self._warnings = read_scale_warnings(calibration.statistics)
-        if self._warnings.count:
-            self._reporter.warn(self._warnings.summary)
-            self._reporter.note("calibration_warnings", self._warnings.details)
-        else:
-            self._reporter.forget("calibration_warnings")
+        self._warnings = report_scale_warnings(self._reporter, calibration)
