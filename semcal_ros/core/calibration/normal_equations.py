@@ -420,7 +420,10 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
         rows[:, at + 6 : at + 8] = 0.0
         rows[0, at + 6] = rows[1, at + 7] = problem.effects.frame_time
     if len(state.lattices):
-        rows[:, at + 8], rows[:, at + 9] = _by_stretch(problem, by_grid), _by_shear(problem, by_grid)
+        rows[:, at + 8], rows[:, at + 9] = (
+            _by_stretch(problem, by_grid),
+            _by_shear(problem, by_grid),
+        )
     rows[:, -1] = miss.T
     whiten(problem.whitening, rows, huber)
     return WhitenedRows(np.array(columns, dtype=np.intp), rows, miss, huber)

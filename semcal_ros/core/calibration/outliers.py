@@ -1,8 +1,9 @@
 """Views that disagree with the others, such as one whose magnification was recorded wrongly.
 
 A wrong magnification is a wrong scale. Under a perspective projection the height of a view imitates
-it; under a parallel one nothing does. So a view is compared with the others in two ways: its height
-with those at its own magnification, and its misfit with all.
+it; under a parallel one a tilt of a stretched grid does in part. So a view is compared with the
+others in three ways: its height with those at its own magnification, its misfit and the stretch of
+its lattice with all.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm, t
 
 from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
@@ -28,9 +30,9 @@ from semcal_ros.core.errors import Rejection
 __all__ = ["ChangePoint", "find_change_point", "find_outliers", "find_wrong_tilts"]
 
 
-# Gain in half chi-squares, 2.7 standard deviations: a recording without a jump is suspected in one
-# of twenty cases.
-_LEAST_GAIN = 3.65
+# Standard deviations: a recording without a jump is suspected in one of twenty cases, as there are
+# many places where it could be.
+_JUMP_SIGMAS = 2.7
 
 
 @dataclass(frozen=True)
@@ -66,16 +68,22 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         )
         problem = replace(problem, effects=effects)
         result = refine(problem, result.state, tolerance=1e-4)
-    scatter = 0.0
+    scatter, determined = 0.0, 0.0
     if problem.effects is not None:
-        scatter = float(np.sum((result.state.visits / visit_sigmas(problem)) ** 2))
+        squares = visit_sigmas(problem) ** 2
+        scatter = float(np.sum(result.state.visits**2 / squares))
+        determined = float(np.sum(np.maximum(1.0 - result.visit_variance / squares, 0.0)))
     matrix, right = reduced_normal_equations(
         problem, result.state.theta, result.information, result.gradient
     )
     g = setup.magnifications
     nominal = setup.nominal_px_per_m(g)
     variance = max(variance_factor(problem, result), 1.0)
-    best, best_gain = None, _LEAST_GAIN
+    # Scatter of few visits is known badly: by Student's t, the same chance needs a larger gain.
+    freedom = max(determined - 1.0, 1.0)
+    chance = norm.sf(_JUMP_SIGMAS)
+    by_corners, by_visits = (0.5 * x**2 for x in (_JUMP_SIGMAS, t.isf(chance, freedom)))
+    best, best_excess = None, 1.0
     for k in range(1, len(g)):
         if any(g[k - 1] < b <= g[k] for b in setup.breakpoints):
             continue
@@ -88,11 +96,11 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         gradient = float(result.gradient[:, 0] @ column) - cross @ solved[:, 1]
         gain = 0.5 * gradient**2 / information
         # Where the jump leaves much of the scatter between visits, they do not come back anyway.
-        left = (scatter - 2.0 * gain) / max(len(result.state.visits) - 1, 1)
-        gain /= max(variance, left)
-        if gain > best_gain:
-            sigma = float(np.sqrt(variance / information))
-            best_gain = gain
+        left = (scatter - 2.0 * gain) / freedom
+        limit = variance * by_corners if left <= variance else left * by_visits
+        if gain > best_excess * limit:
+            sigma = float(np.sqrt(max(variance, left) / information))
+            best_excess = gain / limit
             best = ChangePoint(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
     return best
 
@@ -123,6 +131,8 @@ def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, flo
 _HEIGHT_SIGMAS = 8.0
 # Least spread of the heights, m; smaller differences of height are not significant.
 _LEAST_HEIGHT_M = 5e-6
+# Least spread of the stretches and shears; smaller differences are those of ordinary grids.
+_LEAST_SHAPE = 5e-4
 # RMS residual of a view over that of the median view. Good views differ by less, and a wrong
 # magnification that the height cannot imitate exceeds it. Chosen by trial.
 _MISFIT_RATIO = 6.0
@@ -152,6 +162,11 @@ def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Reject
     # stage.
     spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
     odd = (np.abs(offset) > _HEIGHT_SIGMAS * spread) | (misfit > _MISFIT_RATIO)
+    shape = np.zeros(len(height))
+    if len(result.state.lattices):
+        shape = np.max(np.abs(result.state.lattices), axis=1)
+        usual = max(float(np.quantile(shape, 1.0 - _FEW)) / 1.645, _LEAST_SHAPE)
+        odd |= shape > _HEIGHT_SIGMAS * usual
     outliers: dict[int, Rejection[ViewStatus]] = {}
     if odd.mean() > _FEW:
         return outliers
@@ -162,7 +177,7 @@ def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Reject
             outliers[int(v)] = Rejection(
                 ViewStatus.OUTLIER,
                 f"does not agree with the other views at its magnification: {1e6 * offset[v]:.0f} um of height, where "
-                f"{1e6 * spread:.0f} um are usual, and residuals {misfit[v]:.1f} times the usual; wrong magnification, "
-                "or a wrong square size",
+                f"{1e6 * spread:.0f} um are usual, a grid stretched by {100.0 * shape[v]:.2g} %, and residuals "
+                f"{misfit[v]:.1f} times the usual; wrong magnification, or a wrong square size",
             )
     return outliers
