@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.live.scenes import CONFIG, calibration, pictures
 from benchmarks.table import interleaved
+from semcal_ros import Calibration
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
 
@@ -40,28 +41,30 @@ COLUMNS = (
     "core, drift",
     "core, magnification",
     "core, both",
+    "core, fast",
+    "field, still",
+    "field, drift",
+    "field, magnification",
+    "field, both",
+    "field, fast",
     "node, still",
     "node, both",
     "registration",
 )
 
 
-def drifts(camera: Any, count: int = 31) -> list[RasterDrift]:
-    """Drifts of some px, px/s and px/s^2."""
+def drifts(camera: Any, count: int = 31, *, px: float = 1.0) -> list[RasterDrift]:
+    """Drifts of some ``px``, px/s and px/s^2."""
     rng = np.random.default_rng(0)
-    return [RasterDrift(*(rng.normal(size=(3, 2)) / camera.m)) for _ in range(count)]
+    return [RasterDrift(*(px * rng.normal(size=(3, 2)) / camera.m)) for _ in range(count)]
 
 
 def core_actions(size: int, image: np.ndarray) -> dict[str, Callable[[], object]]:
     """The floor and the core call for one frame."""
-    model = calibration()
-    camera = model.at(MAGNIFICATION).resized(size, size)
-    cameras = cycle([model.at(g).resized(size, size) for g in MAGNIFICATIONS])
-    moving = cycle(drifts(camera))
     out, copy = np.empty_like(image), np.empty_like(image)
-    # One rectifier for each, as in a stream of that kind.
-    still, drifting, zooming, both = (Rectifier() for _ in range(4))
-    map_x, map_y = Rectifier().maps((size, size), camera)
+    map_x, map_y = Rectifier().maps(
+        (size, size), calibration().at(MAGNIFICATION).resized(size, size)
+    )
 
     def floor() -> None:
         cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, dst=out)
@@ -69,12 +72,27 @@ def core_actions(size: int, image: np.ndarray) -> dict[str, Callable[[], object]
 
     return {
         "floor": floor,
-        "core, still": lambda: still.rectify(image, camera, out=out),
-        "core, drift": lambda: drifting.rectify(image, camera, next(moving), CONFIG.scan, out=out),
-        "core, magnification": lambda: zooming.rectify(image, next(cameras), out=out),
-        "core, both": lambda: both.rectify(
-            image, next(cameras), next(moving), CONFIG.scan, out=out
-        ),
+        **_rectifications("core", calibration(), size, image, out),
+        **_rectifications("field", calibration(with_field=True), size, image, out),
+    }
+
+
+def _rectifications(
+    name: str, model: Calibration, size: int, image: np.ndarray, out: np.ndarray
+) -> dict[str, Callable[[], object]]:
+    """Streams of every kind through the core; ``fast`` is a stage that moves by some ten pixels per second."""
+    camera = model.at(MAGNIFICATION).resized(size, size)
+    cameras = cycle([model.at(g).resized(size, size) for g in MAGNIFICATIONS])
+    moving, moving_fast = cycle(drifts(camera)), cycle(drifts(camera, px=20.0))
+    # One rectifier for each, as in a stream of that kind.
+    still, drifting, zooming, both, fast = (Rectifier() for _ in range(5))
+    scan = CONFIG.scan
+    return {
+        f"{name}, still": lambda: still.rectify(image, camera, out=out),
+        f"{name}, drift": lambda: drifting.rectify(image, camera, next(moving), scan, out=out),
+        f"{name}, magnification": lambda: zooming.rectify(image, next(cameras), out=out),
+        f"{name}, both": lambda: both.rectify(image, next(cameras), next(moving), scan, out=out),
+        f"{name}, fast": lambda: fast.rectify(image, camera, next(moving_fast), scan, out=out),
     }
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from semcal_ros import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
 
@@ -34,7 +35,22 @@ class Config:
 CONFIG = Config(0.08)
 
 
-def calibration() -> Calibration:
+def settling_field(limits: tuple[float, float]) -> ResidualField:
+    """A beam that settles by 2 px at the start of the lines, and a spiral of 1 px, at 512 x 512."""
+    zero = zero_field((512, 512), limits, 3)
+    coefficients = zero.coefficients.copy()
+    # Near enough to where each basis function has its maximum.
+    x, y = (
+        np.array([np.mean(knots[k + 1 : k + 4]) for k in range(len(knots) - 4)])
+        for knots in (zero.knots_x, zero.knots_y)
+    )
+    px = np.array([1.0, 1.2, 0.8])[:, None, None] / 256.0
+    coefficients[..., 0] = px * (2.0 * np.exp(-(x + 1.0) / 0.15) + np.sin(3.0 * y)[:, None])
+    coefficients[..., 1] = px * np.sin(3.0 * x) * np.cos(2.0 * y)[:, None]
+    return replace(zero, coefficients=coefficients)
+
+
+def calibration(*, with_field: bool = False) -> Calibration:
     """A calibration with a little of every distortion, for 512 x 512."""
     limits = (500.0, 20000.0)
     values = {"scale": 1.01, "aspect": 1.004, "skew": 0.001, "px": 250.0, "py": 262.0, "rho": 50.0}
@@ -43,14 +59,17 @@ def calibration() -> Calibration:
         name: ContinuousFunction("chebyshev_log", np.array([value]), limits)
         for name, value in values.items()
     }
+    field = settling_field(limits) if with_field else None
+    size = len(values) + (0 if field is None else field.size)
     return Calibration(
         functions=functions,
-        covariance=np.eye(len(values)) * 1e-8,
+        covariance=np.eye(size) * 1e-8,
         image_width=512,
         image_height=512,
         display_width_m=0.12,
         magnifications=limits,
         method="joint",
+        residual=field,
     )
 
 

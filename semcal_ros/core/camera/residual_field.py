@@ -19,11 +19,16 @@ size undefined.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 __all__ = ["FieldSlice", "ResidualField", "zero_field"]
 
@@ -45,22 +50,33 @@ def _clamped(breaks: Array, degree: int) -> Array:
     return np.concatenate([np.repeat(breaks[0], degree), breaks, np.repeat(breaks[-1], degree)])
 
 
-def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
-    """Return (n, size) values of the basis functions, constant beyond the outermost knots."""
+@lru_cache(maxsize=16)
+def _basis_functions(knots: bytes, degree: int) -> BSpline:
+    """Return all basis functions on knots at once; faster than a sparse matrix where these are few."""
     # Imported here so that programs without a residual field start without scipy.
     from scipy.interpolate import BSpline
 
+    at = np.frombuffer(knots)
+    return BSpline(at, np.eye(len(at) - degree - 1), degree)
+
+
+def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
+    """Return (n, size) values of the basis functions, constant beyond the outermost knots."""
     inside = np.clip(values, knots[0], knots[-1])
-    return BSpline.design_matrix(inside, knots, degree).toarray()
+    return np.asarray(_basis_functions(knots.tobytes(), degree)(inside), dtype=np.float64)
+
+
+@lru_cache(maxsize=8)
+def _lattice_rows(values: bytes, knots: bytes) -> Array32:
+    """Return :func:`_spline_rows` of the axis of a lattice, which is the same for frame after frame."""
+    return _spline_rows(np.frombuffer(values), np.frombuffer(knots), _DEGREE).astype(np.float32)
 
 
 def _spline_slopes(values: Array, knots: Array) -> Array:
     """Return (n, size) derivatives of the basis functions, zero beyond the outermost knots."""
-    from scipy.interpolate import BSpline
-
-    size = len(knots) - _DEGREE - 1
     inside = (values > knots[0]) & (values < knots[-1])
-    slopes = BSpline(knots, np.eye(size), _DEGREE)(np.clip(values, knots[0], knots[-1]), nu=1)
+    at = np.clip(values, knots[0], knots[-1])
+    slopes = _basis_functions(knots.tobytes(), _DEGREE)(at, nu=1)
     return np.where(inside[:, None], slopes, 0.0)
 
 
@@ -74,17 +90,31 @@ class FieldSlice:
         Knots of the cubic splines in half image widths from the middle of the image, ends repeated.
     coefficients
         (ny, nx, 2), in half image widths.
-    covariance
-        (2 ny nx, 2 ny nx) of the coefficients, or None where it is not known.
     cross_covariance
-        (10, 2 ny nx) with the parameters of the camera, or None.
+        (10, 2 ny nx) of the parameters of the camera with the coefficients, or None where it is not known.
+    weights, whole_covariance
+        (ng,) weights of the coefficients of the whole field in these, and their covariance
+        (2 ng ny nx, 2 ng ny nx), or None.
     """
 
     knots_x: Array
     knots_y: Array
     coefficients: Array
-    covariance: Array | None = None
     cross_covariance: Array | None = None
+    weights: Array | None = None
+    whole_covariance: Array | None = None
+
+    @cached_property
+    def covariance(self) -> Array | None:
+        """(2 ny nx, 2 ny nx) of the coefficients, or None where it is not known.
+
+        Computed when it is first asked for: a stream that zooms has a slice for every frame.
+        """
+        if self.weights is None or self.whole_covariance is None:
+            return None
+        count, size = len(self.weights), self.coefficients.size
+        blocks = self.whole_covariance.reshape(count, size, count, size)
+        return np.einsum("k,kalb,l->ab", self.weights, blocks, self.weights, optimize=True)
 
     def basis(self, q: Array) -> Array:
         """Return (n, ny nx) products of the basis functions at normalised raw positions (n, 2)."""
@@ -101,6 +131,14 @@ class FieldSlice:
         y = _spline_rows(q[known, 1], self.knots_y, _DEGREE)
         along = (y @ self.coefficients.reshape(ny, -1)).reshape(-1, nx, 2)
         out[known] = np.einsum("na,nac->nc", x, along)
+        return out
+
+    def on_lattice(self, x: Array, y: Array) -> Array32:
+        """Return (2, len(y), len(x)) displacements at all pairs of normalised raw coordinates."""
+        columns = _lattice_rows(x.tobytes(), self.knots_x.tobytes())
+        rows = _lattice_rows(y.tobytes(), self.knots_y.tobytes())
+        coefficients = np.moveaxis(self.coefficients, 2, 0).astype(np.float32)
+        out: Array32 = rows @ (coefficients @ columns.T)
         return out
 
     def gradient(self, q: Array) -> Array:
@@ -205,18 +243,18 @@ class ResidualField:
         ``g`` are optional.
         """
         weights = self.weights(g)
-        spread = between = None
+        between = None
         if covariance is not None and cross is not None:
-            count, size = len(weights), self.slice_size
-            blocks = covariance.reshape(count, size, count, size)
-            spread = np.einsum("k,kalb,l->ab", weights, blocks, weights, optimize=True)
-            between = np.einsum("pka,k->pa", cross.reshape(-1, count, size), weights)
+            between = np.einsum(
+                "pka,k->pa", cross.reshape(-1, len(weights), self.slice_size), weights
+            )
         return FieldSlice(
             self.knots_x,
             self.knots_y,
             np.tensordot(weights, self.coefficients, axes=1),
-            spread,
             between,
+            weights,
+            None if between is None else covariance,
         )
 
     def overlaps(self) -> Array:

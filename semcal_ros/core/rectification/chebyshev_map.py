@@ -2,30 +2,47 @@
 
 A map is evaluated exactly at Chebyshev nodes only and interpolated by polynomials in x and y
 (Trefethen 2019, doi:10.1137/1.9781611975949), in bands of rows: a small matrix product per band, of
-which only the values at the nodes depend on the frame.
+which only the values at the nodes depend on the frame. The residual field of a camera is less smooth and is added
+from a table (:mod:`semcal_ros.core.rectification.field_table`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Array32
+from semcal_ros.core.arrays import Array, Array32, Indices
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.core.rectification.field_table import FieldTable, tabulate_field
+from semcal_ros.core.rectification.raw_positions import (
+    PixelDrift,
+    RasterDrift,
+    camera_key,
+    raw_from_output,
+)
 
 __all__ = ["RawMap", "SmoothMaps"]
 
 # Test points along each axis, which lie where none of the degrees has a node.
 _TESTS, _TEST_OFFSET = 9, 0.37
-# The last ones are for residual fields, whose splines are less smooth than the distortion.
 _DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 # The promise is 0.002 px; between the test points the maps may differ by more.
 _MAX_MAP_ERROR_PX = 0.001
+# With a residual field and a specimen that drifts while a departure of the field is scanned, which is known to first
+# order: a tenth of what OpenCV rounds positions by.
+_MAX_MOVING_ERROR_PX = 0.003
+# Columns and rows at which such a map is tested.
+_FIELD_TESTS = (33, 9)
+# Drift during the scan of a departure up to which a first order needs no test of its own: it is wrong by a tenth.
+_SMALL_RESPONSE_PX = 0.005
+# Degrees down the image of what the field adds; across it, every column has its own values.
+_FIELD_DEGREES = (12, 24, 48)
+# Tables of residual fields that are kept: two magnifications may take turns.
+_MAX_TABLES = 2
 # Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
 _MAX_KEPT = 16
 # A raw position outside every frame, for output pixels without one: they come out as 0.
@@ -119,6 +136,11 @@ class RawMap:
     _columns: Array32 | None
     _exact: tuple[ScanCamera | None, RasterDrift | None, ScanTiming | None]
 
+    @property
+    def is_interpolated(self) -> bool:
+        """Whether the positions are interpolated, and not computed at every pixel, which is slow."""
+        return self._rows is not None
+
     def band(self, top: int, bottom: int, out: Array32) -> None:
         """Write raw x and raw y of the rows ``top`` to ``bottom`` side by side: (rows, 2 w)."""
         if self._rows is not None and self._columns is not None:
@@ -137,12 +159,15 @@ class SmoothMaps:
     """Makes :class:`RawMap`, keeping what does not change from frame to frame.
 
     The degree of the polynomials is the lowest whose map agrees with the exact one to 0.001 px at
-    81 points between the nodes of every single frame. A map that no polynomial follows, or that
-    has holes, is computed exactly at every pixel, which is slow.
+    81 points between the nodes of every single frame. A residual field is added from a table, as
+    long as some 300 pixels agree to 0.001 px, or to 0.003 px where the specimen drifts fast. A map
+    that neither follows, or that has holes, is computed exactly at every pixel, which is slow.
     """
 
     def __init__(self) -> None:
         self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
+        self._split: LruCache[tuple[object, ...], _SplitCamera] = LruCache(_MAX_TABLES)
+        self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
 
     def make_map(
         self,
@@ -154,6 +179,55 @@ class SmoothMaps:
         """The map of one frame; the arguments are those of
         :func:`~semcal_ros.core.rectification.raw_positions.raw_from_output`.
         """
+        if camera is not None and camera.residual is not None:
+            found = self._map_with_field(size, camera, drift, timing)
+            if found is not None:
+                return found
+        return self._map_by_polynomials(size, camera, drift, timing)
+
+    def _map_with_field(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> RawMap | None:
+        """The map without the field, and the field from a table; None where that is not accurate."""
+        split = self._split.get_or_compute(
+            camera_key(size, camera),
+            lambda: _SplitCamera(
+                replace(camera, residual=None).resized(*size), tabulate_field(camera, size)
+            ),
+        )
+        plain, table = split.plain, split.field
+        smooth = None if table is None else self._map_by_polynomials(size, plain, drift, timing)
+        if table is None or smooth is None or smooth._columns is None:
+            return None
+        width, height = size
+        response = _response(size, plain, drift, timing)
+        for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
+            rows = _make_field_rows(height, len(smooth._columns) - 3, degree)
+            undisplaced = rows.at_nodes @ smooth._columns
+            departure = table.invert(undisplaced[:, :width], undisplaced[:, width:])
+            if departure is None:
+                return None
+            x, y = np.tensordot(response, departure, axes=1).astype(np.float32)
+            # As above, the identity comes last.
+            columns = np.vstack([smooth._columns[:-2], np.hstack([x, y]), smooth._columns[-2:]])
+            found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
+            if _is_accurate(found, plain, response, degree + 1):
+                self._field_degrees.put(size, degree)
+                return found
+        return None
+
+    def _map_by_polynomials(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera | None,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> RawMap:
+        """The map by polynomials alone, or the exact one where they do not follow it."""
         exact = camera, drift, timing
         interpolated = self._sample_departure(size, *exact)
         if interpolated is None:
@@ -195,3 +269,103 @@ class SmoothMaps:
                 self._degrees.put(key, degree)
                 return interpolant, at_nodes
         return None
+
+
+def _response(
+    size: tuple[int, int],
+    plain: ScanCamera,
+    drift: RasterDrift | None,
+    timing: ScanTiming | None,
+) -> Array:
+    """The (2, 2) raw shift per departure of the field, to first order in the drift per row."""
+    if drift is None or timing is None:
+        return np.eye(2)
+    middle = 0.5 * np.array([[size[0], size[1]]])
+    velocity = PixelDrift(size, plain, drift, timing).velocity_px_s
+    raw = plain.raw_from_rect(np.vstack([middle, middle + 1e-3 * velocity * timing.frame_time_s]))
+    raw_velocity = (raw[1] - raw[0]) / (1e-3 * timing.frame_time_s)
+    at = timing.pixel_offset_s(
+        np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), size[1], size[0]
+    )
+    return np.asarray(np.linalg.inv(np.eye(2) - np.outer(raw_velocity, at[1:] - at[0])))
+
+
+def _is_accurate(found: RawMap, plain: ScanCamera, response: Array, nodes: int) -> bool:
+    """Whether some pixels of a map with ``nodes`` rows of a field fulfil the equation of the exact position.
+
+    The test takes no iteration: where the field moves a raw position to is where the drift and the rest of the camera
+    put it.
+    """
+    width = found.size[0]
+    camera, drift, timing = found._exact
+    assert camera is not None
+    assert found._rows is not None
+    assert found._columns is not None
+    at = _test_pixels(found.size)
+    picked = found._columns[:, np.r_[at[0], width + at[0]]]
+    raw, shift = (
+        np.stack([a.ravel() for a in np.split(band.astype(np.float64), 2, axis=1)], axis=1)
+        for band in (
+            found._rows[at[1]] @ picked,
+            found._rows[at[1], -nodes - 2 : -2] @ picked[-nodes - 2 : -2],
+        )
+    )
+    # What lies outside of the raw frame comes out black anyway.
+    scanned = np.all((raw > -1.0) & (raw < np.array(found.size)), axis=1)
+    departure = np.linalg.solve(response, shift.T).T
+    if drift is None or np.max(np.abs(shift - departure)) <= _SMALL_RESPONSE_PX:
+        undisplaced, largest = raw - departure, _MAX_MAP_ERROR_PX
+    else:
+        # The response is that of the middle of the image and of the frame.
+        x, y = np.meshgrid(*at)
+        xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+        moved = PixelDrift(found.size, plain, drift, timing).moved(xy, raw)
+        undisplaced, largest = plain.raw_from_rect(moved), _MAX_MOVING_ERROR_PX
+    miss = camera.without_residual(raw) - undisplaced
+    return bool(np.max(np.abs(miss[scanned]), initial=0.0) <= largest)
+
+
+@lru_cache(maxsize=_MAX_KEPT)
+def _test_pixels(size: tuple[int, int]) -> tuple[Indices, Indices]:
+    """Columns and rows at which a map with a residual field is tested, denser towards the edges."""
+    columns, rows = (
+        np.unique(np.round(0.5 * (n - 1) * (1.0 - np.cos(np.pi * (np.arange(k) + 0.5) / k))))
+        for n, k in zip(size, _FIELD_TESTS, strict=True)
+    )
+    return columns.astype(np.intp), rows.astype(np.intp)
+
+
+@dataclass(frozen=True)
+class _SplitCamera:
+    """A camera without its residual field, and the field; None where it cannot be tabulated."""
+
+    plain: ScanCamera
+    field: FieldTable | None
+
+
+@dataclass(frozen=True)
+class _FieldRows:
+    """How the columns of a map, with those of a field among them, become its rows.
+
+    Attributes
+    ----------
+    at_nodes
+        (k, nodes + 2): columns without those of the field, to the rows at which the field is looked up.
+    at_pixels
+        (h, nodes + k + 2): all of them, to the rows of the image.
+    """
+
+    at_nodes: Array32
+    at_pixels: Array32
+
+
+@lru_cache(maxsize=_MAX_KEPT)
+def _make_field_rows(height: int, degree: int, field_degree: int) -> _FieldRows:
+    pixels = np.arange(height, dtype=np.float64)
+    places, field = _make_basis(height, field_degree, pixels)
+    smooth = [_make_basis(height, degree, at)[1] for at in (places, pixels)]
+    nodes = np.column_stack([smooth[0], np.ones(len(places)), places])
+    return _FieldRows(
+        nodes.astype(np.float32),
+        np.column_stack([smooth[1], field, np.ones(height), pixels]).astype(np.float32),
+    )

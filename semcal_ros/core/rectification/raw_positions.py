@@ -21,7 +21,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
+__all__ = ["PixelDrift", "RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
 
 
 # Each step shrinks the error by the drift per row time over a row: a drift of half a row per row
@@ -73,37 +73,77 @@ def raw_from_output(
     timing
         Raster timing; None takes the frame as an instant, so that the velocity has no effect.
     """
-    jacobian = np.eye(2) if camera is None else camera.rectified.ideal_from_sem_jacobian
     if drift is None:
         return xy.copy() if camera is None else camera.raw_from_rect(xy)
-    at_centre = xy + jacobian @ np.asarray(drift.position, dtype=np.float64)
-    raw = at_centre if camera is None else camera.raw_from_rect(at_centre)
-    velocity = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
-    acceleration = 0.5 * (jacobian @ np.asarray(drift.acceleration, dtype=np.float64))
-    is_accelerated = bool(acceleration.any())
-    if timing is None or not (is_accelerated or velocity.any()):
+    shift = PixelDrift(size, camera, drift, timing)
+    moved = shift.moved(xy)
+    raw = moved if camera is None else camera.raw_from_rect(moved)
+    if shift.is_still:
         return raw
-    width, height = size
     for _ in range(_MAX_STEPS):
         # A contraction as long as the drift moves by much less than a row while a row is scanned.
-        offset_s = timing.pixel_offset_s(raw[:, 1], raw[:, 0], height, width)
-        since_s = offset_s - timing.centre_offset_s
-        moved = at_centre + np.multiply.outer(velocity, since_s).T
-        if is_accelerated:
-            # The mean over the passes of the square of the time.
-            square_s2 = since_s**2 + timing.pass_variance_s2
-            moved += np.multiply.outer(acceleration, square_s2).T
+        moved = shift.moved(xy, raw)
         new = moved if camera is None else camera.raw_from_rect(moved)
         change_px = np.abs(new - raw)
         raw = new
         # The error that remains is smaller than the step by the same factor again.
         if not (change_px > _CONVERGED_PX).any():
             return raw
+    assert timing is not None
     raise InvalidValueError(
-        f"drift of {np.hypot(*velocity):.3g} px/s with {timing.frame_time_s} s per pass",
+        f"drift of {np.hypot(*shift.velocity_px_s):.3g} px/s with {timing.frame_time_s} s per pass",
         expected="a drift that is slow against the scan of a row",
         do="check the frame time and the unit of the velocity",
     )
+
+
+class PixelDrift:
+    """A drift in rectified pixels.
+
+    Parameters
+    ----------
+    size, camera, drift, timing
+        As in :func:`raw_from_output`.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera | None,
+        drift: RasterDrift,
+        timing: ScanTiming | None,
+    ) -> None:
+        jacobian = np.eye(2) if camera is None else camera.rectified.ideal_from_sem_jacobian
+        self._size, self._timing = size, timing
+        self._position_px = jacobian @ np.asarray(drift.position, dtype=np.float64)
+        self._half_acceleration_px = 0.5 * (
+            jacobian @ np.asarray(drift.acceleration, dtype=np.float64)
+        )
+        self.velocity_px_s = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
+        self._is_accelerated = bool(self._half_acceleration_px.any())
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the drift is the same for all pixels of a frame."""
+        return self._timing is None or not (self._is_accelerated or self.velocity_px_s.any())
+
+    def moved(self, xy: Array, raw: Array | None = None) -> Array:
+        """Return rectified pixels (n, 2) moved by the drift at the times at which raw ones are scanned.
+
+        Without raw pixels, the time is the centre of the acquisition.
+        """
+        at_centre = xy + self._position_px
+        if raw is None or self._timing is None:
+            return at_centre
+        width, height = self._size
+        offset_s = self._timing.pixel_offset_s(raw[:, 1], raw[:, 0], height, width)
+        since_s = offset_s - self._timing.centre_offset_s
+        moved = at_centre + np.multiply.outer(self.velocity_px_s, since_s).T
+        if self._is_accelerated:
+            # The mean over the passes of the square of the time.
+            square_s2 = since_s**2 + self._timing.pass_variance_s2
+            moved += np.multiply.outer(self._half_acceleration_px, square_s2).T
+        return moved
 
 
 def camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object, ...]:

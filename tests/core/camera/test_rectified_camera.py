@@ -183,7 +183,13 @@ def test_the_jacobian_is_that_of_what_another_camera_rectifies(field):
         size = slice_.coefficients.size
         covariance, cross = 1e-6 * np.eye(size), np.zeros((10, size))
         camera = replace(
-            camera, residual=replace(slice_, covariance=covariance, cross_covariance=cross)
+            camera,
+            residual=replace(
+                slice_,
+                cross_covariance=cross,
+                weights=np.ones(1),
+                whole_covariance=covariance,
+            ),
         )
     columns = []
     for k, name in enumerate(PARAMETER_NAMES):

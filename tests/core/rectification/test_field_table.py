@@ -1,0 +1,119 @@
+"""The residual field from a table, against Newton's method at every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.residual_field import ResidualField, zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps
+from semcal_ros.core.rectification.field_table import tabulate_field
+from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.synthetic import preset
+
+SIZE = (256, 192)
+TIMING = ScanTiming(2.0, averages=2, flyback_fraction=0.1)
+G = 2000.0
+
+
+def settling_field(strength_px: float) -> ResidualField:
+    """A beam that settles at the start of the lines, and a spiral, changing with the magnification."""
+    zero = zero_field(SIZE, (100.0, 10000.0), 3)
+    coefficients = zero.coefficients.copy()
+    # Near enough to where each basis function has its maximum.
+    x, y = (
+        np.array([np.mean(knots[k + 1 : k + 4]) for k in range(len(knots) - 4)])
+        for knots in (zero.knots_x, zero.knots_y)
+    )
+    amplitude = strength_px / (0.5 * SIZE[0]) * np.array([1.0, 1.3, 0.6])[:, None, None]
+    coefficients[..., 0] = amplitude * (np.exp(-(x + 1.0) / 0.15) + 0.5 * np.sin(3.0 * y)[:, None])
+    coefficients[..., 1] = amplitude * 0.5 * np.sin(3.0 * x) * np.cos(2.0 * y)[:, None]
+    return replace(zero, coefficients=coefficients)
+
+
+def camera_with(field: ResidualField, g: float = G) -> ScanCamera:
+    plain = preset("pincushion").camera_at(g).resized(*SIZE)
+    return replace(plain, residual=field.at(g))
+
+
+def pixels() -> Array:
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+
+
+def largest_error(made: RawMap, camera: ScanCamera, drift: RasterDrift | None = None) -> float:
+    """The largest error of a pixel that comes out; what lies outside of the raw frame is black."""
+    exact = raw_from_output(pixels(), SIZE, camera, drift, TIMING)
+    scanned = np.all((exact > -1.0) & (exact < np.array(SIZE)), axis=1)
+    return float(np.max(np.abs(whole(made) - exact)[scanned]))
+
+
+def whole(made: RawMap) -> Array:
+    band = np.empty((SIZE[1], 2 * SIZE[0]), np.float32)
+    made.band(0, SIZE[1], band)
+    return np.stack([band[:, : SIZE[0]].ravel(), band[:, SIZE[0] :].ravel()], axis=1)
+
+
+def drift_px(position: tuple[float, float], velocity: tuple[float, float], acceleration=(0.0, 0.0)):
+    """A drift in px and seconds of the camera at G."""
+    per_px = 1.0 / camera_with(settling_field(0.0)).m
+    return RasterDrift(*(per_px * np.array(v) for v in (position, velocity, acceleration)))
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [
+        None,
+        drift_px((0.0, 0.0), (0.0, 0.0)),
+        drift_px((-7.3, 4.1), (0.4, -0.3)),
+        # A row is scanned while the specimen drifts by a twentieth of it: what lies elsewhere was seen at another time.
+        drift_px((31.0, -20.0), (-3.0, 5.0)),
+        drift_px((1.0, 2.0), (3.0, -2.0), (2.0, 4.0)),
+    ],
+    ids=["no drift", "zero", "slow", "fast", "accelerated"],
+)
+def test_a_map_from_the_table_is_the_exact_one(drift: RasterDrift | None) -> None:
+    camera = camera_with(settling_field(2.0))
+    made = SmoothMaps().make_map(SIZE, camera, drift, TIMING)
+    assert made.is_interpolated
+    # What a fast drift may add at the test points, and a little between them; the field moves pixels by 3 px.
+    assert largest_error(made, camera, drift) < 0.004
+
+
+def test_every_magnification_of_a_zoom_has_its_own_field() -> None:
+    maps, field = SmoothMaps(), settling_field(2.0)
+    for g in (150.0, 151.0, 9000.0, 150.0, 20000.0):
+        camera = camera_with(field, g)
+        made = maps.make_map(SIZE, camera, None, None)
+        assert made.is_interpolated
+        assert largest_error(made, camera) < 0.004
+
+
+def test_a_field_that_is_too_steep_for_the_table_is_computed_exactly() -> None:
+    camera = camera_with(settling_field(12.0))
+    made = SmoothMaps().make_map(SIZE, camera, None, None)
+    assert largest_error(made, camera) < 0.004
+
+
+def test_look_ups_invert_the_field() -> None:
+    camera = camera_with(settling_field(2.0))
+    assert camera.residual is not None
+    table = tabulate_field(camera, SIZE)
+    assert table is not None
+    rng = np.random.default_rng(0)
+    at = rng.uniform([-1.0, -1.0], SIZE, (2000, 2))
+    found = table.invert(*(np.ascontiguousarray(v[None], dtype=np.float32) for v in at.T))
+    assert found is not None
+    q = (at - 0.5 * (np.array(SIZE) - 1.0)) / camera.norm_px
+    exact = camera.norm_px * (camera.residual.inverse(q) - q)
+    # A slope of 0.2 at most, over 64.
+    assert np.max(np.abs(np.stack(found, axis=2)[0] - exact)) < 0.2 / 64
+
+
+def test_a_field_without_end_has_no_table() -> None:
+    assert tabulate_field(camera_with(settling_field(400.0)), SIZE) is None
