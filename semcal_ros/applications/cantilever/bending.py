@@ -50,6 +50,8 @@ _ROUNDS = 12
 _TERMS = 4
 # Least number of edges in a fit: two more than unknowns show the scatter.
 _LEAST = _TERMS + 2
+# An edge of a smaller weight does not count as used.
+_LEAST_WEIGHT = 0.05
 
 
 @dataclass(frozen=True)
@@ -224,16 +226,15 @@ def fit_bending(
     rows = np.repeat(design, 2, axis=0)[usable.ravel()]
     seen, sigma = displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
     if len(seen) < _LEAST:
-        unknown = np.full((2, 2), np.inf)
-        nothing = np.full(4, np.nan)
-        none, nan = np.zeros_like(usable), float("nan")
-        unseen = np.full(usable.shape, nan)
-        return Bending(nan, float("inf"), nothing, unknown, nan, unseen, none)
+        return _nothing_seen(usable.shape)
     prior = np.zeros(design.shape[1])
     prior[0] = 1.0 / max(offset_sigma_m, 1e-13) ** 2
     prior[1] = 1.0 / (_TURN_RAD * length_m) ** 2
-    solution, weight, scale, covariance = _fit_robustly(rows, seen, sigma, prior)
-    kept = weight > 0.05
+    fitted = _fit_robustly(rows, seen, sigma, prior)
+    if fitted is None:
+        return _nothing_seen(usable.shape)
+    solution, weight, scale, covariance = fitted
+    kept = weight > _LEAST_WEIGHT
     used = np.zeros(usable.size, dtype=bool)
     used[np.flatnonzero(usable.ravel())[kept]] = True
     left = seen - rows @ solution
@@ -261,10 +262,25 @@ def fit_bending(
     )
 
 
+def _nothing_seen(shape: tuple[int, ...]) -> Bending:
+    nan = float("nan")
+    return Bending(
+        nan,
+        float("inf"),
+        np.full(4, nan),
+        np.full((2, 2), np.inf),
+        nan,
+        np.full(shape, nan),
+        np.zeros(shape, dtype=bool),
+    )
+
+
 def _fit_robustly(
     rows: Array, seen: Array, sigma: Array, prior: Array
-) -> tuple[Array, Array, float, Array]:
+) -> tuple[Array, Array, float, Array] | None:
     """Fit by reweighted least squares (Tukey's biweight), scaled by the scatter of the residuals.
+
+    Returns None where too few agree with each other.
 
     The model is linear, so each round is one small solve. scipy.optimize.least_squares has no loss
     that gives outliers no weight at all: with its Cauchy loss, a fit of 60 blocks takes 65 to 80 ms
@@ -284,6 +300,8 @@ def _fit_robustly(
         # The first rounds do not yet know what is an outlier.
         far = residual / (scale * _TUKEY * (2.0 if turn < 3 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
+        if int(np.count_nonzero(weight > _LEAST_WEIGHT)) < _LEAST:
+            return None
     # The sandwich formula: the weights cost a little more than the plain inverse says.
     total = weight * plain / scale**2
     meat = (rows * (weight**2 * plain / scale**2)[:, None]).T @ rows + np.diag(prior)

@@ -1,4 +1,4 @@
-"""Find the cantilever in an image: the strongest bright strip between two parallel edges.
+"""Find the cantilever in an image: the strongest strip between two parallel edges, bright or dark.
 
 For every direction, the gradient across it is summed along lines (a Radon transform of the signed
 derivative). Texture averages out; a strip leaves a rising and a falling line close together.
@@ -32,6 +32,9 @@ _FINE_RAD = np.deg2rad(np.arange(-2.0, 2.01, 0.2))
 _LEAST_WIDTH_PX = 4
 # Of the shorter side: a wider bright area is not taken for a cantilever.
 _LARGEST_WIDTH = 0.35
+# Strength of a dark strip over that of a bright one. Between a bright beam and another body lies a dark strip, of which
+# one edge is the beam's own.
+_DARK = 0.7
 # The strip extends as far as its edges are at least this strong, relative to their 90 % quantile.
 _EDGE_SHARE = 0.35
 # Of the shorter side: shorter gaps in the edges are dirt or texture and not an end.
@@ -56,6 +59,8 @@ class Strip:
         Half the width of the strip.
     base_seen, tip_seen
         Whether each end is an end of the cantilever and not the place where it leaves the image.
+    is_dark
+        Whether the strip is darker than what lies beside it.
     """
 
     base_px: Array
@@ -63,6 +68,7 @@ class Strip:
     half_width_px: float
     base_seen: bool
     tip_seen: bool
+    is_dark: bool = False
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ def find_strip(
     base_px: ArrayLike | None = None,
     tip_px: ArrayLike | None = None,
 ) -> Strip:
-    """Find a bright cantilever on a darker ground.
+    """Find a cantilever on a darker ground, or on a clearly brighter one.
 
     Parameters
     ----------
@@ -117,16 +123,20 @@ def find_strip(
         )
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
     if base_px is None or tip_px is None:
-        found = _search_strip(smooth)
+        is_dark, angle, point = _search_line(smooth)
+        smooth = -smooth if is_dark else smooth
+        lines = _prepare_lines(smooth)
+        found = _find_ends(smooth, *_find_pair_near(lines, angle, point)[1:])
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
-        found = _follow_clicks(smooth, clicks[0], clicks[1])
+        is_dark, found = _follow_clicks(smooth, clicks[0], clicks[1])
     return Strip(
         (found.base_px + 0.5) * shrink - 0.5,
         (found.tip_px + 0.5) * shrink - 0.5,
         found.half_width_px * shrink,
         found.base_seen,
         found.tip_seen,
+        is_dark,
     )
 
 
@@ -158,37 +168,39 @@ def _widen(sums: Array) -> Array:
     return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
 
 
-def _search_strip(smooth: Array) -> Strip:
-    """Find the strongest strip in any direction, first in a small image, then in the large one."""
+def _search_line(smooth: Array) -> tuple[bool, float, Array]:
+    """Find the strongest strip in any direction in a small image: whether it is dark, direction, a point on it."""
     shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
     size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
     part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
-    best, angle, offset = 0.0, 0.0, 0.0
+    best, is_dark, angle, offset = 0.0, False, 0.0, 0.0
     # Half a turn is enough: in the opposite direction the two edges only change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
         sums, first = lines.across(float(turn))
         wide = _widen(sums)
-        strength, low, up = _find_best_pair(wide, -wide, _LEAST_WIDTH_PX // shrink + 1, high)
-        if strength > best:
-            best, angle, offset = strength, float(turn), 0.5 * (low + up) + first
+        for dark, edges in ((False, wide), (True, -wide)):
+            strength, low, up = _find_best_pair(edges, -edges, _LEAST_WIDTH_PX // shrink + 1, high)
+            strength *= _DARK if dark else 1.0
+            if strength > best:
+                best, is_dark, angle = strength, dark, float(turn)
+                offset = 0.5 * (low + up) + first
     if best <= 0.0:
         raise InvalidValueError("no strip in the image", expected="a cantilever", do=_GIVE_CLICKS)
     across = np.array([-np.sin(angle), np.cos(angle)])
     middle = 0.5 * (np.array(size) - 1.0)
     point = middle + (offset - float(across @ middle)) * across
-    angle, offset, half = _find_pair_near(
-        _prepare_lines(smooth), angle, (point + 0.5) * shrink - 0.5
-    )
-    return _find_ends(smooth, angle, offset, half)
+    return is_dark, angle, (point + 0.5) * shrink - 0.5
 
 
-def _find_pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float, float, float]:
-    """Find direction, distance from the origin and half width of the strip around a point."""
+def _find_pair_near(
+    lines: _Lines, nominal: float, point: Array
+) -> tuple[float, float, float, float]:
+    """Find strength, direction, distance from the origin and half width of the bright strip around a point."""
     reach = int(_LARGEST_WIDTH * min(lines.size))
-    best, found = 0.0, (nominal, 0.0, 0.0)
+    best, found = 0.0, (0.0, nominal, 0.0, 0.0)
     for angle in nominal + _FINE_RAD:
         sums, first = lines.across(float(angle))
         here = round(float(point[1] * np.cos(angle) - point[0] * np.sin(angle)) - first)
@@ -201,16 +213,12 @@ def _find_pair_near(lines: _Lines, nominal: float, point: Array) -> tuple[float,
         strength, low, up = _find_best_pair(rise, fall, _LEAST_WIDTH_PX, right - left)
         if strength > best:
             best = strength
-            found = float(angle), 0.5 * (low + up) + left + first, 0.5 * (up - low)
-    if best <= 0.0:
-        raise InvalidValueError(
-            "no bright strip between base and tip", expected="two points on its centre line"
-        )
+            found = best, float(angle), 0.5 * (low + up) + left + first, 0.5 * (up - low)
     return found
 
 
-def _follow_clicks(smooth: Array, base: Array, tip: Array) -> Strip:
-    """Find the strip around two points, whose positions along it are taken as its ends."""
+def _follow_clicks(smooth: Array, base: Array, tip: Array) -> tuple[bool, Strip]:
+    """Find the strip around two points, whose positions along it are taken as its ends, and whether it is dark."""
     if not float(np.hypot(*(tip - base))) > 10.0:
         raise InvalidValueError("base and tip at the same place", expected="two ends of a beam")
     nominal = float(np.arctan2(tip[1] - base[1], tip[0] - base[0]))
@@ -221,11 +229,17 @@ def _follow_clicks(smooth: Array, base: Array, tip: Array) -> Strip:
     point = np.mean(points, axis=0) if points else 0.5 * (base + tip)
     if len(points) == 1:
         point = points[0] + inwards[0 if seen[0] else 1]
-    angle, offset, half = _find_pair_near(_prepare_lines(smooth), nominal, point)
+    bright, dark = (_find_pair_near(_prepare_lines(s), nominal, point) for s in (smooth, -smooth))
+    is_dark = _DARK * dark[0] > bright[0]
+    strength, angle, offset, half = dark if is_dark else bright
+    if strength <= 0.0:
+        raise InvalidValueError(
+            "no strip between base and tip", expected="two points on its centre line"
+        )
     along = np.array([np.cos(angle), np.sin(angle)])
     across = offset * np.array([-along[1], along[0]])
     ends = [across + along * float(along @ p) for p in (base, tip)]
-    return Strip(*_clip_to_view(ends, smooth.shape), half, seen[0], seen[1])
+    return is_dark, Strip(*_clip_to_view(ends, smooth.shape), half, seen[0], seen[1])
 
 
 def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,7 +41,13 @@ __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 _SAME_STEP = (0.5, 1.6)
 # Relative difference between measured and given length above which there is a note: a choice, well
 # above the uncertainty of a calibrated scale and of both ends.
-_WRONG_LENGTH = 0.03
+_NOTED_LENGTH = 0.03
+# That above which it is another length, or another body: five times what makers of cantilevers state, 3 %.
+_WRONG_LENGTH = 0.15
+# Sizes of the field of view beyond which a length has the wrong unit, since no bending would be seen.
+_LARGEST_LENGTH = 50.0
+# Deviation of the shape of the bending from a given one, in sigmas, that is told.
+_WRONG_SHAPE = 3.0
 # Largest deflection in the search if the user gives none, as a fraction of the length. The search
 # covers the area beside the beam, and a wider one may find other bodies.
 _LARGEST = 0.04
@@ -187,7 +193,16 @@ def measure_series(
     _check(images, times_s, reference)
     height, width = images[0].shape
     plane = PlaneMap(camera.resized(width, height), timing)
+    field_m = max(width, height) * plane.pixel_m
+    if settings.length_m > _LARGEST_LENGTH * field_m:
+        raise InvalidValueError(
+            f"a cantilever of {settings.length_m:g} m where {1e6 * field_m:.3g} um are in view",
+            expected="its length in m, such as 35e-6",
+            do="check --length",
+        )
     strip = find_strip(images[0], base_px=settings.base_px, tip_px=settings.tip_px)
+    if strip.is_dark:
+        images = [_invert(image) for image in images]
     rough = _make_rough_axis(strip, plane, settings.length_m)
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
@@ -195,8 +210,10 @@ def measure_series(
     undeformed = measure_undeformed_beam(
         rough, [work.sample(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
-    frames, shape = work.deflections(undeformed, tuple(reference), on_frame)
+    _check_length(undeformed, settings.length_m)
+    frames, shape, misfit = work.deflections(undeformed, tuple(reference), on_frame)
     notes = _collect_notes(undeformed, frames, background.path, settings)
+    notes += () if misfit is None else (misfit,)
     return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
 
@@ -214,6 +231,30 @@ def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequ
         )
 
 
+def _invert(image: AnyImage) -> AnyImage:
+    """Return the negative: a dark beam becomes a bright one. It is the same for all images of a type."""
+    return np.asarray(np.invert(image) if image.dtype.kind == "u" else np.negative(image))
+
+
+def _check_length(undeformed: UndeformedBeam, length_m: float) -> None:
+    """Refuse a length that contradicts what is seen."""
+    axis, sigma_m = undeformed.axis, undeformed.length_sigma_m
+    seen_m, told = undeformed.length_m, f"{1e6 * undeformed.length_m:.4g} um long"
+    room_m = _WRONG_LENGTH * length_m + (5.0 * sigma_m if np.isfinite(sigma_m) else 0.0)
+    wrong = abs(seen_m - length_m) > room_m
+    if not np.isfinite(seen_m):
+        # Only a part of the beam is in view, which cannot be longer than all of it.
+        seen_m = axis.visible_m[1] - axis.visible_m[0]
+        told = f"at least {1e6 * seen_m:.4g} um long"
+        wrong = seen_m > length_m + room_m
+    if wrong:
+        raise InvalidValueError(
+            f"a cantilever of {1e6 * length_m:.4g} um that is {told} according to the calibration",
+            expected=f"a length within {100.0 * _WRONG_LENGTH:g} % of what is seen",
+            do="check --length, --base and --tip, and whether the calibration is that of this microscope",
+        )
+
+
 def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
     """Convert the strip to the sem frame, with provisional arc lengths."""
     ends = plane.sem_of(np.stack([strip.base_px, strip.tip_px]))
@@ -224,6 +265,18 @@ def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
     origin = ends[0] - base_at * direction
     visible = (base_at, base_at + seen_m)
     return Axis(origin, direction, half_m, visible, strip.base_seen, strip.tip_seen)
+
+
+def _compare_shapes(given: Shape, common: Shape) -> tuple[Shape, str | None]:
+    """Return the given shape with the uncertainty that the frames' common one shows, and a remark if it is wrong."""
+    deviation = abs(common.value - given.value)
+    if not deviation > _WRONG_SHAPE * common.sigma:
+        return given, None
+    # What is wrong is known, and yet the given shape was asked for: it is stated as if it were a sigma.
+    return replace(given, sigma=deviation, relative=common.relative), (
+        f"the beam does not bend as --shape says: its third order is {common.value:.2f} +- {common.sigma:.2f} of the "
+        f"deflection and not {given.value:.2f}; the sigmas contain the difference, and --shape free avoids it"
+    )
 
 
 def _collect_notes(
@@ -237,7 +290,7 @@ def _collect_notes(
         notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
     if lost := int(np.count_nonzero(~path.trusted)):
         notes.append(f"no drift in {lost} of {len(path)} frames: they rest on the base alone")
-    if abs(undeformed.length_m / settings.length_m - 1.0) > _WRONG_LENGTH:
+    if abs(undeformed.length_m / settings.length_m - 1.0) > _NOTED_LENGTH:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
@@ -279,8 +332,11 @@ class _SeriesMeasurement:
 
     def deflections(
         self, undeformed: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
-    ) -> tuple[list[Deflection], Shape]:
-        """Measure all frames in the order of time, each starting from the last; fit their shape."""
+    ) -> tuple[list[Deflection], Shape, str | None]:
+        """Measure all frames in the order of time, each starting from the last; fit their shape.
+
+        Also returns a remark where the frames do not bend as the shape that was given.
+        """
         edges, free = [], []
         terms = np.zeros(2)
         for frame in range(len(self._images)):
@@ -292,12 +348,12 @@ class _SeriesMeasurement:
                 terms = free[-1].coefficients[2:]
             on_frame()
         shape = parse_shape(self._settings.shape)
-        if shape is None:
-            others = [f for k, f in enumerate(free) if k not in reference]
-            own = [free[k].covariance[1, 1] for k in reference]
-            shape = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
+        others = [f for k, f in enumerate(free) if k not in reference]
+        own = [free[k].covariance[1, 1] for k in reference]
+        common = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
+        shape, misfit = (common, None) if shape is None else _compare_shapes(shape, common)
         bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
-        return [self._result(k, one, undeformed) for k, one in enumerate(bent)], shape
+        return [self._result(k, one, undeformed) for k, one in enumerate(bent)], shape, misfit
 
     def _nearby(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> Array:
         """Find a bending to start from: the one with most contrast along the beam's edges."""

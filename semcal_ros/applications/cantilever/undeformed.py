@@ -31,6 +31,9 @@ _EDGE_PX = 1.1
 _BLOCK_PX = 12.0
 # Least number of blocks with both edges: a fit with four unknowns needs some more.
 _LEAST_BLOCKS = 6
+# Least part of the blocks with both edges. A beam at rest shows all of them, but for dirt; on the
+# texture of the ground, chance finds a quarter to two fifths.
+_LEAST_SHARE = 0.6
 # Largest reach, in half widths: the fit of one edge of a narrow beam must not include the other.
 _REACH_OF_HALF_WIDTH = 1.5
 # The ends are searched for up to this distance from the ends of the strip.
@@ -99,11 +102,12 @@ def measure_undeformed_beam(
     model = _place_blocks(counted, width_m, px_m)
     fits = [fit_edges(*view, model, _predict_straight_edges(model)) for view in final]
     across, sigma, step = average_edges(fits)
-    if int(np.isfinite(sigma).all(axis=1).sum()) < _LEAST_BLOCKS:
+    found = np.isfinite(sigma).all(axis=1)
+    if int(found.sum()) < max(_LEAST_BLOCKS, _LEAST_SHARE * found.size):
         raise InvalidValueError(
-            "a strip whose edges cannot be measured",
-            expected="a beam brighter than its surroundings",
-            do="give base and tip, or check focus and contrast",
+            f"no beam where one was looked for: both edges are seen in {int(found.sum())} of {found.size} places",
+            expected="a strip with two parallel edges from base to tip",
+            do="check --base and --tip, the first frame, focus and contrast",
         )
     return UndeformedBeam(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
 

@@ -75,6 +75,18 @@ def test_edges_are_where_they_are_and_as_good_as_they_say():
     assert np.std(errors) < 1.35 * 0.1 / np.sqrt(12 * 0.28)
 
 
+def test_edges_that_do_not_agree_say_nothing():
+    """The fit of a bending once ended in a singular matrix."""
+    rng = np.random.default_rng(0)
+    # Every edge elsewhere by many sigmas: too few agree with each other.
+    moved = 1e-6 * np.sort(rng.normal(size=(12, 2)) ** 5, axis=0)
+    found = fit_bending(np.linspace(0.1, 1.0, 12), moved, np.full((12, 2), 1e-12), LENGTH, 1e-9)
+    assert np.isnan(found.deflection_m) or np.isfinite(found.sigma_m)
+    nothing = fit_bending(np.linspace(0.1, 1.0, 12), moved, np.full((12, 2), np.inf), LENGTH, 1e-9)
+    assert np.isnan(nothing.deflection_m)
+    assert nothing.sigma_m == np.inf
+
+
 def test_an_edge_that_is_not_there_has_no_sigma():
     rng = np.random.default_rng(2)
     along, across, grey = edge_pixels(rng, 20, 0.0, 5.0)
@@ -219,6 +231,68 @@ def test_pictures_without_a_cantilever_are_refused():
 
 
 # -- the whole ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def end_plan():
+    """The end of the beam at rest, half and fully bent."""
+    return cantilever_plan(
+        scope(256), pushes=(0.0, 0.5, 1.0), magnifications=(7760.0,), view="end", seed=6
+    )
+
+
+@pytest.mark.parametrize(
+    ("base", "tip"), [((50, 50), (200, 200)), ((30, 210), (225, 190)), ((150, 50), (155, 200))]
+)
+def test_points_that_are_not_on_the_beam_are_refused(end_plan, base, tip):
+    with pytest.raises(InvalidValueError, match="no beam where one was looked for"):
+        measured(end_plan, base_px=base, tip_px=tip)
+
+
+def test_a_dark_beam_is_measured_as_its_negative(end_plan):
+    images = [end_plan.render(k) for k in range(3)]
+    camera, timing = scope(256).camera_at(7760.0), end_plan.microscope.timing
+    times = [f.start_time_s for f in end_plan.frames]
+    bright, dark = (
+        measure_series(taken, times, camera, timing, SeriesSettings(LENGTH))
+        for taken in (images, [255 - image for image in images])
+    )
+    assert not find_strip(images[0]).is_dark
+    assert find_strip(255 - images[0]).is_dark
+    for one, other, truth in zip(bright.frames, dark.frames, (0.0, 125e-9, 250e-9), strict=True):
+        assert other.deflection_m == pytest.approx(one.deflection_m, abs=0.1 * one.sigma_m + 1e-12)
+        assert abs(other.deflection_m - truth) < 4.0 * other.sigma_m + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("length_m", "told"),
+    [(3e-6, "3 um that is at least"), (35.0, "a cantilever of 35 m where")],
+)
+def test_a_length_that_the_pixels_contradict_is_refused(end_plan, length_m, told):
+    images = [end_plan.render(0)]
+    with pytest.raises(InvalidValueError, match=told):
+        measure_series(images, [0.0], scope(256).camera_at(7760.0), None, SeriesSettings(length_m))
+
+
+def test_a_whole_beam_of_another_length_is_refused_and_a_small_difference_told():
+    plan = cantilever_plan(scope(256, 0.4), pushes=(0.0,), magnifications=(8890.0,), seed=2)
+    camera = plan.microscope.camera_at(8890.0)
+    image = plan.render(0)
+    with pytest.raises(InvalidValueError, match=r"28 um that is 34\.99 um long"):
+        measure_series([image], [0.0], camera, None, SeriesSettings(28e-6))
+    found = measure_series([image], [0.0], camera, None, SeriesSettings(33e-6))
+    assert any("not 33 um: check the length" in note for note in found.notes)
+
+
+def test_a_shape_that_the_beam_does_not_have_is_told_and_in_the_sigma(end_plan):
+    """A loaded beam bends by a third order that a parabola does not have."""
+    found, truth = measured(end_plan, shape="parabola")
+    assert any("does not bend as --shape says" in note for note in found.notes)
+    last = found.frames[-1]
+    assert last.deflection_m - truth[-1] > 10e-9
+    assert abs(last.deflection_m - truth[-1]) < 2.0 * last.sigma_m
+    fitting, _ = measured(end_plan, shape="beam")
+    assert not any("--shape" in note for note in fitting.notes)
 
 
 @pytest.mark.slow
