@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, solve_scaled
+from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.priors import Setup
@@ -29,6 +29,8 @@ __all__ = ["Summary", "select_functions"]
 # Most coefficients of one function. It bounds the search; with few magnifications their number is
 # the smaller limit.
 _MAX_SIZE = 8
+# What a function may be: a polynomial in log g or in g.
+_POLYNOMIALS = ("chebyshev_log", "chebyshev")
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
@@ -70,27 +72,46 @@ class Summary:
 
 
 class _Candidates:
-    """Cross-validation scores of candidate function sets, with the blocks of each function kept."""
+    """Cross-validation scores of candidate function sets.
+
+    The equations of all coefficients that any candidate may have are made once; a candidate is a
+    choice among them.
+    """
 
     def __init__(self, summary: Summary, setup: Setup, base: Mapping[str, ContinuousFunction]):
-        self.summary = summary
         self.setup = setup
-        self.base = base
-        self.rows: dict[tuple[str, str, int], Array] = {}
-        self.priors: dict[tuple[str, str, int], tuple[Array, Array]] = {}
         self.scores: dict[tuple[tuple[str, int], ...], float] = {}
-
-    def _rows(self, name: str, kind: str, size: int) -> Array:
-        key = (name, kind, size)
-        if key not in self.rows:
-            breaks = self.setup.breaks_of(name)
-            zeros = np.zeros(size + len(breaks))
-            blank = ContinuousFunction(kind, zeros, self.base[name].g_range, breaks=breaks)
-            rows = np.stack([blank.basis(float(g)) for g in self.setup.magnifications])
-            if name == "scale":
-                rows = rows * self.setup.nominal_px_per_m(self.setup.magnifications)[:, None]
-            self.rows[key] = rows
-        return self.rows[key]
+        self.priors: dict[tuple[str, str, int], tuple[Array, Array]] = {}
+        # Columns of each function in the order of its coefficients, and those of its jumps.
+        self.columns: dict[tuple[str, str], Indices] = {}
+        self.jumps: dict[str, Indices] = {}
+        magnifications = [float(g) for g in setup.magnifications]
+        blocks: list[Array] = []
+        rows: list[int] = []
+        for row, name in enumerate(FUNCTION_NAMES):
+            most = max(_MAX_SIZE, base[name].smooth_size)
+            for kind in _POLYNOMIALS:
+                blank = ContinuousFunction(kind, np.zeros(most), base[name].g_range)
+                self.columns[name, kind] = np.arange(len(rows), len(rows) + most)
+                blocks.append(np.stack([blank.basis(g) for g in magnifications]))
+                rows += [row] * most
+            breaks = setup.breaks_of(name)
+            self.jumps[name] = np.arange(len(rows), len(rows) + len(breaks))
+            blocks.append(np.array(magnifications)[:, None] >= breaks)
+            rows += [row] * len(breaks)
+        shared = len(summary.shared_mean)
+        self.shared = np.arange(len(rows), len(rows) + shared)
+        self.shared_prior = summary.shared_mean, summary.shared_precision
+        values = np.concatenate(blocks, axis=1)
+        # The scale is the first of the functions.
+        nominal = setup.nominal_px_per_m(setup.magnifications)
+        values[:, np.array(rows) == 0] *= nominal[:, None]
+        designs = np.zeros((len(magnifications), len(FUNCTION_NAMES), len(rows)))
+        designs[:, rows, np.arange(len(rows))] = values
+        designs = with_shared(designs, shared)
+        transposed = np.swapaxes(designs, 1, 2)
+        self.matrices = transposed @ summary.information @ designs
+        self.rights = (transposed @ summary.right[:, :, None])[:, :, 0]
 
     def _prior(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
         key = (name, kind, size)
@@ -107,34 +128,25 @@ class _Candidates:
         return self.scores[key]
 
     def _score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
-        blocks = [self._rows(name, *sizes[name]) for name in FUNCTION_NAMES]
-        total = sum(b.shape[1] for b in blocks)
-        designs = np.zeros((len(self.setup.magnifications), len(blocks), total))
-        mean, precision = np.zeros(total), np.zeros(total)
-        column = 0
-        for row, (name, block) in enumerate(zip(FUNCTION_NAMES, blocks, strict=True)):
-            stop = column + block.shape[1]
-            designs[:, row, column:stop] = block
-            mean[column:stop], precision[column:stop] = self._prior(name, *sizes[name])
-            column = stop
-        shared = len(self.summary.shared_mean)
-        if shared:
-            designs = with_shared(designs, shared)
-            mean = np.concatenate([mean, self.summary.shared_mean])
-            precision = np.concatenate([precision, self.summary.shared_precision])
-        transposed = np.swapaxes(designs, 1, 2)
-        matrices = transposed @ self.summary.information @ designs
-        rights = (transposed @ self.summary.right[:, :, None])[:, :, 0]
+        chosen: list[Indices] = []
+        for name in FUNCTION_NAMES:
+            kind, size = sizes[name]
+            chosen += [self.columns[name, kind][:size], self.jumps[name]]
+        columns = np.concatenate([*chosen, self.shared])
+        priors = [self._prior(name, *sizes[name]) for name in FUNCTION_NAMES]
+        mean, precision = (
+            np.concatenate(parts) for parts in zip(*priors, self.shared_prior, strict=True)
+        )
+        matrices = self.matrices[:, columns[:, None], columns]
+        rights = self.rights[:, columns]
         matrix = matrices.sum(axis=0) + np.diag(precision)
         right = rights.sum(axis=0) + precision * mean
         # The inner magnifications are predicted from the others, the two outermost ones from all.
         inner = np.ones((len(matrices), 1, 1))
         inner[[0, -1]] = 0.0
         solution = solve_scaled(matrix - inner * matrices, right - inner[:, 0] * rights)
-        cameras = np.einsum("mpk,mk->mp", designs, solution)
-        quadratic = np.einsum("mp,mpq,mq->m", cameras, self.summary.information, cameras)
-        linear = np.einsum("mp,mp->m", cameras, self.summary.right)
-        return float(np.sum(0.5 * quadratic - linear))
+        bent = (matrices @ solution[:, :, None])[:, :, 0]
+        return float(np.sum((0.5 * bent - rights) * solution))
 
 
 def select_functions(
@@ -180,7 +192,7 @@ def _moves(
     moves = []
     for name in free:
         kind, size = sizes[name]
-        for other in ("chebyshev_log", "chebyshev"):
+        for other in _POLYNOMIALS:
             for change in (-1, 0, 1, 2):
                 option = (other, size + change)
                 if 1 <= option[1] <= limit and option != (kind, size):
