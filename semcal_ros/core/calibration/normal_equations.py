@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -158,7 +159,7 @@ class Problem:
     effects: Effects | None = None
     attitudes: Attitudes | None = None
 
-    @property
+    @cached_property
     def view_of_point(self) -> Indices:
         """(N,) view index of every point."""
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
@@ -282,7 +283,12 @@ def _square_columns(problem: Problem) -> list[tuple[int, int]]:
 
 def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
     view = problem.view_of_point
-    rotated = np.einsum("nij,nj->ni", state.rotations[view], _shaped_grid(problem, state))
+    grid = _shaped_grid(problem, state)
+    rotated = np.empty_like(grid)
+    for rotation, first, last in zip(
+        state.rotations, problem.starts[:-1], problem.starts[1:], strict=True
+    ):
+        np.matmul(grid[first:last], rotation.T, out=rotated[first:last])
     cameras = (problem.designs[:, :10] @ state.theta)[problem.group]
     if problem.effects is not None:
         cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
@@ -538,10 +544,13 @@ def normal_equations(
     whitened = whitened_rows(problem, state, poses_only=poses_only)
     priors = pose_priors(problem, state)
     matrix = np.swapaxes(priors, 1, 2) @ priors
-    own = np.ix_(whitened.columns, whitened.columns)
-    for v in range(len(problem.group)):
+    columns = whitened.columns
+    observed = np.empty((len(problem.group), len(columns), len(columns)))
+    for v, own in enumerate(observed):
         x, y = whitened.rows[:, :, problem.starts[v] : problem.starts[v + 1]]
-        matrix[v][own] += x @ x.T + y @ y.T
+        np.matmul(x, x.T, out=own)
+        own += y @ y.T
+    matrix[:, columns[:, None], columns] += observed
     return NormalEquations(
         matrix[:, :-1, :-1], matrix[:, :-1, -1], whitened.residuals_px, whitened.huber_weight
     )
@@ -653,7 +662,7 @@ def reduced_normal_equations(
     ``information`` (M, C, C) and ``gradient`` (M, C) are the blocks of each magnification.
     """
     designs = problem.designs
-    matrix = np.einsum("mpk,mpq,mql->kl", designs, information, designs, optimize=True)
+    matrix = (np.swapaxes(designs, 1, 2) @ information @ designs).sum(axis=0)
     right = np.einsum("mpk,mp->k", designs, gradient)
     matrix[np.diag_indices_from(matrix)] += problem.prior_sigma**-2.0
     right = right - (theta - problem.prior_mean) * problem.prior_sigma**-2.0

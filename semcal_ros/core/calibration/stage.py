@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.camera.plane_geometry import cross_products, rotations_from_vectors
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -161,7 +161,12 @@ def attitudes(
 
 def _about_beam(angles_rad: Array) -> Array:
     """Return the (V, 3, 3) rotations about z, from x towards y."""
-    return rotations_from_vectors(np.outer(angles_rad, [0.0, 0.0, 1.0]))
+    out = np.zeros((len(angles_rad), 3, 3))
+    out[:, 0, 0] = out[:, 1, 1] = np.cos(angles_rad)
+    out[:, 1, 0] = np.sin(angles_rad)
+    out[:, 0, 1] = -out[:, 1, 0]
+    out[:, 2, 2] = 1.0
+    return out
 
 
 def stage_rotations(known: Attitudes, offsets: Array) -> tuple[Array, Array]:
@@ -188,7 +193,7 @@ def stage_rotations(known: Attitudes, offsets: Array) -> tuple[Array, Array]:
 def _turn_between_normals(expected: Array, rotations: Array) -> Array:
     """Return the (V, 3) smallest rotation vectors between the normals of orientations."""
     ours, theirs = rotations[:, :, 2], expected[:, :, 2]
-    across = np.cross(theirs, ours)
+    across = cross_products(theirs, ours)
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.sum(ours * theirs, axis=1))
     return across * (angle / np.maximum(sine, 1e-300))[:, None]
@@ -209,14 +214,16 @@ def attitude_residuals(
         (V, 3, 5) derivative of minus the residuals by the offsets.
     """
     expected, derivative = stage_rotations(known, offsets)
-    left = Rotation.from_matrix(rotations @ np.swapaxes(expected, 1, 2)).as_rotvec()
     direction = known.axis_rad + offsets[1] + known.scan_rotation_rad
     along = np.stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)], axis=1)
     normal = expected[:, :, 2]
-    frame = np.stack([along, np.cross(normal, along), normal], axis=1)
+    frame = np.stack([along, cross_products(normal, along), normal], axis=1)
     # Without a rotation there is no telling which way the grid lies: its turn is not compared.
-    blind = ~np.isfinite(known.sigma_rad[:, 2])
-    left[blind] = _turn_between_normals(expected[blind], rotations[blind])
+    told = np.isfinite(known.sigma_rad[:, 2])
+    left = _turn_between_normals(expected, rotations)
+    if np.any(told):
+        turn = rotations[told] @ np.swapaxes(expected[told], 1, 2)
+        left[told] = Rotation.from_matrix(turn).as_rotvec()
     weighted = frame / known.sigma_rad[:, :, None]
     return -np.einsum("vij,vj->vi", weighted, left), weighted, -weighted @ derivative
 
@@ -257,4 +264,4 @@ def height_of_tilt(
     by_miss = np.stack(
         [-(c * nx + s * ny) / nz, -(-s * nx + c * ny) / nz, -(1.0 - 1.0 / nz)], axis=1
     )
-    return height, np.concatenate([np.cross(normal, by_normal), by_shift], axis=1), by_miss
+    return height, np.concatenate([cross_products(normal, by_normal), by_shift], axis=1), by_miss

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.camera.plane_geometry import (
     cross_matrices,
+    cross_products,
     fit_homography,
     mirrored_tilt,
     rotation_from_affine,
@@ -37,6 +38,7 @@ def test_rotation_about_z_turns_x_towards_y():
 @given(vector, vector)
 def test_cross_matrices(a, b):
     np.testing.assert_allclose(cross_matrices(a[None])[0] @ b, np.cross(a, b), atol=1e-14)
+    np.testing.assert_allclose(cross_products(a[None], b[None])[0], np.cross(a, b), atol=1e-14)
 
 
 @given(st.floats(-3, 3), st.floats(-np.pi, np.pi), st.floats(0.02, 1.2))
