@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from semcal_ros.applications.reconstruction.adjustment import adjust
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, triangulate_cloud
@@ -107,7 +107,7 @@ def measure_ball(
     total = float(np.sqrt(noise**2 + shape**2 + scale**2))
     # Welch and Satterthwaite: only the jackknife has few degrees of freedom.
     degrees = freedom * (total / noise) ** 4 if np.isfinite(freedom) else 1e6
-    reach = float(student.ppf(0.5 + 0.5 * confidence, min(degrees, 1e6))) * total
+    reach = float(stdtrit(min(degrees, 1e6), 0.5 + 0.5 * confidence)) * total
     mesh = _mesh_ball(structure, sphere)
     return Ball(
         sphere=sphere,

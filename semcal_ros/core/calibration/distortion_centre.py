@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import GridView
@@ -115,7 +115,7 @@ def find_distortion_centre(
         smooth_freedom += coefficients - 8
     noise_freedom = max(2 * corners - 8 * len(usable) - smooth_freedom, 1)
     ratio = ((residual_sum - noise_sum) / smooth_freedom) / max(noise_sum / noise_freedom, 1e-300)
-    p_value = float(f_distribution.sf(max(ratio, 0.0), smooth_freedom, noise_freedom))
+    p_value = float(fdtrc(smooth_freedom, noise_freedom, max(ratio, 0.0)))
     rms = float(np.sqrt(residual_sum / corners))
     degenerate = rms <= tau_px if tau_px is not None else p_value > _SIGNIFICANCE
     centre = mean

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.joint import JointFit
@@ -48,7 +48,7 @@ class Hysteresis:
     @property
     def is_significant(self) -> bool:
         """Whether chance hardly explains it, by Student's t-test."""
-        limit = stats.t.ppf(1.0 - 0.5 * _CHANCE, self.pairs - 1)
+        limit = float(stdtrit(self.pairs - 1, 1.0 - 0.5 * _CHANCE))
         return bool(abs(self.relative) > limit * self.sigma)
 
 
