@@ -97,7 +97,7 @@ class _Candidates:
                 rows += [row] * most
             breaks = setup.breaks_of(name)
             self.jumps[name] = np.arange(len(rows), len(rows) + len(breaks))
-            blocks.append(np.array(magnifications)[:, None] >= breaks)
+            blocks.append((np.array(magnifications)[:, None] >= breaks).astype(np.float64))
             rows += [row] * len(breaks)
         shared = len(summary.shared_mean)
         self.shared = np.arange(len(rows), len(rows) + shared)
