@@ -239,6 +239,7 @@ def stage_views(
     seed: int = 0,
     readings: bool = False,
     turn_rad: float = np.pi,
+    most_corners: int | None = None,
 ) -> list[GridView]:
     """Record a multi-scale grid at the visits' magnifications, in this order, with all tilts at each.
 
@@ -260,8 +261,12 @@ def stage_views(
         Whether the views have readings of the stage.
     turn_rad
         The specimen is turned by up to this much either way before every view.
+    most_corners
+        So many corners of a view are found, chosen at random; None for all.
     """
     rng = np.random.default_rng(seed)
+    # A separate generator: what a seed draws is the same with all corners.
+    choice = np.random.default_rng(seed + 1_000_000)
     faults = grid or GridFaults()
     errors: dict[float, float] = {}
     out = []
@@ -301,11 +306,11 @@ def stage_views(
             board = np.stack([c * x - s * y, s * x + c * y], axis=1)[seen]
             sigma = np.full(len(xy), noise_px if noise_px > 0.0 else 0.01)
             name = f"{number}/{k}"
-            out.append(
-                GridView(
-                    float(g), board, xy, sigma, name, visit=number, square_m=square_m, stage=reading
-                )
+            view = GridView(
+                float(g), board, xy, sigma, name, visit=number, square_m=square_m, stage=reading
             )
+            kept = choice.permutation(len(xy))[:most_corners]
+            out.append(view if most_corners is None else view.chosen(kept))
     return out
 
 

@@ -26,7 +26,8 @@ ONE_AXIS = replace(ANY_WAY, axis_rad=0.2)
 
 
 def views_of(stage, grid=None, *, camera_at=MICROSCOPE.camera_at, **options):
-    return stage_views(camera_at, VISITS, stage, grid, **options)
+    """A third of the corners tells the same in half of the time, with larger sigmas."""
+    return stage_views(camera_at, VISITS, stage, grid, **{"most_corners": 130, **options})
 
 
 def calibrated(views, **options):
@@ -94,7 +95,9 @@ def test_a_wavy_grid_is_the_grids_and_no_residual_field():
 def test_a_bowed_stretched_and_sheared_grid_is_estimated():
     grid = GridFaults(stretch=2e-3, shear=1e-3, curvature=20.0)
     stage = replace(ONE_AXIS, reading_sigma_rad=0.003)
-    result = calibrated(views_of(stage, grid, seed=2, readings=True), axis=StageAxis(0.2))
+    result = calibrated(
+        views_of(stage, grid, seed=2, readings=True, most_corners=None), axis=StageAxis(0.2)
+    )
     truths = {"grid_stretch": 2e-3, "grid_shear": 1e-3, "grid_curvature_m": 20.0}
     for name, truth in truths.items():
         assert abs(estimated(result, name, truth)) < 3.0
@@ -119,7 +122,7 @@ def test_a_stretched_grid_whose_lattices_lie_anyhow_is_stated():
 
 @pytest.mark.slow
 def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
-    result = calibrated(views_of(replace(ANY_WAY, line_jitter_px=0.05), seed=3))
+    result = calibrated(views_of(replace(ANY_WAY, line_jitter_px=0.05), seed=3, most_corners=None))
     # From some 12 000 corners of 33 images.
     assert result.model.statistics["fit"]["line_jitter_px"] == pytest.approx(0.05, rel=0.25)
     assert_honest(result)
@@ -127,7 +130,7 @@ def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
 
 @pytest.mark.slow
 def test_drift_within_images_does_not_become_skew_and_aspect():
-    result = calibrated(views_of(replace(ANY_WAY, drift_sigma_px=0.3), seed=4))
+    result = calibrated(views_of(replace(ANY_WAY, drift_sigma_px=0.3), seed=4, most_corners=None))
     low, high = result.model.statistics["fit"]["drift_sigma_px"]
     # Most of it looks like tilts: 20 of the 66 components are determined, and tell the spread to 16 %. Functions
     # with fewer coefficients are preferred to a smaller drift, so that it comes out large rather than small.
