@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, stdtrit
 
 from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
@@ -81,8 +81,8 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     variance = max(variance_factor(problem, result), 1.0)
     # Scatter of few visits is known badly: by Student's t, the same chance needs a larger gain.
     freedom = max(determined - 1.0, 1.0)
-    chance = norm.sf(_JUMP_SIGMAS)
-    by_corners, by_visits = (0.5 * x**2 for x in (_JUMP_SIGMAS, t.isf(chance, freedom)))
+    chance = ndtr(-_JUMP_SIGMAS)
+    by_corners, by_visits = (0.5 * x**2 for x in (_JUMP_SIGMAS, stdtrit(freedom, chance)))
     best, best_excess = None, 1.0
     for k in range(1, len(g)):
         if any(g[k - 1] < b <= g[k] for b in setup.breakpoints):
