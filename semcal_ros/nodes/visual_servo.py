@@ -33,7 +33,7 @@ __all__ = ["VisualServo", "main"]
 
 # Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
-# The stage stops after this many intervals, and at least this time, without a frame: one lost frame does not stop it.
+# The stage stops after this many frame times, and at least this time, without a frame: one lost frame does not stop it.
 _SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
 # Stamps that differ from now by more are from another clock: no frame takes that long to arrive.
 _OTHER_CLOCK_S = 30.0
@@ -67,6 +67,7 @@ class VisualServo(SemNode):
         self._state = "" if self._active else "waiting for ~/start"
         self._last: tuple[int, float] | None = None
         self._interval_s = 0.0
+        self._shortest_s = np.inf
         self._magnification_value: float | None = None
         self._resets = 0
         self._reset_s = -_RESET_AGAIN_S
@@ -106,7 +107,7 @@ class VisualServo(SemNode):
 
     def _on_start(self) -> str:
         self._servo.restart()
-        self._last = None
+        self._last, self._shortest_s = None, np.inf
         self._active, self._state = True, "waiting for frames"
         return "the stage is servoed"
 
@@ -126,9 +127,19 @@ class VisualServo(SemNode):
         if self._last is None or not self._stage.is_moving:
             return
         silent_s = time.monotonic() - self._last[1]
-        if silent_s > max(_SILENCE * self._interval_s, _SHORTEST_SILENCE_S):
+        if silent_s > max(_SILENCE * self._frame_time_s(), _SHORTEST_SILENCE_S):
             self._halt("no frames")
             self._last = None
+
+    def _frame_time_s(self) -> float:
+        """Return how long the microscope takes for a frame.
+
+        Not the interval between the last two that came: where a processor is too slow, that grows with its load, and
+        the time for which the stage would move unseen with it.
+        """
+        if self.config.scan is not None:
+            return self.config.scan.acquisition_time_s
+        return self._shortest_s if np.isfinite(self._shortest_s) else 0.0
 
     def _halt(self, reason: str) -> None:
         """Stop the stage."""
@@ -177,6 +188,7 @@ class VisualServo(SemNode):
         if before is None or frame.stamp_ns <= before[0]:
             return self._servo.stop(ServoStatus.NOT_READY, "waiting for a second frame")
         self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
+        self._shortest_s = min(self._shortest_s, self._interval_s)
         try:
             projection = choose_projection(frame.k, frame.projections)
             camera = PlaneCamera.from_projection(projection, self.parameters["height_m"])

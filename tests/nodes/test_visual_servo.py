@@ -68,9 +68,9 @@ class Microscope:
         self.projections.publish(message)
         self.knob.publish(Float64(data=g))
 
-    def frame(self) -> None:
-        """One frame that was scanned until now."""
-        stamp_s = time.time() - 0.6
+    def frame(self, ago_s: float = 0.0) -> None:
+        """One frame that was scanned until now, or until some time ago."""
+        stamp_s = time.time() - 0.6 - ago_s
         image = image_message(self.picture, stamp_s)
         info, drift = CameraInfo(), PoseWithCovarianceStamped()
         fill_camera_info(info, self.camera, image.header, SIZE, SIZE)
@@ -144,6 +144,22 @@ def test_it_waits_for_the_start_and_stops_without_frames_and_when_asked(peer: Pe
         count = len(microscope.errors)
         microscope.frames_until(lambda: len(microscope.errors) > count + 1, "measurements")
         assert _stands(microscope)
+
+
+def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer) -> None:
+    """A processor that is too slow takes one frame of many; what counts is the time that the microscope needs."""
+    with servoed(peer) as (microscope, _):
+
+        def received(count: int) -> bool:
+            return int(peer.state(SERVO).get("published", 0)) >= count
+
+        microscope.frame(ago_s=20.0)
+        peer.wait_for(lambda: received(1), "the first frame")
+        microscope.frame()
+        peer.wait_for(lambda: _moves(microscope), "a moving stage")
+        # 2.5 of the 0.5 s of a frame, and not of the 20 s between the two that came.
+        peer.wait_for(lambda: microscope.speed == 0.0, "a stop", timeout_s=8.0)
+        peer.wait_for(lambda: "no frames" in peer.state(SERVO).get("servo_state", ""), "the reason")
 
 
 def test_the_stamped_projection_of_a_frame_is_enough(peer: Peer) -> None:
