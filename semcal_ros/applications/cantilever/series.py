@@ -289,7 +289,12 @@ def _collect_notes(
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
         notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
     if lost := int(np.count_nonzero(~path.trusted)):
-        notes.append(f"no drift in {lost} of {len(path)} frames: they rest on the base alone")
+        left = (
+            "they rest on the base alone"
+            if undeformed.axis.base_seen
+            else "neither drift nor base holds them, and their sigma says so"
+        )
+        notes.append(f"no drift in {lost} of {len(path)} frames: {left}")
     if abs(undeformed.length_m / settings.length_m - 1.0) > _NOTED_LENGTH:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
