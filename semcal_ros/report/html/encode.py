@@ -93,7 +93,8 @@ def encode_png(figure: Figure, dpi: float, *, keep_rare_colors: bool = False) ->
         Let the few pixels of a coloured line keep their colour among the grey ones of a micrograph.
     """
     full = io.BytesIO()
-    figure.savefig(full, format="png", dpi=dpi)
+    # Not compressed, as it is only passed on.
+    figure.savefig(full, format="png", dpi=dpi, pil_kwargs={"compress_level": 0})
     method = Image.Quantize.MAXCOVERAGE if keep_rare_colors else Image.Quantize.MEDIANCUT
     with Image.open(full) as image:
         palette = image.convert("RGB").quantize(_COLORS, method, dither=Image.Dither.NONE)

@@ -35,6 +35,7 @@ from semcal_ros.report.calibration.numbers import (
     tabulate_views,
 )
 from semcal_ros.report.calibration.paper import tabulate_beside_paper
+from semcal_ros.report.html import encode
 from semcal_ros.report.html.page import write_page
 from semcal_ros.report.html.text import format_px
 from tests.helpers.report_samples import (
@@ -169,7 +170,11 @@ def test_missing_folder_is_one_clear_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_single_magnification_without_the_optional_parts(tmp_path: Path) -> None:
+def test_single_magnification_without_the_optional_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Coarse figures: what counts here is which there are.
+    monkeypatch.setattr(encode, "_FIGURE_DPI", 48.0)
     rng = np.random.default_rng(3)
     views = [grid_view(800.0, t, a, rng) for t, a in ((3.0, 0.0), (25.0, 70.0), (30.0, 190.0))]
     one = calibrate_views(
