@@ -20,6 +20,10 @@ from semcal_ros.workflows.find_grid import CollectedViews
 from tests.helpers.calibrations import calibrated
 from tests.helpers.semcal_runs import refused, run
 
+# Enough for an equation of the third order with an error of its own.
+MAGNIFICATIONS = (100.0, 1200.0, 2700.0, 5100.0, 7600.0, 10000.0)
+VIEWS = 3
+
 # A calibration takes some seconds.
 pytestmark = pytest.mark.slow
 
@@ -29,7 +33,7 @@ def printed(monkeypatch, tmp_path, capsys):
     """What the command prints for corners that are found already, and the calibration file."""
 
     def found(_recording, *, options: CalibrationOptions, **_):
-        result = calibrated("jsm820", options)
+        result = calibrated("jsm820", options, MAGNIFICATIONS, VIEWS)
         nothing = np.zeros(0)
         squares = SquareAssignment(nothing, 1.0, nothing)
         collected = CollectedViews((), (), (), squares, result.model.image_size)
@@ -134,7 +138,7 @@ def test_readings_of_a_stage_that_are_not_used_are_called_so(printed, monkeypatc
 
     monkeypatch.setattr(calibrate_command, "calibrate_recording", with_stage)
     out, _ = printed("--method", "pda", "--pda-order", 1)
-    assert "the stage is known for 28 of 28 views, but method pda does not use it" in out
+    assert "the stage is known for 18 of 18 views, but method pda does not use it" in out
 
 
 def test_the_choice_of_the_step_is_printed(printed):

@@ -114,7 +114,7 @@ def test_discrete_finds_no_distortion_where_there_is_none():
     "options", [MethodOptions(pda_order=k) for k in (1, 2)] + [MethodOptions(legendre_degree=3)]
 )
 def test_pda_and_legendre_run_between_the_magnifications(options):
-    magnifications = [100.0, 1000.0, 2000.0, 3500.0, 5000.0, 7000.0, 8500.0, 10000.0]
+    magnifications = [100.0, 1000.0, 2500.0, 5000.0, 7500.0, 10000.0]
     result = _calibrate("jsm820", "pda", options, magnifications, views=3)
     # The paper reports 0.9 to 1.45 px RMS; without its corner and drift noise the method itself is well below.
     assert _model_error(result, "jsm820", [500.0, 2700.0, 6000.0, 9300.0]) < 0.5

@@ -13,6 +13,7 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
+from tests.helpers.calibrations import calibrated
 
 pytestmark = pytest.mark.slow
 
@@ -22,16 +23,14 @@ JUMP = 0.015
 MICROSCOPE = preset("jsm820")
 
 
-def _camera(g, jump=JUMP):
+def _camera(g):
     camera = MICROSCOPE.camera_at(g)
-    above = float(g >= 3000.0)
-    return replace(
-        camera, m=camera.m * (1.0 + jump * above), aspect=camera.aspect * (1.0 + 0.3 * jump * above)
-    )
+    jump = JUMP * float(g >= 3000.0)
+    return replace(camera, m=camera.m * (1.0 + jump), aspect=camera.aspect * (1.0 + 0.3 * jump))
 
 
-def _calibrated(jump=JUMP, **options):
-    views = grid_views(lambda g: _camera(g, jump), CALIBRATED, noise_px=0.05, views=4, seed=2)
+def _calibrated(magnifications=CALIBRATED, views=4, **options):
+    views = grid_views(_camera, magnifications, noise_px=0.05, views=views, seed=2)
     return calibrate_views(
         views,
         image_size=MICROSCOPE.image_size,
@@ -48,7 +47,8 @@ def test_a_jump_is_suspected_and_said_but_not_applied():
 
 
 def test_a_smooth_microscope_is_not_suspected():
-    assert not any("jump" in w for w in _calibrated(jump=0.0).warnings)
+    smooth = calibrated("jsm820", CalibrationOptions(residual="off"))
+    assert not any("jump" in w for w in smooth.warnings)
 
 
 def test_a_breakpoint_gives_the_scale_on_both_sides():
@@ -64,7 +64,9 @@ def test_a_breakpoint_gives_the_scale_on_both_sides():
 
 
 def test_breakpoints_survive_the_file(tmp_path):
-    calibration = Calibration.from_model(_calibrated(breakpoints=(3000.0, 7000.0)).model)
+    few = (100.0, 1000.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0)
+    model = _calibrated(few, views=3, breakpoints=(3000.0, 7000.0)).model
+    calibration = Calibration.from_model(model)
     calibration.save(tmp_path / "cal.yaml")
     again = Calibration.load(tmp_path / "cal.yaml")
     assert again.functions["scale"].breaks.tolist() == [3000.0, 7000.0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,16 +13,10 @@ from semcal_ros.core.calibration.normal_equations import Problem, State
 from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.views import ViewStatus
-from tests.helpers.calibrations import calibrated, seen_views
+from tests.helpers.calibrations import CALIBRATED, calibrated, seen_views
 
 OFF = CalibrationOptions(residual="off")
 OPTIONS = {"image_size": (512, 512), "display_width_m": 0.12, "options": OFF}
-
-
-@cache
-def _calibrate_others(name):
-    """Calibration from all views but the one that is misnamed."""
-    return calibrate_views([v for i, v in enumerate(seen_views(name)) if i != 14], **OPTIONS)
 
 
 def _misnamed(views, index, factor):
@@ -38,27 +31,25 @@ def _misnamed(views, index, factor):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "factor"), [("strong_perspective", 1.06), ("parallel", 0.94)])
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor):
-    views = seen_views(name)
-    result = calibrate_views(_misnamed(views, 14, factor), **OPTIONS)
-    assert [o.name for o in result.outliers] == [views[14].name]
+    # One of 16 views, which is still no more than few of them.
+    views = seen_views(name, CALIBRATED[::2])
+    result = calibrate_views(_misnamed(views, 10, factor), **OPTIONS)
+    assert [o.name for o in result.outliers] == [views[10].name]
     assert result.outliers[0].rejection.status is ViewStatus.OUTLIER
     assert "wrong magnification" in result.outliers[0].reason
     assert len(result.views) == len(views) - 1
-    if name == "parallel":
+    if name == "strong_perspective":
         # As good as if that view had never been recorded.
-        clean = _calibrate_others(name)
+        clean = calibrate_views([v for i, v in enumerate(views) if i != 10], **OPTIONS)
         for g in (500.0, 2600.0, 8000.0):
             np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "seed"),
-    [("jsm820", 0), ("pincushion", 0), ("parallel", 0)],
-)
-def test_ordinary_views_stay(name, seed):
-    """As they do in the calibrations of test_calibrate and test_residual_field_fit."""
-    result = calibrated(name, OFF, seed=seed)
+@pytest.mark.parametrize("name", ["jsm820", "pincushion"])
+def test_ordinary_views_stay(name):
+    """As they do with those of the other microscopes (test_calibrate, test_residual_field_fit)."""
+    result = calibrated(name, OFF)
     assert result.outliers == () and len(result.views) == 28
 
 

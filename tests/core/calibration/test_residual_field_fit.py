@@ -95,10 +95,9 @@ def test_the_field_leaves_the_rest_of_the_model_alone(with_field):
         assert np.abs(overlap).max() < 0.02
 
 
-@pytest.mark.parametrize("name", ["jsm820", "strong_perspective"])
-def test_a_microscope_without_such_distortion_is_not_made_worse(name):
-    ordinary = preset(name)
-    auto, on = calibrated(name), calibrated(name, CalibrationOptions(residual="on"))
+def test_a_microscope_without_such_distortion_is_not_made_worse():
+    ordinary = preset("jsm820")
+    auto, on = calibrated("jsm820"), calibrated("jsm820", CalibrationOptions(residual="on"))
     assert auto.model.residual is None
     assert on.model.residual is not None
     # The promise of the project.
@@ -148,7 +147,8 @@ def test_predicted_errors_are_as_large_as_the_errors():
     scores = []
     strong = replace(preset("jsm820"), residual=Residual(spiral=0.003, sine=0.001))
     for seed in range(2):
-        result = _calibrate(strong, "on", seed=seed)
+        # From every other magnification: a field of that many is as certain as it says, too.
+        result = _calibrate(strong, "on", CALIBRATED[::2], seed=seed)
         assert result.outliers == ()
         for g in BETWEEN:
             camera, truth = result.model.at(g), strong.camera_at(g)
