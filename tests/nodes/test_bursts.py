@@ -52,7 +52,7 @@ from tests.helpers.stream_bench import (
 # Images at the limit of what two processes carry; a machine that stops one of them loses some.
 pytestmark = pytest.mark.flaky(reruns=1)
 
-BURST_S = 3.0
+BURST_S = 2.0
 OVERLOAD = 10.0
 # px. Work enough for the node that sending ten times as much is still easy.
 BURST_SIZE = 384
@@ -303,7 +303,7 @@ def test_a_player_that_waits_for_subscribers_loses_none_of_its_frames(
     playing = {"bag": tmp_path / "bag", "wait_for_subscribers": 1}
     with running("rectifier", {"calibration": calibration_file, **PATIENT}):
         watch.wait_heard(RECTIFIER.full_name, "image_rect")
-        for played in range(1, 4):
+        for played in (1, 2):
             with running("bag_player", playing) as player:
                 assert player.wait() == 0
             state = watch.wait_fresh(RECTIFIER.full_name)

@@ -153,7 +153,7 @@ def test_a_stream_node_that_is_killed_again_and_again_comes_back(
     with bench_of(peer, RECTIFIER, parameters) as bench:
         bench.set_magnification(MAGNIFICATION)
         stream = Stream(bench)
-        for _ in range(4):
+        for _ in range(3):
             stream.until(lambda: bench.images, "a frame")
             bench.kill()
             bench.images.clear()
@@ -295,7 +295,7 @@ def test_a_broken_calibration_that_somebody_keeps_does_not_hide_the_good_one(
         peer.wait_for(lambda: bench.state().get("calibration") == "topic", "the calibration")
         broken.publish(String(data=CALIBRATION.dumps()[:400]))
         peer.wait_for(lambda: bench.count("rejected") == 1, "the refusal")
-        for _ in range(3):
+        for _ in range(2):
             bench.kill()
             bench.node.start_again()
             peer.wait_for(lambda: bench.state().get("calibration") == "topic", "the calibration")
