@@ -301,11 +301,16 @@ def test_files_are_untilted_by_name_and_the_certificate_is_kept(tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_the_reference_recording_with_a_stage(reference_data):
+def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
+    # The first two of the four frames of each visit.
+    every = workflow.named_frames
+    monkeypatch.setattr(
+        workflow, "named_frames", lambda bag: (f for k, f in enumerate(every(bag)) if k % 4 < 2)
+    )
     off = CalibrationOptions(residual="off")
     done = calibrate_recording(reference_data / "grid_real_stage", options=off)
     views = done.result.views
-    assert len(views) == 80
+    assert len(views) == 40
     assert all(v.stage is not None and v.stage.tilt_rad is not None for v in views)
     assert sorted({v.visit for v in views}) == list(range(20))
     assert done.notes == ()
