@@ -125,8 +125,10 @@ def find_strip(
     if base_px is None or tip_px is None:
         is_dark, angle, point = _search_line(smooth)
         smooth = -smooth if is_dark else smooth
-        lines = _prepare_lines(smooth)
-        found = _find_ends(smooth, *_find_pair_near(lines, angle, point)[1:])
+        strength, *line = _find_pair_near(_prepare_lines(smooth), angle, point)
+        if strength <= 0.0:
+            raise _no_strip()
+        found = _find_ends(smooth, *line)
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
         is_dark, found = _follow_clicks(smooth, clicks[0], clicks[1])
@@ -138,6 +140,10 @@ def find_strip(
         found.tip_seen,
         is_dark,
     )
+
+
+def _no_strip() -> InvalidValueError:
+    return InvalidValueError("no strip in the image", expected="a cantilever", do=_GIVE_CLICKS)
 
 
 def _prepare_lines(smooth: Array) -> _Lines:
@@ -188,7 +194,7 @@ def _search_line(smooth: Array) -> tuple[bool, float, Array]:
                 best, is_dark, angle = strength, dark, float(turn)
                 offset = 0.5 * (low + up) + first
     if best <= 0.0:
-        raise InvalidValueError("no strip in the image", expected="a cantilever", do=_GIVE_CLICKS)
+        raise _no_strip()
     across = np.array([-np.sin(angle), np.cos(angle)])
     middle = 0.5 * (np.array(size) - 1.0)
     point = middle + (offset - float(across @ middle)) * across

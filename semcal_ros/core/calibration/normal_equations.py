@@ -683,15 +683,7 @@ def retract(problem: Problem, state: State, change: Array, pose: Array, visits: 
 
 def pick_views(pick: Mask, chosen: State, other: State) -> State:
     """Return ``other`` with what ``chosen`` has of the views in ``pick`` (V,)."""
-    rows = pick[:, None]
-    drift, lattices = other.drift_px, other.lattices
-    return replace(
-        other,
-        rotations=np.where(rows[:, :, None], chosen.rotations, other.rotations),
-        translations_m=np.where(rows, chosen.translations_m, other.translations_m),
-        drift_px=np.where(rows, chosen.drift_px, drift) if len(drift) else drift,
-        lattices=np.where(rows, chosen.lattices, lattices) if len(lattices) else lattices,
-    )
+    return with_states_of(other, pick, states_of(chosen, pick))
 
 
 def states_of(state: State, chosen: Mask) -> State:

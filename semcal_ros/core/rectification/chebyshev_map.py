@@ -195,9 +195,7 @@ class SmoothMaps:
         """The map without the field, and the field from a table; None where that is not accurate."""
         split = self._split.get_or_compute(
             camera_key(size, camera),
-            lambda: _SplitCamera(
-                replace(camera, residual=None).resized(*size), tabulate_field(camera, size)
-            ),
+            lambda: _SplitCamera(replace(camera, residual=None), tabulate_field(camera, size)),
         )
         plain, table = split.plain, split.field
         smooth = None if table is None else self._map_by_polynomials(size, plain, drift, timing)
