@@ -43,7 +43,9 @@ _TESTED_NEARBY = 0.01
 # Drift during the scan of a departure up to which a first order needs no test of its own: it is wrong by a tenth.
 _SMALL_RESPONSE_PX = 0.005
 # Degrees down the image of what the field adds; across it, every column has its own values.
-_FIELD_DEGREES = (12, 16, 20, 24, 48)
+_FIELD_DEGREES = (12, 24, 48)
+# Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
+_BEYOND_STEP = 0.125
 # Tables of residual fields that are kept: two magnifications may take turns.
 _MAX_TABLES = 2
 # Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
@@ -169,7 +171,7 @@ class SmoothMaps:
 
     def __init__(self) -> None:
         self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
-        self._split: LruCache[tuple[object, ...], _SplitCamera] = LruCache(_MAX_TABLES)
+        self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         # By camera: degree, and drift at the first and last pixel, of the last map that was tested.
         self._tested: LruCache[tuple[object, ...], tuple[int, Array] | None] = LruCache(_MAX_TABLES)
@@ -198,19 +200,20 @@ class SmoothMaps:
         timing: ScanTiming | None,
     ) -> RawMap | None:
         """The map without the field, and the field from a table; None where that is not accurate."""
+        width, height = size
+        plain = replace(camera, residual=None)
+        moving = None if drift is None else PixelDrift(size, plain, drift, timing)
+        path_px = _drift_path(size, moving)
+        step = _BEYOND_STEP * height
+        beyond = step * min(np.ceil(_largest(path_px) / step), 1.0 / _BEYOND_STEP)
         key = camera_key(size, camera)
-        split = self._split.get_or_compute(
-            key,
-            lambda: _SplitCamera(replace(camera, residual=None), tabulate_field(camera, size)),
+        table = self._tables.get_or_compute(
+            (key, beyond), lambda: tabulate_field(camera, size, beyond)
         )
-        plain, table = split.plain, split.field
         smooth = None if table is None else self._map_by_polynomials(size, plain, drift, timing)
         if table is None or smooth is None or smooth._columns is None:
             return None
-        width, height = size
-        moving = None if drift is None else PixelDrift(size, plain, drift, timing)
         response = _response(size, plain, moving, timing)
-        path_px = _drift_path(size, moving)
         tested = self._tested.get(key, None)
         for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
             rows = _make_field_rows(height, len(smooth._columns) - 3, degree)
@@ -224,9 +227,11 @@ class SmoothMaps:
             columns = np.vstack([smooth._columns[:-2], np.hstack([x, y]), smooth._columns[-2:]])
             found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
             is_small = change <= _SMALL_RESPONSE_PX
-            if is_small and tested is not None and tested[0] == degree:
-                if _largest(path_px - tested[1]) <= _TESTED_NEARBY * height:
-                    return found
+            tested_px = (
+                tested[1] if is_small and tested is not None and tested[0] == degree else None
+            )
+            if tested_px is not None and _largest(path_px - tested_px) <= _TESTED_NEARBY * height:
+                return found
             if _is_accurate(found, plain, response, degree + 1, None if is_small else moving):
                 self._field_degrees.put(size, degree)
                 self._tested.put(key, (degree, path_px))
@@ -328,6 +333,7 @@ def _is_accurate(
     assert found._rows is not None
     assert found._columns is not None
     at = _test_pixels(found.size)
+    at = at[0], np.union1d(at[1], _find_frame_edges(found))
     picked = found._columns[:, np.r_[at[0], width + at[0]]]
     raw, shift = (
         np.stack([a.ravel() for a in np.split(band.astype(np.float64), 2, axis=1)], axis=1)
@@ -350,6 +356,20 @@ def _is_accurate(
     return bool(np.max(np.abs(miss[scanned]), initial=0.0) <= largest)
 
 
+def _find_frame_edges(found: RawMap) -> Indices:
+    """Rows at which the raw frame begins and ends.
+
+    The slope of a field changes suddenly where it ends, and polynomials follow that least well.
+    """
+    width, height = found.size
+    assert found._rows is not None
+    assert found._columns is not None
+    raw = found._rows @ found._columns[:, [width, width + width // 2, 2 * width - 1]]
+    inside = (raw >= 0.0) & (raw <= height - 1.0)
+    first, last = inside.argmax(axis=0), height - 1 - inside[::-1].argmax(axis=0)
+    return np.concatenate([first, last])[np.tile(inside.any(axis=0), 2)]
+
+
 @lru_cache(maxsize=_MAX_KEPT)
 def _test_pixels(size: tuple[int, int]) -> tuple[Indices, Indices]:
     """Columns and rows at which a map with a residual field is tested, denser towards the edges."""
@@ -360,14 +380,6 @@ def _test_pixels(size: tuple[int, int]) -> tuple[Indices, Indices]:
         for n, k in zip(size, _FIELD_TESTS, strict=True)
     )
     return columns.astype(np.intp), rows.astype(np.intp)
-
-
-@dataclass(frozen=True)
-class _SplitCamera:
-    """A camera without its residual field, and the field; None where it cannot be tabulated."""
-
-    plain: ScanCamera
-    field: FieldTable | None
 
 
 @dataclass(frozen=True)
