@@ -12,7 +12,14 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import NOISE_FREE
 from semcal_ros.synthetic.drift import Drift
-from semcal_ros.synthetic.specimens.ball import BallOnTip, Turning, ball_microscope, ball_plan
+from semcal_ros.synthetic.specimens.ball import (
+    BallOnTip,
+    Turning,
+    ball_microscope,
+    ball_plan,
+    draw_ball_plan,
+)
+from semcal_ros.synthetic.specimens.ball_body import TEXTURES
 
 # The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
@@ -41,6 +48,66 @@ def test_rays_meet_the_surface_from_outside():
     # Nothing is passed on the way.
     before = origin[hit] + (along[hit, None] - 20e-9) * direction[hit]
     assert body.distance_m(before).min() > 0.0
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        BallOnTip(stretch=(1.0, 1.03, 0.98), tip_length_m=0.0),
+        BallOnTip(bump_m=45e-9, bump_towards=(0.0, 0.4, -1.0), tip_length_m=0.0),
+    ],
+)
+def test_rays_meet_a_body_that_is_no_ball(body):
+    """The point is on the surface as its equation says, and the normal is that of the surface there."""
+    rng = np.random.default_rng(0)
+    origin = np.column_stack([rng.uniform(-4e-7, 4e-7, (2000, 2)), np.full(2000, -5e-6)])
+    direction = np.tile([0.01, -0.02, 1.0], (2000, 1))
+    along, normal = body.meet(origin, direction)
+    hit = np.isfinite(along)
+    at = origin[hit] + along[hit, None] * direction[hit]
+    assert hit.mean() > 0.6
+    radius = np.linalg.norm(at / np.array(body.stretch), axis=1)
+    towards = np.array(body.bump_towards) / np.linalg.norm(body.bump_towards)
+    squared = np.sum((at / np.linalg.norm(at, axis=1)[:, None] - towards) ** 2, axis=1)
+    bump = body.bump_m * np.exp(-0.5 * squared * (450e-9 / body.bump_width_m) ** 2)
+    # At grazing incidence the search ends early; a pixel is 6.5 nm.
+    assert np.percentile(np.abs(radius - 450e-9 - bump), 99) < 1e-11
+    # Along the surface the distance does not change to first order.
+    side = np.cross(normal[hit], [1.0, 0.0, 0.0])
+    side *= 1e-10 / np.linalg.norm(side, axis=1)[:, None]
+    change = body.distance_m(at + side) - body.distance_m(at - side)
+    assert np.percentile(np.abs(change), 99) < 1e-13
+
+
+def test_scenes_are_drawn_by_their_seed():
+    made = [draw_ball_plan(seed, frames=4) for seed in range(12)]
+    assert {p.specimen.texture_name for p in made} == set(TEXTURES)
+    assert len({p.specimen.grain_m for p in made}) == 12
+    axes = np.array([p.pose_at(np.array([0.0]))[0][0, :, 0] for p in made])
+    # Turn axes point to all sides.
+    assert np.all(axes[:, :2].min(axis=0) < -0.5)
+    assert np.all(axes[:, :2].max(axis=0) > 0.5)
+    again = draw_ball_plan(
+        2, frames=4, texture_name="speckle", charging=0.2, substrate_contrast=0.4
+    )
+    image = again.render(1)
+    assert np.array_equal(
+        image,
+        draw_ball_plan(
+            2, frames=4, texture_name="speckle", charging=0.2, substrate_contrast=0.4
+        ).render(1),
+    )
+    # The ball is in the frame, and its texture is seen: more contrast than noise alone.
+    height, width = image.shape
+    middle = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
+    middle = middle[height // 2 - 25 : height // 2 + 25, width // 2 - 25 : width // 2 + 25]
+    assert middle.mean() > 1.5 * np.median(image[:10])
+    assert middle.std() > 0.03 * middle.mean()
+
+
+def test_unknown_textures_are_refused():
+    with pytest.raises(InvalidValueError, match="islands"):
+        BallOnTip(texture_name="marble")
 
 
 def test_the_outline_is_where_the_true_camera_sees_it():

@@ -1,5 +1,7 @@
 """A textured ball on a tip that turns while it is recorded, with its truth.
 
+:func:`ball_plan` records one look; :func:`draw_ball_plan` draws another for every seed.
+
 Every sample of a frame is a ray of the true camera, distortion included, that meets the ball or the tip where they are
 when its line is scanned. The yield grows with the slope as that of secondary electrons does, so the limb is bright and
 the shading stays while the texture turns with the ball.
@@ -14,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
@@ -23,7 +26,7 @@ from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.presets import preset
-from semcal_ros.synthetic.specimens.ball_body import BallOnTip
+from semcal_ros.synthetic.specimens.ball_body import TEXTURES, BallOnTip
 from semcal_ros.synthetic.specimens.ray_lattice import RayLattice, trace_ray_lattice
 from semcal_ros.synthetic.truth import parameters_of
 
@@ -35,6 +38,7 @@ __all__ = [
     "Turning",
     "ball_microscope",
     "ball_plan",
+    "draw_ball_plan",
 ]
 
 #: Magnifications of section 4.4 of Malti et al. (2012).
@@ -46,7 +50,6 @@ BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
 # Samples per pixel and direction: the outline has steps of a quarter of the contrast at most.
 _SAMPLES = 2
 _MARGIN_M = 20e-9  # by which perspective moves the outline at the end of the tip, and more
-_STEEPEST = 0.08  # cosine below which the yield grows no more: the exit depth is not zero
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,13 @@ class Turning:
         Amplitude of the remaining shift, x, y and z.
     centre_m
         (3,) mean place of the ball in the sem frame.
+    mount_rad
+        (3,) rotation vector that turns tip and axes from x and y to where they are.
+    wobble_rad
+        Amplitude of a slow turn about the third axis.
+    off_centre_m
+        (3,) of the ball's centre from the point on the axes about which the manipulator turns, in the
+        body frame.
     """
 
     duration_s: float
@@ -74,6 +84,9 @@ class Turning:
     yaws: float = 3.0
     travel_m: tuple[float, float, float] = (0.25e-6, 0.12e-6, 0.4e-6)
     centre_m: tuple[float, float, float] = (3.4e-6, 0.0, 8e-6)
+    mount_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wobble_rad: float = 0.0
+    off_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def pose_at(self, time_s: Array) -> tuple[Array, Array]:
         """(n, 3, 3) sem_from_body and (n, 3) places in m at times (n,)."""
@@ -83,8 +96,13 @@ class Turning:
         yaw = self.yaw_rad * np.sin(self.yaws * turn + 0.7)
         about_x = rotations_from_vectors(np.stack([roll, zero, zero], axis=1))
         about_y = rotations_from_vectors(np.stack([zero, yaw, zero], axis=1))
+        third = self.wobble_rad * np.sin(1.3 * turn + 0.4)
+        about_z = rotations_from_vectors(np.stack([zero, zero, third], axis=1))
+        mount = rotations_from_vectors(np.array([self.mount_rad]))[0]
+        rotation = mount @ about_z @ about_y @ about_x
         phases = np.stack([np.sin(turn + 0.3), np.sin(2.0 * turn + 1.1), np.cos(turn)], axis=1)
-        return about_y @ about_x, np.array(self.centre_m) + phases * np.array(self.travel_m)
+        swing = (rotation - mount) @ np.array(self.off_centre_m)
+        return rotation, np.array(self.centre_m) + phases * np.array(self.travel_m) + swing
 
 
 @dataclass(frozen=True)
@@ -136,7 +154,7 @@ class BallPlan:
     def _reflectivity(self, rays: RayLattice, start_time_s: float) -> Image:
         camera, pad = rays.camera, rays.pad
         shape = (camera.height + 2 * pad, camera.width + 2 * pad)
-        total = np.full(shape, self.specimen.background, dtype=np.float32)
+        total = self._draw_substrate(rays, start_time_s, shape)
         box = self._box(rays, start_time_s)
         if box is None:
             return total
@@ -147,9 +165,33 @@ class BallPlan:
         left_s, right_s = _compute_line_times(rays, self.microscope.timing)
         rotation, place = self.pose_at(start_time_s + 0.5 * (left_s + right_s)[lines])
         yields = _compute_yield(self.specimen, x, y, camera.rho, rotation, place)
+        bare = ~np.isfinite(yields)
+        if self.specimen.substrate_contrast == 0.0:
+            yields[bare] = self.specimen.background
+        else:
+            drift = np.asarray(self.drift(start_time_s + 0.5 * (left_s + right_s)[lines]))
+            line = np.nonzero(bare)[0]
+            yields[bare] = self.specimen.substrate(
+                x[bare] - drift[line, 0], y[bare] - drift[line, 1]
+            )
         fine = yields.reshape(bottom - top, _SAMPLES, right - left, _SAMPLES)
         total[top:bottom, left:right] = fine.mean(axis=(1, 3))
+        if self.specimen.charging:
+            total = _darken_lines(total, self.specimen, float(np.mean(camera.pixel_size_m)))
         return total
+
+    def _draw_substrate(
+        self, rays: RayLattice, start_time_s: float, shape: tuple[int, int]
+    ) -> Image:
+        """Draw what lies below, one sample per pixel: the box about the ball is drawn anew."""
+        if self.specimen.substrate_contrast == 0.0:
+            return np.full(shape, self.specimen.background, dtype=np.float32)
+        left_s, right_s = _compute_line_times(rays, self.microscope.timing)
+        drift = np.asarray(self.drift(start_time_s + 0.5 * (left_s + right_s)))[::_SAMPLES]
+        basis = rays.basis[:, ::_SAMPLES]
+        x = rays.x_m[::_SAMPLES] @ basis - drift[:, :1]
+        y = rays.y_m[::_SAMPLES] @ basis - drift[:, 1:]
+        return np.asarray(self.specimen.substrate(x, y), dtype=np.float32)
 
     def _box(
         self, rays: RayLattice, start_time_s: float
@@ -160,7 +202,7 @@ class BallPlan:
         corners = []
         for reach in np.linspace(0.0, body.tip_length_m, 9):
             wide = body.tip_radius_m + body.tip_slope * reach
-            wide = 0.5 * body.diameter_m if reach == 0.0 else wide
+            wide = body.reach_m if reach == 0.0 else wide
             corners.append(np.array([reach, 0.0, 0.0]) + wide * _CUBE)
         rotation, place = self.pose_at(times)
         sem = np.einsum("tij,nj->tni", rotation, np.concatenate(corners)) + place[:, None]
@@ -198,6 +240,9 @@ class BallPlan:
                 "flyback_fraction": timing.flyback_fraction,
             },
             "ball_diameter_m": self.specimen.diameter_m,
+            "stretch": list(self.specimen.stretch),
+            "bump_m": self.specimen.bump_m,
+            "bump_towards": list(self.specimen.bump_towards),
             "tip_radius_m": self.specimen.tip_radius_m,
             "tip_slope": self.specimen.tip_slope,
             "frames": [
@@ -232,8 +277,10 @@ def _compute_line_times(rays: RayLattice, timing: ScanTiming) -> tuple[Array, Ar
 def _compute_yield(
     body: BallOnTip, x: Array, y: Array, rho: float, rotation: Array, place: Array
 ) -> Array:
-    """Reflectivity (lines, columns) of rays through (x, y) at height 0, one pose per line."""
-    out = np.full(x.shape, body.background)
+    """Reflectivity (lines, columns) of rays through (x, y) at height 0, one pose per line; NaN where
+    they miss the body.
+    """
+    out = np.full(x.shape, np.nan)
     line, column = np.nonzero(_find_near(body, x, y, rho, rotation, place))
     x, y = x[line, column], y[line, column]
     origin = np.stack([x, y, np.zeros_like(x)], axis=1) - place[line]
@@ -245,12 +292,22 @@ def _compute_yield(
     along, normal = body.meet(origin, direction)
     hit = np.isfinite(along)
     unit = direction[hit] / np.linalg.norm(direction[hit], axis=1)[:, None]
-    cosine = np.maximum(-np.sum(unit * normal[hit], axis=1), _STEEPEST)
+    cosine = np.maximum(-np.sum(unit * normal[hit], axis=1), body.least_cosine)
     at = origin[hit] + along[hit, None] * direction[hit]
     bright = body.reflectivity * body.texture(at) / cosine**body.slope_power
+    if body.detector_side != (0.0, 0.0):
+        across = np.einsum("nij,nj->ni", turn[hit][:, :2], normal[hit])
+        bright *= np.maximum(1.0 + across @ np.array(body.detector_side), 0.0)
     # The bright limb levels off below the full yield.
-    out[line[hit], column[hit]] = np.minimum(bright, 1.0)
+    out[line[hit], column[hit]] = np.minimum(bright, body.most_yield)
     return out
+
+
+def _darken_lines(image: Image, body: BallOnTip, pixel_m: float) -> Image:
+    """Darken every line after bright parts: charge that the beam has left behind and that leaks away."""
+    keep = math.exp(-pixel_m / body.charging_length_m)
+    charge = lfilter([1.0 - keep], [1.0, -keep], image - body.background, axis=1)
+    return np.asarray(np.maximum(image - body.charging * charge, 0.0), dtype=np.float32)
 
 
 def _find_near(
@@ -265,7 +322,7 @@ def _find_near(
     across = np.abs(dx * axis[:, 1:] - dy * axis[:, :1]) / length
     radius = body.tip_radius_m + body.tip_slope * np.maximum(along, 0.0) / length
     tip = (across < radius + _MARGIN_M) & (along > -radius)
-    ball = dx * dx + dy * dy < (0.5 * body.diameter_m + _MARGIN_M) ** 2
+    ball = dx * dx + dy * dy < (body.reach_m + _MARGIN_M) ** 2
     return np.asarray(ball | (tip & (along < body.tip_length_m * length + radius)))
 
 
@@ -317,4 +374,80 @@ def ball_plan(
     exposed = detector or Detector(electrons=90.0)
     return BallPlan(
         used, specimen or BallOnTip(seed=seed), path.pose_at, planned, drift, exposed, seed
+    )
+
+
+def draw_ball_plan(
+    seed: int,
+    *,
+    frames: int = 100,
+    pixel_m: float = 6.5e-9,
+    grain_m: float | None = None,
+    drift: DriftFunction = NO_DRIFT,
+    **given: Any,
+) -> BallPlan:
+    """Draw a recording whose texture, grains, limb, detector, charging, substrate, tip and axes are random.
+
+    Parameters
+    ----------
+    seed
+        Of all that is drawn.
+    frames
+        Number of frames; their magnification rises by 2 % in the middle of the recording.
+    pixel_m
+        Pixel size, m; the frame has just room for the ball and its movement.
+    grain_m
+        Size of the grains; between 15 and 60 nm by default, but not less than 2.5 pixels.
+    drift
+        Drift of the specimen.
+    given
+        Fields of the specimen (:class:`.BallOnTip`) that are not drawn.
+    """
+    rng = np.random.default_rng([seed, 900])
+    grain = float(np.exp(rng.uniform(np.log(15e-9), np.log(60e-9))))
+    grain = max(grain, 2.5 * pixel_m) if grain_m is None else grain_m
+    texture = TEXTURES[int(rng.integers(len(TEXTURES)))]
+    side = rng.uniform(0.0, 0.25)
+    azimuth = rng.uniform(0.0, 2.0 * np.pi)
+    drawn: dict[str, Any] = {
+        "texture_name": texture,
+        "contrast": float(rng.uniform(0.2, 0.4)),
+        "slope_power": float(rng.uniform(0.5, 1.2)),
+        "least_cosine": float(rng.uniform(0.05, 0.25)),
+        "detector_side": (float(side * np.cos(azimuth)), float(side * np.sin(azimuth))),
+        "charging": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
+        "substrate_contrast": float(rng.choice([0.0, rng.uniform(0.1, 0.5)])),
+        "tip_length_m": float(rng.choice([0.0, 5e-6])),
+        "tip_radius_m": float(rng.uniform(50e-9, 120e-9)),
+    } | given
+    name = drawn["texture_name"]
+    # The noise has its smaller grains some 3 voxels wide, the larger ones 6.
+    specimen = BallOnTip(grain_m=grain / 4.0 if name == "noise" else grain, seed=seed, **drawn)
+    mount = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(-np.pi, np.pi)])
+    interval_s = 2.0
+    motion = Turning(
+        frames * interval_s,
+        roll_rad=math.radians(rng.uniform(28.0, 42.0)),
+        yaw_rad=math.radians(rng.uniform(10.0, 22.0)),
+        rolls=1.0,
+        yaws=float(rng.choice([1.0, 2.0])),
+        travel_m=(60e-9, 50e-9, 400e-9),
+        centre_m=(0.0, 0.0, float(rng.uniform(-8e-6, 8e-6))),
+        mount_rad=(float(mount[0]), float(mount[1]), float(mount[2])),
+        wobble_rad=math.radians(rng.uniform(0.0, 6.0)),
+        off_centre_m=(0.0, *(float(v) for v in rng.uniform(-120e-9, 120e-9, 2))),
+    )
+    side_px = 16 * math.ceil((specimen.diameter_m + 0.55e-6) / pixel_m / 16.0)
+    microscope = ball_microscope(width=side_px, height=side_px)
+    magnification = microscope.display_width_m / side_px / pixel_m
+    return ball_plan(
+        microscope,
+        frames=frames,
+        interval_s=interval_s,
+        magnifications=(magnification, 1.02 * magnification),
+        specimen=specimen,
+        motion=motion,
+        drift=drift,
+        detector=Detector(electrons=float(rng.uniform(80.0, 300.0)), noise=0.01),
+        seed=seed,
     )
