@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Image, mad_sigma
 
-__all__ = ["Appearance", "convert_for_tracking", "prepare_appearance"]
+__all__ = ["Appearance", "compute_log_grey", "convert_for_tracking", "prepare_appearance"]
 
 # Second difference along both axes. Its squares sum to 1, so that it keeps the sigma of the noise.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
@@ -67,6 +67,16 @@ def prepare_appearance(
     floor = noise**2 / (4.0 * math.pi * smoothing_px**2)
     texture = high / np.sqrt(power + np.float32(floor + 1e-12))
     return Appearance(smooth, np.asarray(texture, dtype=np.float32), noise, smoothing_px)
+
+
+def compute_log_grey(image: NDArray[Any]) -> Image:
+    """Compute the logarithm of a grey image (h, w) of any depth: shading adds to texture.
+
+    Grey levels below what noise alone gives are raised to it: their logarithm has no bound.
+    """
+    grey = np.sqrt(np.maximum(image.astype(np.float32), 0.0))
+    least = np.float32(max(_estimate_noise(grey), 1e-3))
+    return np.asarray(2.0 * np.log(np.maximum(grey, least)), dtype=np.float32)
 
 
 def convert_for_tracking(appearance: Appearance) -> NDArray[np.uint8]:

@@ -67,7 +67,7 @@ class TrackerSettings:
     window_px: int = 21
     levels: int = 3
     backwards_px: float = 0.7
-    parallax_px: float = 2.0
+    parallax_px: float = 1.0
     lost_fraction: float = 0.3
     epipolar_px: float = 2.0
     noise_factor: float = 3.0

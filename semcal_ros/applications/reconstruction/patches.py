@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from semcal_ros.applications.reconstruction.appearance import Appearance
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
+from semcal_ros.applications.reconstruction.shading import Shading, fit_shading
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -55,6 +55,8 @@ WINDOW = 0.6  # sigma of the window in which patches are compared, in half patch
 # Least contrast of a patch over that of the template. It keeps the division bounded for patches
 # that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
 _GAIN_LEAST = 0.3
+# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
+_SHADING_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ class PatchSettings:
         Number of resamplings at the shifted position.
     floor_px
         Least 1-sigma of an observation, added in quadrature.
+    smoothing_px
+        Sigma of the smoothing of patches, px.
     """
 
     half_px: int = 7
@@ -84,6 +88,7 @@ class PatchSettings:
     largest_shift_px: float = 2.5
     rounds: int = 2
     floor_px: float = 0.03
+    smoothing_px: float = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +119,13 @@ class _Cut:
     by_patch: Array  # (n, 2, 2) raw px per patch px
     bend: Array  # (n, 2) raw px per squared patch px
     inside: Mask
+    slope: Array  # (n, 2) X and Y of the normal in the sem frame
+    slope_by_patch: Array  # (n, 2, 2) their change per patch px
 
 
 def measure_patches(
     frames: Sequence[TrackKeyframe],
-    looks: Sequence[Appearance],
+    log_greys: Sequence[Image],
     scan: ScanTiming | None,
     posed: PosedSurface,
     settings: PatchSettings,
@@ -136,12 +143,18 @@ def measure_patches(
     for view, cut in enumerate(cuts):
         seen[view, cut.points[cut.inside]] = True
     found: _Matched | None = None
+    shading: Shading | None = None
     for _ in range(settings.rounds):
         patches = np.zeros((*shape, len(grid)), dtype=np.float32)
         for view, cut in enumerate(cuts):
-            patches[view, cut.points] = _sample_patches(
-                looks[view].texture, cut, shift[view, cut.points], grid
-            )
+            drawn = _sample_patches(log_greys[view], cut, shift[view, cut.points], grid)
+            patches[view, cut.points] = _smooth_patches(drawn, settings)
+        if shading is None:
+            shading = _measure_shading(cuts, patches, seen, settings.half_px)
+        for view, cut in enumerate(cuts):
+            everything = np.arange(len(cut.points))
+            patches[view, cut.points] -= shading.evaluate(_compute_slopes(cut, everything, grid))
+        _normalise(patches, seen)
         found = _match_patches(patches, seen, settings.half_px)
         shift += np.where(seen[..., None], np.clip(found.shift, -1.0, 1.0), 0.0)
     assert found is not None
@@ -196,11 +209,20 @@ def _cut_patches(
     inside = np.all(np.isfinite(raw[0]), axis=1)
     inside &= np.all(raw[0] > border, axis=1)
     inside &= np.all(raw[0] < np.array([width, height]) - 1.0 - border, axis=1)
-    return _Cut(points, np.nan_to_num(raw[0]), by_patch, bend, inside)
+    turn = (posed.curvature_1_m[points] * size_m)[:, None, None]
+    return _Cut(
+        points,
+        np.nan_to_num(raw[0]),
+        by_patch,
+        bend,
+        inside,
+        normal @ rotation[:2].T,
+        turn * np.stack([first @ rotation[:2].T, second @ rotation[:2].T], axis=2),
+    )
 
 
-def _sample_patches(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
-    """Sample (n, grid) patches, normalised to zero mean and unit standard deviation."""
+def _sample_patches(log_grey: Image, cut: _Cut, shift: Array, grid: Array) -> Image:
+    """Sample (n, grid) patches."""
     if not len(cut.points):
         return np.zeros((0, len(grid)), dtype=np.float32)
     local = grid[None] + shift[:, None]
@@ -208,10 +230,51 @@ def _sample_patches(texture: Image, cut: _Cut, shift: Array, grid: Array) -> Ima
     xy = cut.centres[:, None] + local @ np.swapaxes(cut.by_patch, 1, 2)
     xy = xy + np.sum(grid**2, axis=1)[None, :, None] * cut.bend[:, None]
     x, y = (np.ascontiguousarray(xy[..., k], dtype=np.float32) for k in (0, 1))
-    drawn = cv2.remap(texture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    drawn = np.asarray(drawn, dtype=np.float32).reshape(len(local), len(grid))
-    drawn -= drawn.mean(axis=1, keepdims=True)
-    return np.asarray(drawn / (drawn.std(axis=1, keepdims=True) + 1e-6), dtype=np.float32)
+    drawn = cv2.remap(log_grey, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(drawn, dtype=np.float32).reshape(len(local), len(grid))
+
+
+def _smooth_patches(patches: Image, settings: PatchSettings) -> Image:
+    """Smooth (n, grid) patches on the surface.
+
+    In the image, the same smoothing would reach further over the surface on the side of the limb: that
+    moves the texture of a ball of radius R towards its middle, by about ``(sigma / R)^2`` of R.
+    """
+    half = settings.half_px
+    at = np.arange(2 * half + 1)
+    kernel = np.exp(-0.5 * ((at[:, None] - at) / settings.smoothing_px) ** 2)
+    kernel = (kernel / kernel.sum(axis=1, keepdims=True)).astype(np.float32)
+    square = patches.reshape(-1, len(at), len(at))
+    return np.asarray(kernel @ square @ kernel.T, dtype=np.float32).reshape(patches.shape)
+
+
+def _normalise(patches: Image, seen: Mask) -> None:
+    """Bring patches to zero mean and unit standard deviation, in place."""
+    part = patches[seen]
+    part -= part.mean(axis=1, keepdims=True)
+    patches[seen] = part / (part.std(axis=1, keepdims=True) + 1e-6)
+
+
+def _compute_slopes(cut: _Cut, chosen: Indices, grid: Array) -> Array:
+    """Compute X and Y of the normals at the samples, (n, grid, 2)."""
+    return cut.slope[chosen][:, None] + grid[None] @ np.swapaxes(cut.slope_by_patch[chosen], 1, 2)
+
+
+def _measure_shading(cuts: Sequence[_Cut], patches: Image, seen: Mask, half: int) -> Shading:
+    """Fit the shading to some samples of the patches of some points."""
+    side = 2 * half + 1
+    pick = np.arange(side * side).reshape(side, side)[1::3, 1::3].ravel()
+    grid = _make_patch_grid(half)[pick]
+    points = np.flatnonzero(seen.sum(axis=0) >= 3)
+    points = points[:: max(1, len(points) // _SHADING_POINTS)]
+    slopes, greys, names = [], [], []
+    for view, cut in enumerate(cuts):
+        chosen = np.flatnonzero(np.isin(cut.points, points) & seen[view, cut.points])
+        slopes.append(_compute_slopes(cut, chosen, grid))
+        greys.append(patches[view][np.ix_(cut.points[chosen], pick)])
+        names.append(cut.points[chosen])
+    grey = np.concatenate(greys).astype(np.float64)
+    return fit_shading(np.concatenate(slopes), grey, np.concatenate(names))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
-from semcal_ros.applications.reconstruction.appearance import Appearance, prepare_appearance
+from semcal_ros.applications.reconstruction.appearance import compute_log_grey
 from semcal_ros.applications.reconstruction.factorization import factorize
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
 from semcal_ros.applications.reconstruction.metric_upgrade import (
@@ -29,7 +29,7 @@ from semcal_ros.applications.reconstruction.patches import (
     project_to_plane_at_centre,
 )
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
-from semcal_ros.core.arrays import Array, Indices, Mask
+from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
@@ -49,8 +49,6 @@ class StructureSettings:
         Largest number of times that patches are measured and adjusted.
     converged_sigma
         The passes end when one moves the points by less than this many of their 1-sigma (RMS).
-    smoothing_px
-        Sigma of the smoothing of patches.
     least_track
         Least number of keyframes in which a feature was followed.
     least_views
@@ -66,7 +64,6 @@ class StructureSettings:
     patches: PatchSettings = field(default_factory=PatchSettings)
     most_passes: int = 10
     converged_sigma: float = 0.5
-    smoothing_px: float = 1.3
     least_track: int = 4
     least_views: int = 6
     separation_px: float = 4.0
@@ -185,10 +182,7 @@ def reconstruct(
     )
     on_step("adjusting")
     work.adjust_tracks()
-    work.looks = [
-        prepare_appearance(frame.image, smoothing_px=chosen.smoothing_px)
-        for frame in work.keyframes
-    ]
+    work.log_greys = [compute_log_grey(frame.image) for frame in work.keyframes]
     while not work.converged and work.passes < chosen.most_passes:
         on_step(f"measuring, pass {work.passes + 1}")
         work.refine()
@@ -244,7 +238,7 @@ class _Refinement:
         self.settings = settings
         self.rotations, self.translations, self.points = rotations, translations, points
         self.seen = observations
-        self.looks: list[Appearance] = []
+        self.log_greys: list[Image] = []
         self.adjusted: Adjustment | None = None
         self.ids = np.arange(len(points))
         self.passes, self.converged = 0, False
@@ -271,7 +265,7 @@ class _Refinement:
         normals, curvature = self._surface()
         posed = PosedSurface(self.rotations, self.translations, self.points, normals, curvature)
         self.seen = measure_patches(
-            self.keyframes, self.looks, self.scan, posed, self.settings.patches
+            self.keyframes, self.log_greys, self.scan, posed, self.settings.patches
         )
         self._prune(self.settings.least_views)
         self._adjust()
@@ -342,7 +336,7 @@ class _Refinement:
         kept = np.flatnonzero(views)
         self.keyframes = [self.keyframes[int(v)] for v in kept]
         self.cameras = tuple(self.cameras[int(v)] for v in kept)
-        self.looks = [self.looks[int(v)] for v in kept] if self.looks else []
+        self.log_greys = [self.log_greys[int(v)] for v in kept] if self.log_greys else []
 
     def _merge(self) -> None:
         """Among points too close for patches to tell apart, keep the one seen most."""
