@@ -424,6 +424,7 @@ def draw_ball_plan(
     # The noise has its smaller grains some 3 voxels wide, the larger ones 6.
     specimen = BallOnTip(grain_m=grain / 4.0 if name == "noise" else grain, seed=seed, **drawn)
     mount = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(-np.pi, np.pi)])
+    off = rng.uniform(-120e-9, 120e-9, 2)
     interval_s = 2.0
     motion = Turning(
         frames * interval_s,
@@ -435,7 +436,7 @@ def draw_ball_plan(
         centre_m=(0.0, 0.0, float(rng.uniform(-8e-6, 8e-6))),
         mount_rad=(float(mount[0]), float(mount[1]), float(mount[2])),
         wobble_rad=math.radians(rng.uniform(0.0, 6.0)),
-        off_centre_m=(0.0, *(float(v) for v in rng.uniform(-120e-9, 120e-9, 2))),
+        off_centre_m=(0.0, float(off[0]), float(off[1])),
     )
     side_px = 16 * math.ceil((specimen.diameter_m + 0.55e-6) / pixel_m / 16.0)
     microscope = ball_microscope(width=side_px, height=side_px)
