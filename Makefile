@@ -44,7 +44,8 @@ format: setup ## bring the source into the form that lint wants
 	@$(VENV_PYTHON) -m ruff format .
 
 # Three processes on two cores: tests of nodes mostly wait.
-PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal
+# Tests marked flaky are tried once more, but no more than two in a run: the third one fails.
+PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal --rerun-show-tracebacks --max-suite-reruns=2
 
 test: lint ## everything that is checked: style, types, tests
 	@$(PYTEST) $(PYTEST_ARGS) tests

@@ -4,13 +4,16 @@ The two ways to install it put the ROS executables in the same place, lib/semcal
 `ros2 run` looks for them:
 
 - colcon calls the commands ``install`` or ``develop``. The nodes become ordinary console scripts,
-  which setup.cfg sends there, and rosdep provides the dependencies.
+  which setup.cfg sends there, and rosdep provides the dependencies. ``bin``, which a sourced
+  workspace has on its PATH, gets a link to the command ``semcal`` alone: the names of the nodes
+  (``rectifier``) are too common for a PATH.
 - pip builds a wheel, whose console scripts all land on the PATH. The wheel therefore carries the
   nodes as launchers in lib/semcal_ros.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +62,25 @@ class Distribution(setuptools.Distribution):
             self.install_requires = []
         return parsed
 
+    def run_commands(self) -> None:
+        super().run_commands()
+        for command, attribute in (("install", "install_scripts"), ("develop", "script_dir")):
+            if command in self.commands:
+                folder = Path(getattr(self.get_command_obj(command), attribute))
+                link_command(folder / "semcal", folder.parents[1] / "bin" / "semcal")
+
     def has_data(self) -> bool:
         """What the build of an editable wheel asks for."""
         return self.has_data_files()
+
+
+def link_command(executable: Path, link: Path) -> None:
+    """Make a relative link, so that the installed folder can be moved."""
+    # None without the former: `develop --uninstall`, or scripts that go to another folder.
+    if executable.parent.name == "semcal_ros" and executable.exists():
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.path.relpath(executable, link.parent))
 
 
 class InstallData(install_data):

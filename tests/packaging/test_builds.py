@@ -89,7 +89,8 @@ def test_a_wheel_holds_everything(source: Path, tmp_path: Path) -> None:
     assert dict(scripts["console_scripts"]) == PYPROJECT["project"]["scripts"]
     assert metadata["Version"] == semcal_ros.__version__
     assert metadata["License"] == "Apache-2.0"
-    assert len(metadata.get_all("Requires-Dist", [])) == len(PYPROJECT["project"]["dependencies"])
+    needed = [r for r in metadata.get_all("Requires-Dist", []) if "extra ==" not in r]
+    assert len(needed) == len(PYPROJECT["project"]["dependencies"])
 
 
 @pytest.mark.parametrize("linked", [False, True], ids=["install", "symlink-install"])
@@ -107,12 +108,17 @@ def test_a_workspace_has_all_executables_in_its_folder(
     install = ("install", "--single-version-externally-managed", "--record", "files")
     _run(folder, "setup.py", "--quiet", *install, "--prefix", str(prefix))
     assert {p.name for p in (prefix / "lib/semcal_ros").iterdir()} == {*NODES, "semcal"}
+    # A sourced workspace has this folder on its PATH, where colcon finds a file in it.
+    (command,) = (prefix / "bin").iterdir()
+    assert command.name == "semcal"
+    assert command.samefile(prefix / "lib/semcal_ros/semcal")
+    assert not command.readlink().is_absolute()
     shared = prefix / "share" / "semcal_ros"
     assert {str(p.relative_to(shared)) for p in shared.rglob("*") if p.is_file()} == SHARED
     assert (prefix / "share/ament_index/resource_index/packages/semcal_ros").is_file()
-    # rosdep provides the dependencies, under names that pip does not know.
+    # rosdep provides the dependencies, under names that pip does not know; those of tests are optional.
     (egg,) = (prefix / "lib").glob("python*/site-packages/*.egg-info")
-    assert not (egg / "requires.txt").exists()
+    assert (egg / "requires.txt").read_text(encoding="utf-8").strip().startswith("[test]")
 
 
 def test_colcon_can_read_what_setup_py_says(source: Path) -> None:
@@ -124,6 +130,8 @@ def test_colcon_can_read_what_setup_py_says(source: Path) -> None:
         "names = 'name version packages package_data data_files entry_points install_requires'\n"
         "for n in (*names.split(), 'python_requires', 'license'):\n"
         "    assert ast.literal_eval(repr(values[n])), n\n"
+        "required = ast.literal_eval(repr(values['extras_require']))['test']\n"
+        "assert 'pytest' in {r.partition('>')[0] for r in required}  # else colcon runs no tests\n"
         "assert 'semcal_ros.core.drift' in d.packages\n"
     )
     _run(source, "-W", "ignore", "-c", "import setuptools\n" + code)

@@ -113,6 +113,10 @@ def test_nothing_else_is_in_the_executables_folder() -> None:
     assert found - {"semcal"} == set(NODES)
 
 
+# A workspace has its own set-up file, so that an executable need not find the index by itself.
+in_environment = pytest.mark.skipif(
+    Path(get_package_prefix("semcal_ros")) != Path(sys.prefix), reason="installed in a workspace"
+)
 FIND = "from ament_index_python import get_package_prefix as p; print(p('semcal_ros'))"
 COMMAND = f"from semcal_ros.cli import main; main(['at', '--help']); {FIND}"
 NODE = f"""
@@ -123,6 +127,7 @@ run_node(factory, [])
 """
 
 
+@in_environment
 @pytest.mark.parametrize("program", [COMMAND, NODE], ids=["command", "node"])
 def test_commands_and_executables_find_the_index_in_a_plain_shell(
     program: str, tmp_path: Path
@@ -154,10 +159,10 @@ def test_other_programs_of_the_interpreter_are_left_alone() -> None:
 
 
 def test_semcal_is_a_command_of_the_environment() -> None:
-    command = Path(sys.executable).parent / "semcal"
+    """In a folder that an activated environment and a sourced workspace have on the PATH."""
     done = subprocess.run(
-        [command, "--version"],
-        env={"PATH": "/usr/bin:/bin"},
+        [Path(get_package_prefix("semcal_ros")) / "bin" / "semcal", "--version"],
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": os.environ.get("PYTHONPATH", "")},
         capture_output=True,
         text=True,
         check=False,
