@@ -40,6 +40,9 @@ _PARSER_ERRORS: tuple[type[Exception], ...] = (
     cv2.error,
 )
 
+# OpenCV 4.6, which rosdep installs on Ubuntu 24.04, has these functions elsewhere than later versions.
+_OPENCV_LOG: Any = getattr(cv2.utils, "logging", cv2)
+
 
 def is_tiff(path: Path) -> bool:
     """Return whether the file's name is that of a TIFF."""
@@ -50,14 +53,14 @@ def is_tiff(path: Path) -> bool:
 def _quiet() -> Iterator[None]:
     """Keep the TIFF parsers from logging unknown tags, and what is raised as an error here."""
     logger = logging.getLogger("tifffile")
-    before, opencv = logger.disabled, cv2.utils.logging.getLogLevel()
+    before, opencv = logger.disabled, _OPENCV_LOG.getLogLevel()
     logger.disabled = True
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    _OPENCV_LOG.setLogLevel(0)  # LOG_LEVEL_SILENT
     try:
         yield
     finally:
         logger.disabled = before
-        cv2.utils.logging.setLogLevel(opencv)
+        _OPENCV_LOG.setLogLevel(opencv)
 
 
 def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
