@@ -242,7 +242,10 @@ def test_the_blocker_blocks() -> None:
 
 def test_quick_commands_load_only_what_they_use(tmp_path: Path) -> None:
     make_calibration().save(tmp_path / "cal.yaml")
-    slow = ("pydantic", "rosbags", "ruamel", "matplotlib", "tifffile", "rclpy", "trimesh")
+    slow = (
+        *("pydantic", "rosbags", "ruamel.yaml", "matplotlib", "tifffile", "rclpy", "trimesh"),
+        *("scipy", "cv2", "PIL", "av", "joblib", "jinja2", "tqdm"),
+    )
     code = (
         "import sys; from semcal_ros.cli import main; "
         "status = main(sys.argv[1:]); "
