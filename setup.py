@@ -65,9 +65,10 @@ class Distribution(setuptools.Distribution):
     def run_commands(self) -> None:
         super().run_commands()
         for command, attribute in (("install", "install_scripts"), ("develop", "script_dir")):
-            if command in self.commands:
-                folder = Path(getattr(self.get_command_obj(command), attribute))
-                link_command(folder / "semcal", folder.parents[1] / "bin" / "semcal")
+            # Since setuptools 80, `develop` calls pip and has no folder of its own.
+            folder = getattr(self.command_obj.get(command), attribute, None)
+            if command in self.commands and folder is not None:
+                link_command(Path(folder) / "semcal", Path(folder).parents[1] / "bin" / "semcal")
 
     def has_data(self) -> bool:
         """What the build of an editable wheel asks for."""

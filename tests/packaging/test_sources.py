@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import yaml
 
 import semcal_ros
 from tests.helpers.project import NODES, PYPROJECT, ROOT, runtime_imports
@@ -27,6 +28,20 @@ ROSDEP_KEYS = {
     "pyyaml": "python3-yaml",
     "rosbags": "python3-rosbags-pip",
     "trimesh": "python3-trimesh-pip",
+}
+
+# Keys that rosdep/python.yaml of rosdistro had in August 2026, for Ubuntu 24.04. Look there before adding one.
+RESOLVED_KEYS = {
+    *(
+        "python3-click",
+        "python3-hypothesis",
+        "python3-jinja2",
+        "python3-joblib",
+        "python3-jsonschema",
+    ),
+    *("python3-matplotlib", "python3-numpy", "python3-opencv", "python3-packaging", "python3-pil"),
+    *("python3-pytest", "python3-pytest-timeout", "python3-rosbags-pip", "python3-ruamel.yaml"),
+    *("python3-scipy", "python3-tqdm", "python3-trimesh-pip", "python3-yaml"),
 }
 
 
@@ -119,6 +134,27 @@ def test_package_xml_names_what_pyproject_asks_for() -> None:
     depends = {node.text for node in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
     keys = {ROSDEP_KEYS.get(name, f"python3-{name}") for name in _declared() - NO_ROSDEP_KEY}
     assert keys == {name for name in depends if name and name.startswith("python3-")}
+
+
+def test_rosdep_knows_every_key() -> None:
+    root = ElementTree.parse(ROOT / "package.xml").getroot()
+    keys = {str(node.text) for node in root if node.tag.endswith("depend")}
+    assert {key for key in keys if key.startswith("python3-")} <= RESOLVED_KEYS
+    assert not {key for key in keys if not ROS.fullmatch(key)} - RESOLVED_KEYS
+
+
+def test_package_xml_names_what_tests_need() -> None:
+    """colcon finds them in pyproject.toml, rosdep in package.xml."""
+    asked = PYPROJECT["project"]["optional-dependencies"]["test"]
+    keys = {node.text for node in ElementTree.parse(ROOT / "package.xml").iter("test_depend")}
+    assert keys == {f"python3-{re.split('[<>=]', name)[0]}" for name in asked}
+
+
+def test_the_pages_for_docs_ros_org_have_a_configuration() -> None:
+    (name,) = {node.text for node in ElementTree.parse(ROOT / "package.xml").iter("rosdoc2")}
+    head, settings = yaml.safe_load_all((ROOT / str(name)).read_text(encoding="utf-8"))
+    assert head == {"type": "rosdoc2 config", "version": 1}
+    assert (ROOT / settings["settings"]["python_source"]).is_dir()
 
 
 def test_package_xml_names_what_ros_imports_need() -> None:
