@@ -8,10 +8,13 @@
 At a display width of 0.12 m, 35 um are more than the field (18.6 um at 6450x). So there are two experiments: `end` has
 the display width of the JSM-820 and only the free end in view; `whole` has one of 0.4 m and all of the cantilever.
 
+4. The same for ten scenes that look different (tip, substrate, contrast, charging, direction, push, drift), measured
+   with the same calibration: median and worst. `--scenes N` takes N of them, `--scenes 0` none.
+
 `--figure-16a` adds the comparison of the paper: the same frames, measured with separate calibrations that were made at
 exactly 6450x, 7760x and 8890x.
 
-Everything lands in cantilever_output/. `--quick` takes fewer frames and magnifications.
+Everything lands in cantilever_output/. `--quick` takes fewer frames and magnifications, and no further scenes.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ from examples.cantilever.figure_16a import (
     draw_comparison,
     show_comparison,
 )
+from examples.cantilever.scenes import measure_scenes
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
     STAGES,
@@ -134,7 +138,8 @@ def compare(folder: Path) -> dict[str, float]:
 
 def run(
     experiment: Experiment, output: Path, *, quick: bool, seed: int, shape: str, figure_16a: bool
-) -> None:
+) -> tuple[Path, Path]:
+    """Record, calibrate and measure an experiment: its calibration and configuration."""
     folder = output / experiment.name
     folder.mkdir(parents=True)
     microscope = experiment.microscope
@@ -171,7 +176,7 @@ def run(
                 f"mean {1e9 * errors[name + '_bias']:.2f} nm; error over sigma {errors[name + '_z']:.2f}"
             )
     if not figure_16a:
-        return
+        return calibration, config
     shown = CANTILEVER_MAGNIFICATIONS
     exactly = calibration_plan(microscope, magnifications=shown, seed=seed + 1, **recorded)
     record(exactly, folder / "grid_exactly")
@@ -185,6 +190,7 @@ def run(
         compared = compare_calibrations(folder / "bending.csv", table, truth, scale=scale)
         show_comparison(compared)
         (folder / f"figure_16a_{scale}.png").write_bytes(draw_comparison(compared))
+    return calibration, config
 
 
 def main() -> int:
@@ -195,14 +201,18 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--shape", default="free")
+    parser.add_argument(
+        "--scenes", type=int, metavar="N", help="scenes of other looks: 10, or none with --quick"
+    )
     parser.add_argument("--only", choices=[e.name for e in EXPERIMENTS])
     parser.add_argument("-o", "--output", type=Path, default=Path("cantilever_output"))
     given = parser.parse_args()
+    scenes = given.scenes if given.scenes is not None else 0 if given.quick else 10
     started = time.monotonic()
     shutil.rmtree(given.output, ignore_errors=True)
     for experiment in EXPERIMENTS:
         if given.only in (None, experiment.name):
-            run(
+            calibration, config = run(
                 experiment,
                 given.output,
                 quick=given.quick,
@@ -210,6 +220,9 @@ def main() -> int:
                 shape=given.shape,
                 figure_16a=given.figure_16a,
             )
+            if scenes > 0:
+                scope = experiment.microscope.with_image_size(experiment.size, experiment.size)
+                measure_scenes(scenes, scope, experiment.view, calibration, config)
     print(
         f"\nLook at {given.output}/*/poses.png and strip.png ({time.monotonic() - started:.0f} s)"
     )

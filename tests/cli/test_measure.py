@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import struct
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -108,6 +110,42 @@ def test_deflections_with_all_outputs(bag, calibration, tmp_path, capsys):
         assert cv2.imread(str(file)).std() > 5
     film = cv2.VideoCapture(str(video))
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 4
+
+
+def write_tescan(path: Path, image: np.ndarray, pixel_m: float, time_s: float) -> None:
+    """A file as TESCAN's microscopes write it, with a data bar of 20 rows and times in whole seconds."""
+    minutes, seconds = divmod(int(time_s), 60)
+    text = f"Date=2020-01-02\nTime=10:{minutes:02d}:{seconds:02d}\nImageStripSize=20\n"
+    text += f"PixelSizeX={pixel_m!r}\nPixelSizeY={pixel_m!r}\n"
+    data = struct.pack("<IH", len(text) + 2, 2) + text.encode()
+    bar = np.zeros((20, image.shape[1]), image.dtype)
+    tags = [(50431, 7, len(data), data, True)]
+    tifffile.imwrite(path, np.concatenate([image, bar]), extratags=tags)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_folder_of_tiffs(bits, images, calibration, tmp_path, capsys):
+    """16 bits carry the same counts of electrons on a finer scale."""
+    folder = tmp_path / "tiffs"
+    folder.mkdir()
+    for k, frame in enumerate(PLAN.frames):
+        image = images[k] if bits == 8 else (images[k].astype(np.uint16) + 3) * 200
+        pixel_m = SCOPE.nominal_pixel_size_m(frame.magnification)
+        write_tescan(folder / f"bending_{k}.tif", image, pixel_m, frame.start_time_s)
+    (folder / "notes.txt").write_text("pushed in the second pose")
+    table = tmp_path / "d.csv"
+    command = ("measure", "cantilever", folder, "--calibration", calibration, *LENGTH)
+    assert run(*command, "--config", "virtual_sem", "-o", table) == 0
+    assert "local times taken as UTC" in capsys.readouterr().err
+    rows = rows_of(table)
+    assert [int(r["pose"]) for r in rows] == [1, 2, 1, 2]
+    assert {r["recording"] for r in rows} == {"tiffs"}
+    for row, g in zip(rows[1::2], (6450.0, 8890.0), strict=True):
+        # The magnification comes from the pixel size and the configuration's display width.
+        assert float(row["magnification"]) == pytest.approx(g, rel=1e-9)
+        assert abs(float(row["deflection_m"]) - 250e-9) < 4.0 * float(row["sigma_m"])
+        assert float(row["sigma_m"]) < 8e-9
+        assert row["drift_status"] == "tracked"
 
 
 def test_recordings_of_their_own_and_clicks(bag, images, calibration, tmp_path, capsys):

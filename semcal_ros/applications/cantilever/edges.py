@@ -21,6 +21,7 @@ __all__ = [
     "StepFit",
     "choose_width",
     "find_unchanged_width",
+    "fit_blocks",
     "fit_edges",
     "fit_step",
 ]
@@ -125,7 +126,7 @@ def fit_edges(
         near = np.abs(across - line) < 2.0 * model.reach_m
         # With the sign the beam is always on the side of growing coordinates.
         distance = sign * (across - line)[near]
-        place, sigma, step, left = _fit_blocks(
+        place, sigma, step, left = fit_blocks(
             block[near], distance, level[near], model, model.blocks
         )
         results.append((predicted_m[:, side] + sign * place, sigma, step))
@@ -150,7 +151,7 @@ def fit_step(
         if near.sum() < _LEAST_PIXELS:
             continue
         zero = np.zeros(int(near.sum()), dtype=np.intp)
-        found = _fit_blocks(zero, distance_m[near] - start, grey[near], model, 1)
+        found = fit_blocks(zero, distance_m[near] - start, grey[near], model, 1)
         place, sigma, step = (float(v[0]) for v in found[:3])
         if np.isfinite(sigma) and step > 0.0 and (best is None or step / sigma > best[3]):
             best = (start + place, sigma, step, step / sigma)
@@ -186,10 +187,16 @@ def _interpolate_line(along: Array, model: EdgeModel, values: Array) -> Array:
     return np.asarray(values[k] + part * (values[k + 1] - values[k]))
 
 
-def _fit_blocks(
+def fit_blocks(
     block: Indices, distance: Array, grey: Array, model: EdgeModel, count: int
 ) -> tuple[Array, Array, Array, float]:
-    """Fit position, 1-sigma and step of each block's edge; also the sum of squared residuals."""
+    """Fit the edge of each block to pixels at distances from where it is expected, positive on the bright side.
+
+    Returns
+    -------
+    Positions, 1-sigmas (infinite where there is no edge) and steps, (count,) each, and the sum of
+    squared residuals.
+    """
     place, slope = np.zeros(count), np.zeros(count)
     low, step = np.zeros(count), np.zeros(count)
     width, reach = model.width_m, model.reach_m

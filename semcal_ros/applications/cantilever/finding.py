@@ -341,9 +341,14 @@ def _find_longest_run(good: Mask, gap: int) -> tuple[int, int] | None:
 def _measure_freedom(
     image: Array, end: Array, outwards: Array, across: Array, half: float
 ) -> float:
-    """Measure how dark it is beyond an end: 1 as beside the strip, 0 as on it, NaN out of view."""
+    """Measure how dark it is beyond an end: 1 as beside the strip, 0 as on it, NaN out of view.
+
+    It is the median of three places: ahead of the end, and ahead on its left and right. A tapered tip
+    is bright ahead, and a pusher beside the tip on one side; a holder is bright in at least two.
+    """
     spread = np.linspace(-0.5 * half, 0.5 * half, 5)
     beyond = np.linspace(8.0, 8.0 + max(half, 8.0), 9)
+    away = half + 8.0
 
     def level(steps: Array, offsets: Array) -> float:
         points = end + steps[:, None, None] * outwards + offsets[None, :, None] * across
@@ -351,9 +356,12 @@ def _measure_freedom(
         return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
 
     inside = level(-beyond, spread)
-    beside = level(-beyond, np.concatenate([spread - half - 8.0, spread + half + 8.0]))
-    outside = level(beyond, spread)
-    return (inside - outside) / max(inside - beside, 1e-9)
+    beside = level(-beyond, np.concatenate([spread - away, spread + away]))
+    outside = [level(beyond, spread + shift) for shift in (-away, 0.0, away)]
+    known = [v for v in outside if np.isfinite(v)]
+    if not np.isfinite(outside[1]) or not known:
+        return float("nan")
+    return (inside - float(np.median(known))) / max(inside - beside, 1e-9)
 
 
 def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:

@@ -21,6 +21,7 @@ from semcal_ros.applications.cantilever.bending import (
 from semcal_ros.applications.cantilever.edges import EdgeFit, find_unchanged_width, fit_edges
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.tip import find_apex
 from semcal_ros.applications.cantilever.undeformed import (
     REACH_PX,
     PixelSamples,
@@ -203,7 +204,7 @@ def measure_series(
     strip = find_strip(images[0], base_px=settings.base_px, tip_px=settings.tip_px)
     if strip.is_dark:
         images = [_invert(image) for image in images]
-    rough = _make_rough_axis(strip, plane, settings.length_m)
+    rough = _extend_to_apex(_make_rough_axis(strip, plane, settings.length_m), plane, images[0])
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
     work = _SeriesMeasurement(images, plane, background.path, settings, rough)
@@ -265,6 +266,17 @@ def _make_rough_axis(strip: Strip, plane: PlaneMap, length_m: float) -> Axis:
     origin = ends[0] - base_at * direction
     visible = (base_at, base_at + seen_m)
     return Axis(origin, direction, half_m, visible, strip.base_seen, strip.tip_seen)
+
+
+def _extend_to_apex(axis: Axis, plane: PlaneMap, image: AnyImage) -> Axis:
+    """Move the end from where the edges of the beam fade to the apex of its tip."""
+    if not axis.end_seen:
+        return axis
+    along, across = axis.coordinates(plane.x_m.ravel(), plane.y_m.ravel())
+    samples = along, across, image.ravel().astype(np.float64)
+    first, last = axis.visible_m
+    apex_m = find_apex(samples, last, axis.half_width_m, plane.pixel_m)
+    return replace(axis, visible_m=(first, max(apex_m, last - axis.half_width_m)))
 
 
 def _compare_shapes(given: Shape, common: Shape) -> tuple[Shape, str | None]:
@@ -435,7 +447,10 @@ class _SeriesMeasurement:
         value, noise = bending.deflection_m, bending.sigma_m
         known = 0.0 if np.isnan(value) else value
         scale = scale_covariance(camera, known * axis.normal, np.zeros(2))[:2, :2]
-        sigma = float(np.sqrt(noise**2 + axis.normal @ scale @ axis.normal))
+        # Where the beam ends is common to all frames, as the scale: its slope there tells the effect.
+        ends = np.nan_to_num(bending.coefficients[2:]) @ [2.0, 3.0] / length
+        shared = axis.normal @ scale @ axis.normal + (ends * undeformed.zero_sigma_m) ** 2
+        sigma = float(np.sqrt(noise**2 + shared))
         factor, relative = (
             length / undeformed.length_m,
             undeformed.length_sigma_m / undeformed.length_m,

@@ -15,6 +15,7 @@ from semcal_ros.applications.cantilever.edges import (
     fit_step,
 )
 from semcal_ros.applications.cantilever.plane import Axis
+from semcal_ros.applications.cantilever.tip import ROUGH_APEX_PX, fit_tip
 from semcal_ros.core.arrays import Array, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
@@ -60,6 +61,8 @@ class UndeformedBeam:
         brighter.
     length_m, length_sigma_m
         Length in calibrated metres and its 1-sigma; NaN if base and end are not both in view.
+    zero_sigma_m
+        1-sigma of the place from which arc lengths are counted.
     notes
         Remarks for the user.
     """
@@ -71,6 +74,7 @@ class UndeformedBeam:
     step: Array
     length_m: float
     length_sigma_m: float
+    zero_sigma_m: float
     notes: tuple[str, ...]
 
 
@@ -97,9 +101,10 @@ def measure_undeformed_beam(
     """
     axis, width_m = _align_axis(rough, views, px_m)
     moved = [_change_axis(view, rough, axis) for view in views]
-    counted, seen_m, seen_sigma_m, notes = _locate_ends(axis, moved, width_m, length_m, px_m)
+    ends, notes = _locate_ends(axis, moved, width_m, length_m, px_m)
+    counted = ends.axis
     final = [_change_axis(view, axis, counted) for view in moved]
-    model = _place_blocks(counted, width_m, px_m)
+    model = _place_blocks(counted, width_m, px_m, ends.flank_m)
     fits = [fit_edges(*view, model, _predict_straight_edges(model)) for view in final]
     across, sigma, step = average_edges(fits)
     found = np.isfinite(sigma).all(axis=1)
@@ -109,7 +114,17 @@ def measure_undeformed_beam(
             expected="a strip with two parallel edges from base to tip",
             do="check --base and --tip, the first frame, focus and contrast",
         )
-    return UndeformedBeam(counted, model, across, sigma, step, seen_m, seen_sigma_m, tuple(notes))
+    return UndeformedBeam(
+        counted,
+        model,
+        across,
+        sigma,
+        step,
+        ends.length_m,
+        ends.length_sigma_m,
+        ends.zero_sigma_m,
+        tuple(notes),
+    )
 
 
 def average_edges(fits: list[EdgeFit]) -> tuple[Array, Array, Array]:
@@ -129,8 +144,9 @@ def _predict_straight_edges(model: EdgeModel) -> Array:
     return np.asarray(np.ones((model.blocks, 1)) * np.array([-1.0, 1.0]) * model.half_width_m)
 
 
-def _place_blocks(axis: Axis, width_m: float, px_m: float) -> EdgeModel:
-    first, last = axis.visible_m
+def _place_blocks(axis: Axis, width_m: float, px_m: float, flank_m: float = 0.0) -> EdgeModel:
+    # Where the beam narrows towards its tip, its edges are not parallel to the axis.
+    first, last = axis.visible_m[0], axis.visible_m[1] - flank_m
     # Blocks keep clear of the ends of the beam, which are edges themselves.
     inset = REACH_PX * px_m
     count = max(int((last - first - 2.0 * inset) / (_BLOCK_PX * px_m)), 1)
@@ -185,38 +201,48 @@ def _refine_axis(axis: Axis, model: EdgeModel, across: Array, sigma: Array) -> A
 # -- the ends -------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Ends:
+    """Both ends: the axis with arc lengths from the base, lengths with 1-sigma, and where the tip begins."""
+
+    axis: Axis
+    length_m: float
+    length_sigma_m: float
+    zero_sigma_m: float
+    flank_m: float
+
+
 def _locate_ends(
     axis: Axis, views: list[PixelSamples], width_m: float, length_m: float, px_m: float
-) -> tuple[Axis, float, float, list[str]]:
-    """Locate both ends: axis with arc lengths from the base, length and its 1-sigma, notes."""
+) -> tuple[_Ends, list[str]]:
+    """Locate both ends; also notes."""
     notes: list[str] = []
     model = _place_blocks(axis, width_m, px_m)
     first, last = axis.visible_m
-    unseen = StepFit(float("nan"), float("inf"), 0.0)
-    base = (
-        _average_steps([_fit_base_edge(v, first, model, px_m) for v in views])
-        if axis.base_seen
-        else unseen
-    )
-    end = (
-        _average_steps([_fit_end_edge(v, last, model, px_m) for v in views])
-        if axis.end_seen
-        else unseen
-    )
-    start_m, stop_m = first - base.place_m, last - end.place_m
-    if axis.base_seen and not np.isfinite(start_m):
-        notes.append("the edge of the holder is not seen: the base is where the beam fades")
-        start_m = first
-    if axis.end_seen and not np.isfinite(stop_m):
-        notes.append("the edge of the free end is not seen: it is where the beam fades")
-        stop_m = last
-    both = bool(np.isfinite([base.place_m, end.place_m]).all())
-    seen_m = stop_m - start_m if both else float("nan")
-    sigma_m = float(np.hypot(base.sigma_m, end.sigma_m)) if both else float("nan")
+    start_m, start_sigma_m, stop_m, stop_sigma_m, flank_m = first, np.inf, last, np.inf, 0.0
     if axis.base_seen:
-        zero = start_m
+        base = _average_steps([_fit_base_edge(v, first, model, px_m) for v in views])
+        start_m, start_sigma_m = first - base.place_m, base.sigma_m
+        if not np.isfinite(start_m):
+            notes.append("the edge of the holder is not seen: the base is where the beam fades")
+            start_m, start_sigma_m = first, model.half_width_m
+    if axis.end_seen:
+        joined = tuple(np.concatenate([v[k] for v in views]) for k in range(3))
+        tip = fit_tip((joined[0], joined[1], joined[2]), last, model, px_m)
+        if tip is None:
+            notes.append(
+                "the outline of the free end is not seen: it is where the middle of the beam fades"
+            )
+            stop_sigma_m = ROUGH_APEX_PX * px_m
+        else:
+            stop_m, stop_sigma_m, flank_m = tip.apex_m, tip.sigma_m, tip.flank_m
+    both = axis.base_seen and axis.end_seen
+    seen_m = stop_m - start_m if both else float("nan")
+    sigma_m = float(np.hypot(start_sigma_m, stop_sigma_m)) if both else float("nan")
+    if axis.base_seen:
+        zero, zero_sigma_m = start_m, start_sigma_m
     elif axis.end_seen:
-        zero = stop_m - length_m
+        zero, zero_sigma_m = stop_m - length_m, stop_sigma_m
         notes.append("the base is out of view: arc lengths are counted back from the free end")
     else:
         raise InvalidValueError(
@@ -227,7 +253,7 @@ def _locate_ends(
     low, high = start_m if axis.base_seen else first, stop_m if axis.end_seen else last
     origin = axis.origin_m + zero * axis.direction
     counted = replace(axis, origin_m=origin, visible_m=(low - zero, high - zero))
-    return counted, seen_m, sigma_m, notes
+    return _Ends(counted, seen_m, sigma_m, float(zero_sigma_m), flank_m), notes
 
 
 def _average_steps(steps: list[StepFit]) -> StepFit:
@@ -245,10 +271,3 @@ def _fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: floa
     away = np.abs(across) - model.half_width_m
     beside = (away > _BESIDE_PX * px_m) & (away < _BESIDE_REACH_PX * px_m)
     return fit_step(at_m - along[beside], grey[beside], model, rough_m=_END_SEARCH_PX * px_m)
-
-
-def _fit_end_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float) -> StepFit:
-    """Fit the edge of the free end; distances grow into the beam."""
-    along, across, grey = view
-    middle = np.abs(across) < max(model.half_width_m - _BESIDE_PX * px_m, 0.5 * model.half_width_m)
-    return fit_step(at_m - along[middle], grey[middle], model, rough_m=_END_SEARCH_PX * px_m)

@@ -1,15 +1,16 @@
 """A cantilever that is pushed sideways, after section 4.3 of Malti et al. (2012).
 
-A bright beam leaves a holder and ends over a textured background. A plane comes from one side,
-pushes its end and is drawn back, while the specimen as a whole drifts. Coordinates of the scene:
-the base is the origin, the beam at rest lies along +x, and the pusher moves it towards +y.
+A beam leaves a holder and ends over a textured background. A plane comes from one side, pushes its
+end and is drawn back, while the specimen as a whole drifts. Coordinates of the scene: the base is
+the origin, the beam at rest lies along +x, and the pusher moves it towards +y, or towards -y if it
+comes from there.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,13 +24,17 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
+from semcal_ros.synthetic.specimens.substrate import Substrate
 
 __all__ = [
     "CANTILEVER_MAGNIFICATIONS",
     "CANTILEVER_PUSHES",
+    "SQUARE_TIP",
+    "BeamTip",
     "CantileverFrame",
     "CantileverPlan",
     "CantileverScene",
+    "Charging",
     "cantilever_plan",
 ]
 
@@ -58,6 +63,95 @@ _FREE_GAP_M = 600e-9
 
 
 @dataclass(frozen=True)
+class BeamTip:
+    """The outline of the free end: a facet across the axis, and a flank from either of its ends to the sides.
+
+    The length of the beam runs to the facet, or to the apex where there is none.
+
+    Parameters
+    ----------
+    length_m
+        How far from the end the beam begins to narrow; zero for a square end.
+    facet
+        Width of the facet, as a fraction of the width of the beam.
+    flank
+        ``"straight"``: a taper, or chamfered corners. ``"elliptic"``: a quarter of an ellipse, so that
+        a tip without a facet and half a width long is a semicircle.
+    """
+
+    length_m: float = 0.0
+    facet: float = 1.0
+    flank: Literal["straight", "elliptic"] = "straight"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.length_m) and self.length_m >= 0.0 and 0.0 <= self.facet <= 1.0):
+            raise InvalidValueError(
+                f"a tip of {self.length_m} m with a facet of {self.facet} widths",
+                expected="a length from zero and a facet of 0 to 1",
+            )
+
+    def distance(self, before_end: Array, across: Array, width_m: float) -> Array | None:
+        """Return the distance, positive outside, from the flanks; None for a square end.
+
+        Parameters
+        ----------
+        before_end, across
+            Distance from the end towards the base, and from the centre line, m.
+        """
+        facet_m = 0.5 * self.facet * width_m
+        depth_m = 0.5 * width_m - facet_m
+        if self.length_m <= 0.0 or depth_m <= 0.0:
+            return None
+        if self.flank == "straight":
+            away = (across - facet_m) * self.length_m - before_end * depth_m
+            return np.asarray(away / math.hypot(self.length_m, depth_m))
+        # Measured from where the ellipses meet the straight sides; before it and between them nothing is cut off.
+        u = np.maximum(1.0 - before_end / self.length_m, 0.0)
+        v = np.maximum((across - facet_m) / depth_m, 0.0)
+        radius = np.maximum(np.hypot(u, v), 1e-9)
+        # To first order in the distance; exact for circles.
+        slope = np.hypot(u / self.length_m, v / depth_m) / radius
+        return np.asarray((radius - 1.0) / np.maximum(slope, 1e-3 / self.length_m))
+
+
+SQUARE_TIP = BeamTip()
+
+
+@dataclass(frozen=True)
+class Charging:
+    """What charge does to the brightness of an insulating specimen.
+
+    Parameters
+    ----------
+    gradient_per_m
+        (x, y) relative change of the brightness along the specimen; it levels off at one half.
+    halo, halo_m
+        By how much the ground is brighter right beside a body (darker if negative: the shadow of a
+        high one), in reflectivity, and how far that reaches.
+    """
+
+    gradient_per_m: tuple[float, float] = (0.0, 0.0)
+    halo: float = 0.0
+    halo_m: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if not (
+            self.halo_m > 0.0
+            and math.isfinite(self.halo)
+            and all(map(math.isfinite, self.gradient_per_m))
+        ):
+            raise InvalidValueError(f"{self}", expected="finite numbers and a positive halo_m")
+
+    def shade(self, x_m: Array, y_m: Array) -> Array:
+        """Return the factor of the brightness at points of the specimen."""
+        slope = self.gradient_per_m[0] * x_m + self.gradient_per_m[1] * y_m
+        return np.asarray(1.0 + 0.5 * np.tanh(2.0 * slope))
+
+
+NO_CHARGING = Charging()
+
+
+@dataclass(frozen=True)
 class CantileverScene:
     """The beam, its holder, the pusher and the background at one moment.
 
@@ -76,11 +170,19 @@ class CantileverScene:
     pusher_m
         First and last arc length under the pusher.
     beam, holder, pusher, background
-        Reflectivities; that of the background is the largest of its texture.
+        Reflectivities; that of the background is the largest of its texture of gold on carbon.
     rim, rim_m
         By how much the edges are brighter than the rest, and how far that reaches.
     seed
         Of the texture.
+    tip
+        Outline of the free end.
+    substrate
+        What lies behind the beam, in place of gold on carbon.
+    charging
+        Slow changes of the brightness.
+    push_direction
+        1: the pusher comes from -y and bends the beam towards +y; -1: the other way round.
     """
 
     length_m: float = 35e-6
@@ -96,6 +198,10 @@ class CantileverScene:
     rim: float = 0.12
     rim_m: float = 150e-9
     seed: int = 0
+    tip: BeamTip = SQUARE_TIP
+    substrate: Substrate | None = None
+    charging: Charging = NO_CHARGING
+    push_direction: Literal[1, -1] = 1
 
     def __post_init__(self) -> None:
         sizes = (self.length_m, self.width_m, self.rim_m)
@@ -109,6 +215,8 @@ class CantileverScene:
             raise InvalidValueError(
                 f"a deflection of {self.deflection_m} m", expected="at most a tenth of the length"
             )
+        if self.push_direction not in (1, -1):
+            raise InvalidValueError(f"a push towards {self.push_direction}", expected="1 or -1")
 
     @property
     def supersampling(self) -> int:
@@ -142,31 +250,53 @@ class CantileverScene:
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> NDArray[np.floating]:
         """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
-        ground = GoldOnCarbon(self.seed, largest_m=6e-6, octaves=4)
-        seen = self.background * np.asarray(ground.reflectivity(x_m, y_m, footprint_m), dtype=float)
+        seen = self._draw_ground(x_m, y_m, footprint_m)
         x_width, y_width = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
         line = self.deflection_m * self.bending(x_m / self.end_x_m)
-        across = np.abs(y_m - line) - 0.5 * self.width_m
-        parts = [_soften_edge(across, y_width), _soften_edge(x_m - self.end_x_m, x_width)]
-        inside = np.minimum(-across, self.end_x_m - x_m)
-        self._lay(seen, self.beam, parts, inside)
+        across, before_end = np.abs(y_m - line), self.end_x_m - x_m
+        cover = _soften_edge(across - 0.5 * self.width_m, y_width)
+        cover *= _soften_edge(-before_end, x_width)
+        inside = np.minimum(0.5 * self.width_m - across, before_end)
+        flank = self.tip.distance(before_end, across, self.width_m)
+        if flank is not None:
+            # Not the product: the flank of a round tip goes on as the straight side.
+            cover = np.minimum(cover, _soften_edge(flank, math.sqrt(x_width * y_width)))
+            inside = np.minimum(inside, -flank)
+        if self.charging.halo != 0.0:
+            outside = np.maximum(np.minimum(-inside, x_m), 0.0)
+            seen += self.charging.halo * np.exp(-outside / self.charging.halo_m)
+            np.maximum(seen, 0.0, out=seen)
+        self._lay(seen, self.beam, [cover], inside)
         # The beam continues inside the holder, so that no seam is visible.
         self._lay(seen, self.holder, [_soften_edge(x_m, x_width)], -x_m)
         if self.gap_m is not None:
             self._lay_pusher(seen, x_m, y_m, x_width, y_width)
+        if self.charging.gradient_per_m != (0.0, 0.0):
+            seen *= self.charging.shade(x_m, y_m)
         return seen
+
+    def _draw_ground(self, x_m: Array, y_m: Array, footprint_m: Array) -> Array:
+        if self.substrate is not None:
+            ground = self.substrate.reflectivity(x_m, y_m, footprint_m)
+            return np.asarray(ground, dtype=np.float64)
+        gold = GoldOnCarbon(self.seed, largest_m=6e-6, octaves=4)
+        grains = np.asarray(gold.reflectivity(x_m, y_m, footprint_m), dtype=np.float64)
+        return np.asarray(self.background * grains)
 
     def _lay_pusher(self, seen: Array, x: Array, y: Array, x_width: float, y_width: float) -> None:
         assert self.gap_m is not None
         first, last = self.pusher_m
+        sign = float(self.push_direction)
         touched = self.deflection_m * float(self.bending(np.array([self.load]))[0])
-        front = touched - 0.5 * self.width_m - self.gap_m
+        front = sign * touched - 0.5 * self.width_m - self.gap_m
+        ahead = sign * y
         parts = [
-            _soften_edge(y - front, y_width),
+            _soften_edge(ahead - front, y_width),
             _soften_edge(first - x, x_width),
             _soften_edge(x - last, x_width),
         ]
-        self._lay(seen, self.pusher, parts, np.minimum(front - y, np.minimum(x - first, last - x)))
+        inside = np.minimum(front - ahead, np.minimum(x - first, last - x))
+        self._lay(seen, self.pusher, parts, inside)
 
     def _lay(self, seen: Array, level: float, parts: Sequence[Array], inside: Array) -> None:
         """Draw a bright shape over the image; ``inside`` is the distance from its edges."""
@@ -265,6 +395,7 @@ class CantileverPlan:
                     "pose": frame.pose,
                     "deflection_m": frame.scene.deflection_m,
                     "length_m": frame.scene.length_m,
+                    "width_m": frame.scene.width_m,
                     "shape": frame.scene.shape,
                     "drift_m": self.drift_at_centre_m(index).tolist(),
                     "base_px": self.pixel_of(index, 0.0).tolist(),
@@ -299,8 +430,8 @@ def cantilever_plan(
     scene
         The beam; its deflection and the gap of the pusher are set in each pose.
     magnifications, pushes, largest_deflection_m, frames_per_pose
-        The poses: fractions of the largest deflection, and frames of each at each magnification.
-        At a fraction of 0 the pusher does not touch the beam.
+        The poses: fractions of the largest deflection (towards the push direction of the scene), and
+        frames of each at each magnification. At a fraction of 0 the pusher does not touch the beam.
     view
         What lies in the middle of the field: the middle of the beam, its last two thirds of a field
         with the end, or the first with the base.
@@ -323,8 +454,8 @@ def cantilever_plan(
     planned: list[CantileverFrame] = []
     for number, push in enumerate(pushes):
         gap = 0.0 if push > 0.0 else _FREE_GAP_M
-        values = {**base.__dict__, "deflection_m": push * largest_deflection_m, "gap_m": gap}
-        bent = CantileverScene(**values)
+        deflection_m = push * base.push_direction * largest_deflection_m
+        bent = replace(base, deflection_m=deflection_m, gap_m=gap)
         for g in magnifications:
             for _ in range(frames_per_pose):
                 planned.append(CantileverFrame(step_s * len(planned), float(g), number, bent))

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Image
+from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
 
 __all__ = ["GoldOnCarbon"]
 
@@ -77,51 +77,23 @@ class GoldOnCarbon:
     ) -> tuple[Image | np.float32, Image | np.float32]:
         """Return the cover of the particles of one octave, and their light (already times the cover)."""
         pyramid, mean = _make_pyramid(self.seed)
-        level = max(0, math.floor(math.log2(max(0.5 * pixel_m / texel_m, 1.0))))
-        if level >= len(pyramid):
-            return mean[0], mean[1]
-        tile = pyramid[level]
-        size = float(len(tile))
-        step = texel_m * 2.0**level
-        angle = _GOLDEN_ANGLE * (octave + 1)
-        shift = np.random.default_rng([self.seed, octave]).uniform(0.0, 1.0, 2)
-        c, s = math.cos(angle) / step, math.sin(angle) / step
-        u = _wrap(c * x_m - s * y_m, shift[0], size)
-        v = _wrap(s * x_m + c * y_m, shift[1], size)
-        seen: Image = np.asarray(
-            cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), dtype=np.float32
+        seen = sample_pyramid(
+            pyramid,
+            x_m,
+            y_m,
+            texel_m=texel_m,
+            pixel_m=pixel_m,
+            angle_rad=_GOLDEN_ANGLE * (octave + 1),
+            shift=np.random.default_rng([self.seed, octave]).uniform(0.0, 1.0, 2),
         )
-        return seen[..., 0], seen[..., 1]
-
-
-def _wrap(u: Array, shift: float, size: float) -> Image:
-    """Reduce coordinates to one tile before they are rounded to single precision."""
-    # Texel centres are at integers, so the border of the tile, where all levels agree, is at -0.5.
-    u += shift * size - 0.5
-    u -= size * np.floor(u / size)
-    return u.astype(np.float32)
+        return (mean[0], mean[1]) if seen is None else (seen[..., 0], seen[..., 1])
 
 
 @lru_cache(maxsize=4)
 def _make_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
-    """Make levels (n, n, 2) of cover and light, each half the size of the last, and their means (2,)."""
+    """Make levels (n, n, 2) of cover and light, and their means (2,)."""
     tile = _draw_tile(np.random.default_rng([seed, 1]))
-    levels = [tile]
-    while len(levels[-1]) > 8:
-        half = len(levels[-1]) // 2
-        levels.append(levels[-1].reshape(half, 2, half, 2, 2).mean(axis=(1, 3), dtype=np.float32))
-    # A pixel covers two to four texels of its level: this blur keeps what is finer than a pixel out
-    # of the samples.
-    filtered = [tile] + [_blur_periodic(level, 1.1) for level in levels[1:]]
-    for level in filtered:
-        level.setflags(write=False)
-    return tuple(filtered), tile.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
-
-
-def _blur_periodic(tile: Image, sigma: float) -> Image:
-    padded = np.pad(tile, ((4, 4), (4, 4), (0, 0)), mode="wrap")
-    blurred = cv2.GaussianBlur(padded, (9, 9), sigma)[4:-4, 4:-4]
-    return np.ascontiguousarray(blurred, dtype=np.float32)
+    return build_pyramid(tile), tile.mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
 
 
 def _draw_tile(rng: np.random.Generator) -> Image:
