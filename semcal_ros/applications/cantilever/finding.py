@@ -123,12 +123,7 @@ def find_strip(
         )
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
     if base_px is None or tip_px is None:
-        is_dark, angle, point = _search_line(smooth)
-        smooth = -smooth if is_dark else smooth
-        strength, *line = _find_pair_near(_prepare_lines(smooth), angle, point)
-        if strength <= 0.0:
-            raise _no_strip()
-        found = _find_ends(smooth, *line)
+        is_dark, found = _find_strongest(smooth)
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
         is_dark, found = _follow_clicks(smooth, clicks[0], clicks[1])
@@ -174,15 +169,38 @@ def _widen(sums: Array) -> Array:
     return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
 
 
-def _search_line(smooth: Array) -> tuple[bool, float, Array]:
-    """Find the strongest strip in any direction in a small image: whether it is dark, direction, a point on it."""
+def _find_strongest(smooth: Array) -> tuple[bool, Strip]:
+    """Find the strongest strip that has ends, bright or dark: whether it is dark, and the strip.
+
+    Between a beam and a pusher of the same kind lies a strip of the other, with edges as strong; it
+    is short.
+    """
+    refusals = []
+    for is_dark, angle, point in _search_lines(smooth):
+        signed = -smooth if is_dark else smooth
+        strength, *line = _find_pair_near(_prepare_lines(signed), angle, point)
+        if strength <= 0.0:
+            continue
+        try:
+            return is_dark, _find_ends(signed, *line)
+        except InvalidValueError as error:
+            refusals.append(error)
+    # Of the stronger one.
+    raise refusals[0] if refusals else _no_strip()
+
+
+def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
+    """Find the strongest bright and dark strips in any direction in a small image, the stronger first.
+
+    Of each: whether it is dark, its direction, and a point on it.
+    """
     shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
     size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
     part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
-    best, is_dark, angle, offset = 0.0, False, 0.0, 0.0
+    best = {False: (0.0, 0.0, 0.0), True: (0.0, 0.0, 0.0)}
     # Half a turn is enough: in the opposite direction the two edges only change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
         sums, first = lines.across(float(turn))
@@ -190,15 +208,16 @@ def _search_line(smooth: Array) -> tuple[bool, float, Array]:
         for dark, edges in ((False, wide), (True, -wide)):
             strength, low, up = _find_best_pair(edges, -edges, _LEAST_WIDTH_PX // shrink + 1, high)
             strength *= _DARK if dark else 1.0
-            if strength > best:
-                best, is_dark, angle = strength, dark, float(turn)
-                offset = 0.5 * (low + up) + first
-    if best <= 0.0:
-        raise _no_strip()
-    across = np.array([-np.sin(angle), np.cos(angle)])
+            if strength > best[dark][0]:
+                best[dark] = strength, float(turn), 0.5 * (low + up) + first
     middle = 0.5 * (np.array(size) - 1.0)
-    point = middle + (offset - float(across @ middle)) * across
-    return is_dark, angle, (point + 0.5) * shrink - 0.5
+    found = []
+    for dark, (strength, angle, offset) in sorted(best.items(), key=lambda one: -one[1][0]):
+        if strength > 0.0:
+            across = np.array([-np.sin(angle), np.cos(angle)])
+            point = middle + (offset - float(across @ middle)) * across
+            found.append((dark, angle, (point + 0.5) * shrink - 0.5))
+    return found
 
 
 def _find_pair_near(

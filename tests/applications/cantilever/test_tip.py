@@ -13,7 +13,11 @@ from semcal_ros.applications.cantilever.series import SeriesSettings, measure_se
 from semcal_ros.applications.cantilever.tip import find_apex, fit_tip
 from semcal_ros.synthetic import Detector, preset
 from semcal_ros.synthetic.specimens.cantilever import BeamTip, CantileverScene, cantilever_plan
-from semcal_ros.synthetic.specimens.cantilever_random import TIPS, make_tip
+from semcal_ros.synthetic.specimens.cantilever_random import (
+    TIPS,
+    make_tip,
+    random_cantilever,
+)
 from semcal_ros.synthetic.specimens.substrate import Substrate
 
 PIXEL_M = 40e-9
@@ -109,3 +113,22 @@ def test_a_beam_with_such_a_tip_bends_by_what_it_bends(name, seed):
     seen = camera.project(np.column_stack([apex, [[0.0]]]))[0]
     # Where it counts from is the apex, to half a pixel.
     assert np.hypot(*(seen - end)) < 0.5
+
+
+def test_the_gap_between_a_dark_beam_and_a_dark_pusher_is_no_beam():
+    """It is a bright strip with edges as sharp as the beam's; this scene was refused."""
+    one = random_cantilever(14)
+    scope = replace(preset("jsm820"), display_width_m=0.12).with_image_size(256, 256)
+    plan = cantilever_plan(
+        scope,
+        scene=one.scene,
+        pushes=(0.0,),
+        magnifications=(8890.0,),
+        rotation_rad=one.rotation_rad,
+        view="end",
+        seed=14,
+    )
+    strip = find_strip(plan.render(0))
+    assert strip.is_dark and strip.tip_seen and not strip.base_seen
+    pixel_m = scope.nominal_pixel_size_m(8890.0)
+    assert strip.half_width_px == pytest.approx(0.5 * one.scene.width_m / pixel_m, abs=2.5)
