@@ -67,9 +67,17 @@ def _spline_rows(values: Array, knots: Array, degree: int) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _lattice_rows(values: bytes, knots: bytes) -> Array32:
-    """Return :func:`_spline_rows` of the axis of a lattice, which is the same for frame after frame."""
-    return _spline_rows(np.frombuffer(values), np.frombuffer(knots), _DEGREE).astype(np.float32)
+def _lattice_rows(values: bytes, knots: bytes, *, straight: bool = False) -> Array32:
+    """Return :func:`_spline_rows` of the axis of a lattice, which is the same for frame after frame.
+
+    Beyond the outermost knots the spline is constant, or straight.
+    """
+    at, ends = np.frombuffer(values), np.frombuffer(knots)[[0, -1]]
+    rows = _spline_rows(at, np.frombuffer(knots), _DEGREE)
+    if straight:
+        inside = np.clip(at, *ends)
+        rows += (at - inside)[:, None] * _basis_functions(knots, _DEGREE)(inside, nu=1)
+    return rows.astype(np.float32)
 
 
 def _spline_slopes(values: Array, knots: Array) -> Array:
@@ -134,9 +142,13 @@ class FieldSlice:
         return out
 
     def on_lattice(self, x: Array, y: Array) -> Array32:
-        """Return (2, len(y), len(x)) displacements at all pairs of normalised raw coordinates."""
+        """Return (2, len(y), len(x)) displacements at all pairs of normalised raw coordinates.
+
+        Above and below the outermost knots the field goes on in a straight line: no pixel comes from
+        there, and a sudden change of its slope is nothing that can be interpolated.
+        """
         columns = _lattice_rows(x.tobytes(), self.knots_x.tobytes())
-        rows = _lattice_rows(y.tobytes(), self.knots_y.tobytes())
+        rows = _lattice_rows(y.tobytes(), self.knots_y.tobytes(), straight=True)
         coefficients = np.moveaxis(self.coefficients, 2, 0).astype(np.float32)
         out: Array32 = rows @ (coefficients @ columns.T)
         return out

@@ -36,11 +36,16 @@ _MAX_MAP_ERROR_PX = 0.001
 # order: a tenth of what OpenCV rounds positions by.
 _MAX_MOVING_ERROR_PX = 0.003
 # Columns and rows at which such a map is tested.
-_FIELD_TESTS = (33, 9)
+_FIELD_TESTS = (17, 11)
+# Part of the height by which a drift may differ from a tested one of the same camera without another test: the knots of
+# a field are a quarter of the height apart, so that interpolation is as good that near.
+_TESTED_NEARBY = 0.01
 # Drift during the scan of a departure up to which a first order needs no test of its own: it is wrong by a tenth.
 _SMALL_RESPONSE_PX = 0.005
 # Degrees down the image of what the field adds; across it, every column has its own values.
 _FIELD_DEGREES = (12, 24, 48)
+# Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
+_BEYOND_STEP = 0.125
 # Tables of residual fields that are kept: two magnifications may take turns.
 _MAX_TABLES = 2
 # Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
@@ -166,8 +171,10 @@ class SmoothMaps:
 
     def __init__(self) -> None:
         self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
-        self._split: LruCache[tuple[object, ...], _SplitCamera] = LruCache(_MAX_TABLES)
+        self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
+        # By camera: degree, and drift at the first and last pixel, of the last map that was tested.
+        self._tested: LruCache[tuple[object, ...], tuple[int, Array] | None] = LruCache(_MAX_TABLES)
 
     def make_map(
         self,
@@ -193,16 +200,21 @@ class SmoothMaps:
         timing: ScanTiming | None,
     ) -> RawMap | None:
         """The map without the field, and the field from a table; None where that is not accurate."""
-        split = self._split.get_or_compute(
-            camera_key(size, camera),
-            lambda: _SplitCamera(replace(camera, residual=None), tabulate_field(camera, size)),
+        width, height = size
+        plain = replace(camera, residual=None)
+        moving = None if drift is None else PixelDrift(size, plain, drift, timing)
+        path_px = _drift_path(size, moving)
+        step = _BEYOND_STEP * height
+        beyond = step * min(np.ceil(_largest(path_px) / step), 1.0 / _BEYOND_STEP)
+        key = camera_key(size, camera)
+        table = self._tables.get_or_compute(
+            (key, beyond), lambda: tabulate_field(camera, size, beyond)
         )
-        plain, table = split.plain, split.field
         smooth = None if table is None else self._map_by_polynomials(size, plain, drift, timing)
         if table is None or smooth is None or smooth._columns is None:
             return None
-        width, height = size
-        response = _response(size, plain, drift, timing)
+        response = _response(size, plain, moving, timing)
+        tested = self._tested.get(key, None)
         for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
             rows = _make_field_rows(height, len(smooth._columns) - 3, degree)
             undisplaced = rows.at_nodes @ smooth._columns
@@ -210,11 +222,19 @@ class SmoothMaps:
             if departure is None:
                 return None
             x, y = np.tensordot(response, departure, axes=1).astype(np.float32)
+            change = max(_largest(x - departure[0]), _largest(y - departure[1]))
             # As above, the identity comes last.
             columns = np.vstack([smooth._columns[:-2], np.hstack([x, y]), smooth._columns[-2:]])
             found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
-            if _is_accurate(found, plain, response, degree + 1):
+            is_small = change <= _SMALL_RESPONSE_PX
+            tested_px = (
+                tested[1] if is_small and tested is not None and tested[0] == degree else None
+            )
+            if tested_px is not None and _largest(path_px - tested_px) <= _TESTED_NEARBY * height:
+                return found
+            if _is_accurate(found, plain, response, degree + 1, None if is_small else moving):
                 self._field_degrees.put(size, degree)
+                self._tested.put(key, (degree, path_px))
                 return found
         return None
 
@@ -272,15 +292,15 @@ class SmoothMaps:
 def _response(
     size: tuple[int, int],
     plain: ScanCamera,
-    drift: RasterDrift | None,
+    moving: PixelDrift | None,
     timing: ScanTiming | None,
 ) -> Array:
     """The (2, 2) raw shift per departure of the field, to first order in the drift per row."""
-    if drift is None or timing is None:
+    if moving is None or timing is None:
         return np.eye(2)
     middle = 0.5 * np.array([[size[0], size[1]]])
-    velocity = PixelDrift(size, plain, drift, timing).velocity_px_s
-    raw = plain.raw_from_rect(np.vstack([middle, middle + 1e-3 * velocity * timing.frame_time_s]))
+    step = 1e-3 * moving.velocity_px_s * timing.frame_time_s
+    raw = plain.raw_from_rect(np.vstack([middle, middle + step]))
     raw_velocity = (raw[1] - raw[0]) / (1e-3 * timing.frame_time_s)
     at = timing.pixel_offset_s(
         np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), size[1], size[0]
@@ -288,18 +308,32 @@ def _response(
     return np.asarray(np.linalg.inv(np.eye(2) - np.outer(raw_velocity, at[1:] - at[0])))
 
 
-def _is_accurate(found: RawMap, plain: ScanCamera, response: Array, nodes: int) -> bool:
+def _drift_path(size: tuple[int, int], moving: PixelDrift | None) -> Array:
+    """Drift, (2, 2) px, at the times of the first and the last pixel."""
+    if moving is None:
+        return np.zeros((2, 2))
+    return moving.moved(np.zeros((2, 2)), np.array([[0.0, 0.0], np.subtract(size, 1.0)]))
+
+
+def _largest(values: Array | Array32) -> float:
+    return float(np.max(np.abs(values)))
+
+
+def _is_accurate(
+    found: RawMap, plain: ScanCamera, response: Array, nodes: int, moving: PixelDrift | None
+) -> bool:
     """Whether some pixels of a map with ``nodes`` rows of a field fulfil the equation of the exact position.
 
     The test takes no iteration: where the field moves a raw position to is where the drift and the rest of the camera
-    put it.
+    put it. Without ``moving``, the first order of the response is not tested.
     """
     width = found.size[0]
-    camera, drift, timing = found._exact
+    camera = found._exact[0]
     assert camera is not None
     assert found._rows is not None
     assert found._columns is not None
     at = _test_pixels(found.size)
+    at = at[0], np.union1d(at[1], _find_frame_edges(found))
     picked = found._columns[:, np.r_[at[0], width + at[0]]]
     raw, shift = (
         np.stack([a.ravel() for a in np.split(band.astype(np.float64), 2, axis=1)], axis=1)
@@ -310,35 +344,42 @@ def _is_accurate(found: RawMap, plain: ScanCamera, response: Array, nodes: int) 
     )
     # What lies outside of the raw frame comes out black anyway.
     scanned = np.all((raw > -1.0) & (raw < np.array(found.size)), axis=1)
-    departure = np.linalg.solve(response, shift.T).T
-    if drift is None or np.max(np.abs(shift - departure)) <= _SMALL_RESPONSE_PX:
-        undisplaced, largest = raw - departure, _MAX_MAP_ERROR_PX
+    if moving is None:
+        undisplaced = raw - np.linalg.solve(response, shift.T).T
+        largest = _MAX_MAP_ERROR_PX
     else:
         # The response is that of the middle of the image and of the frame.
         x, y = np.meshgrid(*at)
         xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
-        moved = PixelDrift(found.size, plain, drift, timing).moved(xy, raw)
-        undisplaced, largest = plain.raw_from_rect(moved), _MAX_MOVING_ERROR_PX
+        undisplaced, largest = plain.raw_from_rect(moving.moved(xy, raw)), _MAX_MOVING_ERROR_PX
     miss = camera.without_residual(raw) - undisplaced
     return bool(np.max(np.abs(miss[scanned]), initial=0.0) <= largest)
+
+
+def _find_frame_edges(found: RawMap) -> Indices:
+    """Rows at which the raw frame begins and ends.
+
+    The slope of a field changes suddenly where it ends, and polynomials follow that least well.
+    """
+    width, height = found.size
+    assert found._rows is not None
+    assert found._columns is not None
+    raw = found._rows @ found._columns[:, [width, width + width // 2, 2 * width - 1]]
+    inside = (raw >= 0.0) & (raw <= height - 1.0)
+    first, last = inside.argmax(axis=0), height - 1 - inside[::-1].argmax(axis=0)
+    return np.concatenate([first, last])[np.tile(inside.any(axis=0), 2)]
 
 
 @lru_cache(maxsize=_MAX_KEPT)
 def _test_pixels(size: tuple[int, int]) -> tuple[Indices, Indices]:
     """Columns and rows at which a map with a residual field is tested, denser towards the edges."""
     columns, rows = (
-        np.unique(np.round(0.5 * (n - 1) * (1.0 - np.cos(np.pi * (np.arange(k) + 0.5) / k))))
+        np.unique(
+            np.round(0.5 * (n - 1) * (1.0 - np.cos(np.pi * (np.arange(k) + _TEST_OFFSET) / k)))
+        )
         for n, k in zip(size, _FIELD_TESTS, strict=True)
     )
     return columns.astype(np.intp), rows.astype(np.intp)
-
-
-@dataclass(frozen=True)
-class _SplitCamera:
-    """A camera without its residual field, and the field; None where it cannot be tabulated."""
-
-    plain: ScanCamera
-    field: FieldTable | None
 
 
 @dataclass(frozen=True)

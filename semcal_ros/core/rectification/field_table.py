@@ -74,7 +74,9 @@ class FieldTable:
         return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
 
 
-def tabulate_field(camera: ScanCamera, size: tuple[int, int]) -> FieldTable | None:
+def tabulate_field(
+    camera: ScanCamera, size: tuple[int, int], rows_beyond: float = 0.0
+) -> FieldTable | None:
     """Tabulate the residual field of a camera; None where it is too large.
 
     Parameters
@@ -83,6 +85,8 @@ def tabulate_field(camera: ScanCamera, size: tuple[int, int]) -> FieldTable | No
         A camera with a residual field.
     size
         (width, height) of its image.
+    rows_beyond
+        Rows above and below the image up to which the table goes on, px.
     """
     field, norm = camera.residual, camera.norm_px
     assert field is not None
@@ -97,6 +101,7 @@ def tabulate_field(camera: ScanCamera, size: tuple[int, int]) -> FieldTable | No
         1.0 + np.ceil(largest + max(norm * end - 0.5 * count, 0.0))
         for end, count in zip(ends, size, strict=True)
     ]
+    margins[1] += np.ceil(rows_beyond)
     steps = _COLUMN_PX, max(size[1] / _MOST_ROWS, 1.0)
     columns, rows = (
         np.arange(int((count + 2.0 * margin) / step) + 1, dtype=np.float64) * step

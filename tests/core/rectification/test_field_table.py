@@ -85,6 +85,18 @@ def test_a_map_from_the_table_is_the_exact_one(drift: RasterDrift | None) -> Non
     assert largest_error(made, camera, drift) < 0.004
 
 
+def test_a_stage_that_starts_to_move_is_tested_anew() -> None:
+    camera, maps = camera_with(settling_field(2.0)), SmoothMaps()
+    for drift in (
+        drift_px((0.0, 0.0), (0.1, 0.0)),
+        drift_px((1.0, 0.5), (0.1, 0.0)),
+        # Far from what was tested, and so fast that rows of the field that did before do not now.
+        drift_px((31.0, -20.0), (-3.0, 5.0)),
+    ):
+        made = maps.make_map(SIZE, camera, drift, TIMING)
+        assert largest_error(made, camera, drift) < 0.004
+
+
 def test_every_magnification_of_a_zoom_has_its_own_field() -> None:
     maps, field = SmoothMaps(), settling_field(2.0)
     for g in (150.0, 151.0, 9000.0, 150.0, 20000.0):
