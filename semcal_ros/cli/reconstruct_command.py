@@ -52,7 +52,7 @@ __all__ = ["command"]
 @click.option(
     "--height-sigma",
     type=click.FloatRange(0.0),
-    default=40e-6,
+    default=10e-6,
     show_default=True,
     metavar="M",
     help="1-sigma of the height above or below the plane of the calibration.",
@@ -130,6 +130,12 @@ def _echo_summary(result: dict[str, Any]) -> None:
         f"{parts['scale']:.2f} nm; depth {result['relief_sigma']:.2%}"
     )
     click.echo(f"  points about the sphere: RMS {1e9 * result['sphere_rms_m']:.2f} nm")
+    departure = result["departure"]
+    click.echo(
+        f"  {'a ball' if result['is_ball'] else 'NOT A BALL'}: the most significant departure is "
+        f"{1e9 * departure['height_m']:+.1f} +- {1e9 * departure['height_sigma_m']:.1f} nm "
+        f"({departure['kind']}), by chance with a probability of {departure['probability']:.2g}"
+    )
     kind = "watertight" if result["watertight"] else "open where nothing was seen"
     click.echo(
         f"mesh: {result['vertices']} vertices, {result['faces']} faces, "

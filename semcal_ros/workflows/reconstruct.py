@@ -117,6 +117,15 @@ class Reconstruction:
                 "scale": ball.scale_sigma_m,
             },
             "sphere_rms_m": ball.sphere.rms_m,
+            "is_ball": ball.roundness.is_ball,
+            "departure": {
+                "kind": ball.roundness.kind,
+                "height_m": ball.roundness.height_m,
+                "height_sigma_m": ball.roundness.height_sigma_m,
+                "towards": ball.roundness.towards.tolist(),
+                "frame": int(structure.frames[structure.adjustment.reference]),
+                "probability": ball.roundness.probability,
+            },
             "relief_sigma": structure.relief_sigma,
             "relief_condition": structure.relief_condition,
             "convexity": structure.convexity,
@@ -132,7 +141,7 @@ def reconstruct(
     frame_time_s: float | None = None,
     spacing_px: float = 5.0,
     keyframes: int = 150,
-    height_sigma_m: float = 40e-6,
+    height_sigma_m: float = 10e-6,
     on_progress: OnProgress = ignore_progress,
 ) -> Reconstruction:
     """Reconstruct a ball that turns: follow features, adjust points and poses, fit and mesh.
@@ -189,6 +198,8 @@ def reconstruct(
     ball = measure_ball(structure, height_sigma_m=height_sigma_m)
     if outside:
         notes.append(f"{outside} frames are outside the calibrated range")
+    if not ball.roundness.is_ball:
+        notes.append(_describe_departure(structure, ball))
     notes += _list_doubts(structure, microscope.scan is not None)
     return Reconstruction(structure, ball, tracker.frames, tuple(notes))
 
@@ -215,6 +226,30 @@ def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyfr
         return keyframes
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, most).round().astype(int))
     return [keyframes[int(k)] for k in chosen]
+
+
+def _describe_departure(structure: Structure, ball: Ball) -> str:
+    found = ball.roundness
+    x, y, z = found.towards
+    frame = int(structure.frames[structure.adjustment.reference])
+    from_beam = np.degrees(np.arccos(np.clip(-z, -1.0, 1.0)))
+    around = np.degrees(np.arctan2(y, x))
+    place = (
+        f"{from_beam:.0f} deg from the direction to the gun, towards {around:.0f} deg in the image "
+        f"(0 right, 90 down) of frame {frame}"
+    )
+    size = f"{1e9 * abs(found.height_m):.1f} +- {1e9 * found.height_sigma_m:.1f} nm"
+    if found.kind == "ellipsoid":
+        what = (
+            f"it bulges like an ellipsoid by {size} from its lowest to its highest place, {place}"
+        )
+    else:
+        name = "bump" if found.height_m > 0.0 else "dent"
+        what = f"a {name} of {size} lies {place}"
+    return (
+        f"this is not a ball: {what}; noise alone does so with a probability of "
+        f"{found.probability:.0e}. The diameter is that of the best sphere"
+    )
 
 
 def _list_doubts(structure: Structure, timed: bool) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +37,13 @@ def ball_scene(
     roll_deg: float = 35.0,
     yaw_deg: float = 15.0,
     steepest_deg: float = 60.0,
+    heights_m: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
     seed: int = 0,
 ) -> Scene:
-    """A ball that rolls and yaws; a point is seen where its normal is near enough to the beam."""
+    """A ball that rolls and yaws; a point is seen where its normal is near enough to the beam.
+
+    ``heights_m`` are those of directions (n, 3) over the sphere.
+    """
     rng = np.random.default_rng(seed)
     microscope = preset("jsm820").with_image_size(2048, 320)
     steps = np.linspace(0.0, 1.0, views)
@@ -58,6 +63,8 @@ def ball_scene(
     kept = np.flatnonzero(seen.sum(axis=0) >= max(6, views // 4))[:points]
     directions, seen = directions[kept], seen[:, kept]
     world = RADIUS_M * directions
+    if heights_m is not None:
+        world += heights_m(directions)[:, None] * directions
     xy = np.zeros((*seen.shape, 2))
     false = seen & (rng.random(seen.shape) < wrong)
     for view, camera in enumerate(cameras):

@@ -26,6 +26,7 @@ from semcal_ros.applications.reconstruction.reconstruct import (
     StructureSettings,
     reconstruct,
 )
+from semcal_ros.applications.reconstruction.roundness import Roundness
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 
@@ -35,6 +36,7 @@ __all__ = [
     "Ball",
     "MetricUpgrade",
     "Observations",
+    "Roundness",
     "SequenceTracker",
     "SphereFit",
     "Structure",

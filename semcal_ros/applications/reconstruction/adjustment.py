@@ -78,10 +78,16 @@ class Adjustment:
 
     def propagate_variance(self, gradient: Array) -> float:
         """Variance of a function of the points with the (points, 3) gradient, poses included."""
-        direct = np.einsum("pi,pij,pj->", gradient, self._inverse_points, gradient, optimize=True)
-        moved = np.einsum("pij,pj->pi", self._inverse_points, gradient).ravel()
-        through = self._coupling @ moved
-        return float(direct + through @ self._inverse_poses @ through)
+        return float(self.propagate_covariance(gradient[None])[0, 0])
+
+    def propagate_covariance(self, gradients: Array) -> Array:
+        """Covariance (k, k) of functions of the points with (k, points, 3) gradients, poses included."""
+        moved = np.einsum("pij,kpj->kpi", self._inverse_points, gradients).reshape(
+            len(gradients), -1
+        )
+        through = moved @ self._coupling.T
+        direct = moved @ gradients.reshape(len(gradients), -1).T
+        return np.asarray(direct + through @ self._inverse_poses @ through.T, dtype=np.float64)
 
     @property
     def rms_px(self) -> float:

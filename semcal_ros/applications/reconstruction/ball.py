@@ -2,10 +2,10 @@
 
 Three errors add up. *Noise*: the fit to the adjusted points, with the errors of the poses.
 Neighbouring patches share pixels, so the variance is multiplied by the number of points that share
-one; it is also measured by leaving out groups of views in turn (jackknife), and the larger value
-counts. *Shape*: the departure of the points from a sphere. *Scale*: nm per pixel of the
-calibration, and the height of the ball above or below the reference plane, which parallel
-projection does not show.
+one. It is also measured by leaving out groups of views in turn (jackknife), which counts where it is
+larger than chance allows. *Shape*: what the points scatter about the sphere beyond their own
+uncertainty. *Scale*: nm per pixel of the calibration, and the height of the ball above or below the
+reference plane, which parallel projection does not show.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from semcal_ros.applications.reconstruction.adjustment import adjust
 from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, triangulate_cloud
@@ -23,9 +23,14 @@ from semcal_ros.applications.reconstruction.moving_least_squares import (
     fit_local_surface,
 )
 from semcal_ros.applications.reconstruction.reconstruct import Structure
+from semcal_ros.applications.reconstruction.roundness import Roundness, measure_roundness
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 
 __all__ = ["Ball", "measure_ball"]
+
+
+# The jackknife has few degrees of freedom: a larger scatter than this happens by chance once in 20 times.
+_CHANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +53,8 @@ class Ball:
         Number of groups of views in the jackknife.
     coverage
         Fraction of the sphere that the mesh covers.
+    roundness
+        Whether the body is a ball, and where it departs from one.
     """
 
     sphere: SphereFit
@@ -59,6 +66,7 @@ class Ball:
     interval_m: tuple[float, float]
     groups: int
     coverage: float
+    roundness: Roundness
 
     @property
     def sigma_m(self) -> float:
@@ -70,7 +78,7 @@ class Ball:
 def measure_ball(
     structure: Structure,
     *,
-    height_sigma_m: float = 40e-6,
+    height_sigma_m: float = 10e-6,
     groups: int = 8,
     confidence: float = 0.95,
 ) -> Ball:
@@ -94,14 +102,15 @@ def measure_ball(
     """
     sphere = fit_sphere(structure.points_m, structure.normal_sigma_m)
     variance = structure.adjustment.propagate_variance(sphere.radius_gradient)
-    noise = 2.0 * np.sqrt(variance * _count_sharing(structure))
+    sharing = _count_sharing(structure)
+    noise = 2.0 * np.sqrt(variance * sharing)
     groups = min(groups, len(structure.cameras) // 4)
     freedom = np.inf
     if groups >= 3:
         measured = _run_jackknife(structure, sphere, groups)
-        if measured > noise:
+        if (measured / noise) ** 2 > float(chdtri(groups - 1, _CHANCE)) / (groups - 1):
             noise, freedom = measured, groups - 1.0
-    shape = 2.0 * sphere.radius_sigma_m
+    shape = 2.0 * sphere.radius_sigma_m * np.sqrt(sharing * _compute_excess(structure, sphere))
     diameter = 2.0 * sphere.radius_m
     scale = diameter * _compute_scale_sigma(structure, height_sigma_m)
     total = float(np.sqrt(noise**2 + shape**2 + scale**2))
@@ -114,12 +123,19 @@ def measure_ball(
         mesh=mesh,
         diameter_m=diameter,
         noise_sigma_m=float(noise),
-        shape_sigma_m=shape,
+        shape_sigma_m=float(shape),
         scale_sigma_m=scale,
         interval_m=(diameter - reach, diameter + reach),
         groups=groups,
         coverage=_compute_coverage(mesh, sphere),
+        roundness=measure_roundness(structure, sphere, sharing),
     )
+
+
+def _compute_excess(structure: Structure, sphere: SphereFit) -> float:
+    """Compute the part of the squared residuals that the points' own uncertainty does not explain."""
+    own = np.mean(structure.normal_sigma_m[sphere.inliers] ** 2)
+    return float(np.clip(1.0 - own / sphere.rms_m**2, 0.0, 1.0))
 
 
 def _count_sharing(structure: Structure) -> float:
