@@ -192,7 +192,10 @@ class Parameters:
         return self._allowed.resolve(path)
 
     def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
-        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after."""
+        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after.
+
+        A parameter that is set to the value that it has does not change, unless it names a file.
+        """
         self._applies[name] = apply
         if check is not None:
             self._checks[name] = check
@@ -217,6 +220,10 @@ class Parameters:
             declaration = self._declared.get(parameter.name)
             if declaration is None:
                 continue
+            before = self._values[parameter.name]
             self._values[parameter.name] = declaration.convert(parameter.value)
+            # What a file holds may have changed; nothing else has.
+            if self._values[parameter.name] == before and not declaration.confined:
+                continue
             if parameter.name in self._applies:
                 self._applies[parameter.name](self._values[parameter.name])
