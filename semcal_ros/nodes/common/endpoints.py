@@ -94,9 +94,12 @@ class Endpoints:
             except NODE_ERRORS as error:
                 response.message = " ".join(str(error).split())
                 response.success = False
-                self._node.get_logger().warning(f"{name}: {response.message}")
             if on_answer is not None:
                 on_answer(response.success, response.message)
+            if response.success:
+                self._node.get_logger().info(f"{name}: {response.message}")
+            else:
+                self._node.get_logger().warning(f"{name}: {response.message}")
             return response
 
         return self._node.create_service(

@@ -43,9 +43,9 @@ def test_arguments_for_ros_pass() -> None:
 
 
 def test_a_misspelt_parameter_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(InvalidValueError, match="calibraton.* expected calibration, perhaps"):
+    with pytest.raises(InvalidValueError, match=r"calibraton.* expected calibration, perhaps"):
         unused(CommandLine(), "config", "calibraton")
-    with pytest.raises(InvalidValueError, match="xyz.* expected one of its parameters"):
+    with pytest.raises(InvalidValueError, match=r"xyz.* expected one of its parameters"):
         unused(CommandLine(), "xyz")
 
 
