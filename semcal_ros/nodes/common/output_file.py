@@ -40,7 +40,7 @@ class OutputFile:
 
     def path(self) -> Path:
         """Return the file that would be written now; raises :class:`InvalidValueError` if none may be."""
-        name = self._parameters[OUTPUT.name] or OUTPUT.default
+        name = str(self._parameters[OUTPUT.name] or OUTPUT.default)
         wanted = self._parameters.allowed_path(name)
         if name != OUTPUT.default:
             return wanted
