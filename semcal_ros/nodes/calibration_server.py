@@ -152,6 +152,10 @@ class CalibrationServer(StreamNode):
         magnification = self.known_magnification(frame)
         if magnification is None or frame.mixed:
             return
+        if self.frames is not None and self.frames.has_rivals:
+            with self._lock:
+                self._newest = None
+            return
         with self._lock:
             before = self._newest
             visit = 0 if before is None else before.visit
@@ -160,7 +164,12 @@ class CalibrationServer(StreamNode):
 
     # -- services ----------------------------------------------------------------------------------
 
+    def _refuse_rivals(self) -> None:
+        if self.frames is not None:
+            self.frames.refuse_rivals()
+
     def _add_view(self) -> str:
+        self._refuse_rivals()
         with self._lock:
             newest, name = self._newest, f"view {len(self._views)}"
         frame = None if newest is None else newest.frame
@@ -249,6 +258,7 @@ class CalibrationServer(StreamNode):
         return result.summary
 
     def _begin(self) -> CalibrationProcess:
+        self._refuse_rivals()
         with self._lock:
             if self._running is not None:
                 raise CalibrationError(

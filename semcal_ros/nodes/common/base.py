@@ -23,6 +23,7 @@ from semcal_ros.bridge.diagnostics import (
 from semcal_ros.config.config import load_config
 from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
 from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import (
     CONFIG,
     DIAGNOSTICS_PERIOD,
@@ -72,6 +73,7 @@ class SemNode(Node):
         if command_line().wants_help:
             raise HelpWanted(name, declared)
         super().__init__(name, namespace=DEFAULT_NAMESPACE)
+        self._executable = name
         self.parameters = Parameters(self, declared)
         unused = self._unused_parameters(of_topics=False)
         self.config = load_config(self.parameters["config"])
@@ -92,6 +94,17 @@ class SemNode(Node):
         """Close what :attr:`closing` holds, then destroy the node as the base class does."""
         self.closing.close()
         super().destroy_node()
+
+    def introduction(self) -> list[str]:
+        """Return what a user who starts the node wants to know, a few words each."""
+        about = EXECUTABLES.get(self._executable)
+        purpose = self._executable if about is None else about.purpose.rstrip(".")
+        return [purpose, f"config {self.config.name}"]
+
+    def introduce(self) -> None:
+        """Say in one line of the log what the finished node is, and where it listens and speaks."""
+        topics = self.endpoints.describe_topics()
+        self.reporter.info("; ".join([*self.introduction(), *filter(None, [topics])]))
 
     # -- parameters --------------------------------------------------------------------------------
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
-from semcal_ros.files.plain_yaml import load_plain_yaml
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.files.parameter_file import ParameterSection, read_parameter_sections
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
-from semcal_ros.text_files import read_text_file
 
 __all__ = [
     "CommandLine",
@@ -28,8 +25,6 @@ _HELP = ("-h", "--help")
 # rclpy declares these by itself.
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_QOS = "qos_overrides."
-# A parameter file is written by hand; larger ones are something else.
-_MAX_BYTES = 1024 * 1024
 
 
 class HelpWanted(Exception):
@@ -39,15 +34,6 @@ class HelpWanted(Exception):
         super().__init__(name)
         self.name = name
         self.declarations = tuple(declarations)
-
-
-@dataclass(frozen=True)
-class _Section:
-    """A section of a parameter file: the nodes that it is for, and the names in it."""
-
-    file: str
-    nodes: str
-    names: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -104,7 +90,7 @@ class CommandLine:
             Such a name was given to this node alone, or a section of a file has its name without its namespace,
             which ROS takes for another node.
         """
-        sections = list(self._sections())
+        sections = self._sections()
         namespace, _, name = node.rpartition("/")
         for section in sections:
             if namespace and section.nodes == f"/{name}":
@@ -126,40 +112,21 @@ class CommandLine:
                 )
         return unknown
 
-    def _sections(self) -> Iterator[_Section]:
+    def _sections(self) -> list[ParameterSection]:
         pairs = zip(self.arguments, self.arguments[1:], strict=False)
-        for file in [value for flag, value in pairs if flag == "--params-file"]:
-            try:
-                text = read_text_file(
-                    Path(file), _MAX_BYTES, error=ConfigError, expected="a parameter file"
-                )
-                content = load_plain_yaml(text, file)
-            except SemcalError:
-                continue  # ROS itself says what is wrong with it
-            yield from _list_sections(file, "", content)
+        files = [value for flag, value in pairs if flag == "--params-file"]
+        return [section for file in files for section in _read_sections(file)]
+
+
+def _read_sections(file: str) -> tuple[ParameterSection, ...]:
+    with suppress(SemcalError):  # ROS itself says what is wrong with it
+        return read_parameter_sections(file)
+    return ()
 
 
 def is_quality(name: str) -> bool:
     """Return whether a parameter overrides the quality of service of a topic."""
     return name.startswith(_OF_QOS)
-
-
-def _list_sections(file: str, path: str, content: Any) -> Iterator[_Section]:
-    if not isinstance(content, Mapping):
-        return
-    for key, value in content.items():
-        if key == "ros__parameters":
-            yield _Section(file, path, frozenset(_list_names("", value)))
-        else:
-            yield from _list_sections(file, f"{path}/{str(key).strip('/')}", value)
-
-
-def _list_names(prefix: str, content: Any) -> Iterator[str]:
-    if isinstance(content, Mapping):
-        for key, value in content.items():
-            yield from _list_names(f"{prefix}.{key}" if prefix else str(key), value)
-    else:
-        yield prefix
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -41,10 +41,23 @@ class Endpoints:
         group: CallbackGroup | None = None,
         *,
         raw: bool = False,
+        source: str = "",
+        streams: bool = False,
     ) -> AdaptiveSubscription:
-        """Subscribe; the callback takes the message, or its bytes if ``raw``, and its information."""
+        """Subscribe; the callback takes the message, or its bytes if ``raw``, and its information.
+
+        ``source`` and ``streams`` are those of :class:`AdaptiveSubscription`.
+        """
         subscription = AdaptiveSubscription(
-            self._node, message_type, topic, callback, profile, group, raw=raw
+            self._node,
+            message_type,
+            topic,
+            callback,
+            profile,
+            group,
+            raw=raw,
+            source=source,
+            streams=streams,
         )
         self._subscriptions.append(subscription)
         return subscription
@@ -121,4 +134,12 @@ class Endpoints:
         """Return what is wrong with the subscribed topics, a few words each."""
         weak = [f"{s.topic} without {s.downgraded}" for s in self._subscriptions if s.downgraded]
         foreign = [(s.topic, s.foreign_types) for s in self._subscriptions if s.foreign_types]
-        return weak + [f"{types} on {topic}" for topic, types in foreign]
+        rivals = [s.rivals for s in self._subscriptions if s.rivals]
+        return weak + [f"{types} on {topic}" for topic, types in foreign] + rivals
+
+    def describe_topics(self) -> str:
+        """Return the full names of all topics of this node, in words."""
+        inputs = sorted({s.full_topic for s in self._subscriptions})
+        outputs = sorted({str(p.topic_name) for p in self._publishers.values()})
+        parts = [("subscribes to", inputs), ("publishes", outputs)]
+        return "; ".join(f"{verb} {', '.join(names)}" for verb, names in parts if names)

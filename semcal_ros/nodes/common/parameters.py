@@ -26,6 +26,7 @@ __all__ = [
     "DIAGNOSTICS_PERIOD",
     "DIRECTORY",
     "INTERPOLATION",
+    "REPLAYED_CALIBRATION",
     "ParameterDeclaration",
     "Parameters",
 ]
@@ -138,6 +139,13 @@ CALIBRATION = ParameterDeclaration(
     "",
     "Calibration file; empty to wait for one on the topic `calibration`.",
     confined=True,
+)
+REPLAYED_CALIBRATION = ParameterDeclaration(
+    "replayed_calibration",
+    "ignore",
+    "What to do with a calibration that comes while a recording is played on the topic `calibration`, where another one"
+    " is in force already.",
+    choices=("ignore", "take"),
 )
 INTERPOLATION = ParameterDeclaration(
     "interpolation",

@@ -138,6 +138,7 @@ def _make(factory: Callable[[], Node]) -> Node | None:
             if isinstance(node, SemNode):
                 with _destroyed_if_refused(node):
                     node.refuse_unknown_topics()
+                node.introduce()
             return node
     except RuntimeError:
         # All others have become errors of the suite.
