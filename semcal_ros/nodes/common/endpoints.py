@@ -11,7 +11,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from semcal_ros.nodes.common.qos import latched, overridable, service_queue, stream_output
+from semcal_ros.nodes.common.qos import (
+    camera_output,
+    latched,
+    overridable,
+    service_queue,
+    stream_output,
+)
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageInfo
 
@@ -62,17 +68,44 @@ class Endpoints:
         self._subscriptions.append(subscription)
         return subscription
 
-    def stream_publisher(self, message_type: Any, topic: str) -> Any:
-        """Create a publisher of messages that belong to single frames."""
-        return self._publisher(message_type, topic, stream_output())
+    def stream_publisher(self, message_type: Any, topic: str, name: str | None = None) -> Any:
+        """Create a publisher of messages that belong to single frames.
+
+        ``name`` is the full name of a topic that follows another one.
+        """
+        return self._publisher(message_type, topic, stream_output(), name)
+
+    def camera_publisher(self, message_type: Any, topic: str, name: str) -> Any:
+        """Create a publisher of the cameras of single frames, with a name as for :meth:`stream_publisher`."""
+        return self._publisher(message_type, topic, camera_output(), name)
+
+    def beside(self, topic: str, neighbour: str) -> str:
+        """Return the full name of a topic in the namespace of another one, which may have been remapped.
+
+        A remap of ``topic`` itself counts more.
+        """
+        own = self._node.resolve_topic_name(topic)
+        if own != self._node.resolve_topic_name(topic, only_expand=True):
+            return own
+        return f"{self._node.resolve_topic_name(neighbour).rpartition('/')[0]}/{topic}"
+
+    def below(self, topic: str, name: str) -> str:
+        """Return the full name ``<topic>/<name>``, where ``topic`` may have been remapped."""
+        own = f"{topic}/{name}"
+        resolved = self._node.resolve_topic_name(own)
+        if resolved != self._node.resolve_topic_name(own, only_expand=True):
+            return resolved
+        return f"{self._node.resolve_topic_name(topic)}/{name}"
 
     def latched_publisher(self, message_type: Any, topic: str) -> Any:
         """Create a publisher whose last message also reaches late subscribers."""
         return self._publisher(message_type, topic, latched())
 
-    def _publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:
+    def _publisher(
+        self, message_type: Any, topic: str, profile: QoSProfile, name: str | None = None
+    ) -> Any:
         publisher = self._node.create_publisher(
-            message_type, topic, profile, qos_overriding_options=overridable()
+            message_type, name or topic, profile, qos_overriding_options=overridable()
         )
         self._publishers[topic] = publisher
         return publisher

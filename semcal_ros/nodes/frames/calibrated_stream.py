@@ -57,7 +57,7 @@ class CalibratedStreamNode(StreamNode):
             self.reporter,
             on_change=self.on_calibration,
         )
-        self.output = RectifiedOutput(self.parameters, self.endpoints, self.reporter)
+        self.output = RectifiedOutput(self.config, self.parameters, self.endpoints, self.reporter)
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._range = RangeWatch(self.reporter)
