@@ -8,111 +8,147 @@ from pathlib import Path
 
 from launch import LaunchDescription  # isort: skip - this folder has the same name
 from launch.actions import (
-    DeclareLaunchArgument,
-    IncludeLaunchDescription,
     OpaqueFunction,
-    RegisterEventHandler,
+    SetLaunchConfiguration,
     Shutdown,
     TimerAction,
 )
 from launch.conditions import IfCondition
-from launch.event_handlers import OnProcessExit
-from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.launch_description_sources import load_python_launch_file_as_module
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
-PACKAGE = "semcal_ros"
-SUITE = Path(__file__).absolute().with_name("semcal_launch.py")
+suite = load_python_launch_file_as_module(
+    str(Path(__file__).absolute().with_name("semcal_launch.py"))
+)
 # Seconds for the frames that have been received but are still being worked on.
 GRACE_S = 1.0
-# Status of a node that cannot start with what it was given.
-CANNOT_START = 2
 
-# Default (None: there is none), type and description.
-ARGUMENTS = {
-    "bag": (None, str, "Recording: a rosbag2 folder, or an .mcap or .db3 file."),
-    "rate": ("1.0", float, "Seconds of recording per second."),
-    "loop": ("false", bool, "Begin again at the end, until interrupted."),
-    "clock": (
+# What the nodes of the suite subscribe to, of what a recording can hold; `image`, `magnification` and `stage` are the
+# configured topics. In the mode `separate` the images go through drift_compensator to the rectifier, which takes the
+# stamps of the originals as well.
+INPUTS = {
+    "parameter_server": ["magnification"],
+    "stream_corrector": ["image", "magnification"],
+    "drift_compensator": ["image", "magnification"],
+    "rectifier": ["image", "magnification", "image_stabilized"],
+    "calibration_server": ["image", "magnification", "stage"],
+}
+
+
+def recording(text):
+    if not Path(suite.expand(text)).exists():
+        raise ValueError("there is no such recording; check the path")
+    return suite.expand(text)
+
+
+def subscribers(text):
+    return text if text == "suite" else suite.number(0, 100, int)(text)
+
+
+PLAYER = {
+    "bag": suite.Argument(
+        None, "Recording: a rosbag2 folder, or an .mcap or .db3 file.", recording
+    ),
+    "topics": suite.Argument(
+        "inputs",
+        "What is played. inputs: images, magnification and stage by the configuration; all: whatever was recorded, also"
+        " what the suite publishes itself, which then comes twice; or names, with commas between them.",
+    ),
+    "exclude": suite.Argument("", "Topics that are not played, with commas between them."),
+    "rate": suite.Argument("1.0", "Seconds of recording per second.", suite.number(0.001, 1000.0)),
+    "loop": suite.Argument("false", "Begin again at the end, until interrupted.", suite.boolean),
+    "clock": suite.Argument(
         "false",
-        bool,
         "Publish the time of the recording on /clock, and let all nodes go by it.",
+        suite.boolean,
     ),
-    "wait_for_subscribers": (
-        "1",
-        int,
-        "Start once every image topic of the recording has this many subscribers: 1 is the suite,"
-        " 2 with calibration_server:=true, one more for each viewer. 0: at once.",
+    "start_paused": suite.Argument(
+        "false", "Wait for ~/resume or ~/play_next of bag_player.", suite.boolean
     ),
+    "wait_for_subscribers": suite.Argument(
+        "suite",
+        "suite: start once all nodes that this file starts have subscribed. A number: once images and magnification"
+        " have so many subscribers each. 0: at once.",
+        subscribers,
+    ),
+}
+ARGUMENTS = {**suite.ARGUMENTS, **PLAYER}
+TYPES = {
+    "rate": float,
+    "loop": bool,
+    "clock": bool,
+    "start_paused": bool,
+    "wait_for_subscribers": int,
 }
 
 
 def generate_launch_description():
-    suite = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(SUITE)),
-        launch_arguments={"use_sim_time": LaunchConfiguration("clock")}.items(),
-    )
     # The recording keeps the names of its topics: `namespace` must be the one it was made in.
-    # The player comes second, for it uses the arguments and the environment of the suite.
     return LaunchDescription(
         [
-            *(declaration(name) for name in ARGUMENTS),
-            suite,
-            OpaqueFunction(function=start_player),
+            *suite.declarations(ARGUMENTS),
+            OpaqueFunction(function=suite.check_arguments, args=[ARGUMENTS]),
+            SetLaunchConfiguration(
+                "use_sim_time", "true", condition=IfCondition(LaunchConfiguration("clock"))
+            ),
+            OpaqueFunction(
+                function=suite.set_environment,
+                condition=IfCondition(LaunchConfiguration("large_images")),
+            ),
+            OpaqueFunction(function=start_nodes),
         ]
     )
 
 
-def declaration(name):
-    default, _, description = ARGUMENTS[name]
-    return DeclareLaunchArgument(name, default_value=default, description=description)
+def start_nodes(context):
+    nodes = suite.make_nodes(context)
+    player = make_player(context, [node.node_executable for node in nodes])
+    watch = ReplayWatch(nodes, player)
+    return [*watch.handlers(), *nodes, player]
 
 
-def start_player(context):
-    values = {
-        name: LaunchConfiguration(name).perform(context)
-        for name in (*ARGUMENTS, "namespace", "config", "params_file", "log_level")
-    }
-    # As in the suite: what is left at its default does not win over params_file. Only to wait for
-    # subscribers is a default that the node does not have.
-    parameters = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-        for name, (default, kind, _) in ARGUMENTS.items()
-        if values[name] != default or name == "wait_for_subscribers"
-    }
-    # A shell leaves the ~ of `name:=~/file` to us.
-    parameters["bag"] = ParameterValue(str(Path(values["bag"]).expanduser()), value_type=str)
-    if values["config"] != "generic":
-        parameters["config"] = ParameterValue(values["config"], value_type=str)
-    files = [str(Path(values["params_file"]).expanduser())] if values["params_file"] else []
-    # As the suite does for its nodes.
-    secure = context.environment.get("ROS_SECURITY_ENABLE") == "true"
-    enclave = ["--enclave", f"/{values['namespace'].strip('/')}/bag_player"] if secure else []
-    player = Node(
-        package=PACKAGE,
-        executable="bag_player",
-        name="bag_player",
-        namespace=values["namespace"],
-        parameters=[*files, parameters],
-        ros_arguments=["--log-level", values["log_level"], *enclave],
-        output="screen",
-    )
-    watch = OnProcessExit(
-        target_action=lambda action: getattr(action, "node_package", None) == PACKAGE,
-        on_exit=lambda event, context: on_exit(event, context, event.action is player),
-    )
-    return [RegisterEventHandler(watch), player]
+def make_player(context, executables):
+    values = suite.given(context, ARGUMENTS, ["config", *PLAYER])
+    # What is played and what is waited for are not the defaults of the node.
+    values.setdefault("topics", "inputs")
+    if "wait_for_subscribers" not in values:
+        values["wait_for"] = awaited(executables)
+    parameters = {name: convert(text, TYPES.get(name, str)) for name, text in values.items()}
+    return suite.make_node(context, "bag_player", parameters)
 
 
-def on_exit(event, context, is_player):
-    """What follows the end of a node."""
-    if event.returncode == 0:
-        after = TimerAction(period=GRACE_S, actions=[Shutdown(reason="the recording has ended")])
-        return [after] if is_player else None
-    # The suite restarts a node that has died. A player that was restarted would play everything twice, and would
-    # wait forever for a node that cannot start.
-    final = is_player or event.returncode == CANNOT_START
-    if not final and IfCondition(LaunchConfiguration("respawn")).evaluate(context):
-        return None
-    return [Shutdown(reason=f"{event.process_name} ended with {event.returncode}")]
+def convert(text, kind):
+    return text == "true" if kind is bool else kind(text)
+
+
+def awaited(executables):
+    """How many of these nodes subscribe to each topic, as the player's parameter wait_for."""
+    topics = [topic for executable in executables for topic in INPUTS[executable]]
+    return " ".join(f"{topic}:{topics.count(topic)}" for topic in dict.fromkeys(topics))
+
+
+class ReplayWatch(suite.NodeWatch):
+    """Ends the launch with the recording, or with the first node that will not come back."""
+
+    def __init__(self, nodes, player):
+        super().__init__([*nodes, player])
+        self.player = player
+
+    def comes_back(self, event, context):
+        # A player that was restarted would play everything twice.
+        return event.action is not self.player and super().comes_back(event, context)
+
+    def on_exit(self, event, context):
+        actions = super().on_exit(event, context) or []
+        if context.is_shutdown:
+            return actions
+        if self.failures:
+            # The player would wait forever for a node that has failed.
+            return [*actions, Shutdown(reason=self.failures[0])]
+        if event.action is self.player and event.returncode == 0:
+            end = Shutdown(reason="the recording has ended")
+            return [*actions, TimerAction(period=GRACE_S, actions=[end])]
+        return actions
+
+    def has_failed(self):
+        return bool(self.failures)

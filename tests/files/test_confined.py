@@ -17,16 +17,15 @@ def test_only_what_really_lies_inside_is_allowed(tmp_path: Path) -> None:
     (inside / "door").symlink_to(tmp_path)
     (tmp_path / "way_in").symlink_to(inside)
     allowed = AllowedPaths(str(inside))
-    good_ones = (inside / "a", inside / "deep" / ".." / "a", tmp_path / "way_in" / "a", "a")
-    for good in good_ones:
+    for good in (inside / "a", inside / "deep" / ".." / "a", tmp_path / "way_in" / "a"):
         assert allowed.resolve(str(good)) == inside / "a"
     for bad in (
         inside / ".." / "a",
         inside / "door" / "a",
         inside / "deep" / ".." / ".." / "inside2" / "a",
         tmp_path / "inside2" / "a",
-        "../a",
-        "door/a",
+        "a",
+        "",
         "nul\0byte",
     ):
         with pytest.raises(InvalidValueError):

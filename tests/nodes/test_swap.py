@@ -279,9 +279,8 @@ class Suite:
             self.start(name)
 
     def start(self, name: str) -> None:
-        queue = {} if name == "parameter_server" else PATIENT
         self.processes[name] = self._stack.enter_context(
-            running(name, {"calibration": self._file, **queue})
+            running(name, {"calibration": self._file, **PATIENT})
         )
 
     def restart(self, name: str) -> None:

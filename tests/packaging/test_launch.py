@@ -11,14 +11,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 from ament_index_python import get_package_prefix
+
+from semcal_ros.config.yaml_text import load_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITE = ROOT / "launch" / "semcal_launch.py"
 REPLAY = ROOT / "launch" / "replay_launch.py"
 PROFILE = str(ROOT / "dds" / "fastdds_large_images.xml")
+FILES = ("recording", "2024", "2025")
 BAG = {"bag": "recording"}
 
 
@@ -43,14 +47,8 @@ class IfCondition:
 
 class ParameterValue:
     def __init__(self, value: Any, *, value_type: type) -> None:
-        self.value, self.value_type = value, value_type
-
-    def evaluate(self, context: Context) -> Any:
-        if not isinstance(self.value, LaunchConfiguration):
-            assert isinstance(self.value, self.value_type)
-            return self.value
-        text = self.value.perform(context)
-        return _as_bool(text) if self.value_type is bool else self.value_type(text)
+        assert isinstance(value, value_type)
+        self.value = value
 
 
 @dataclass
@@ -79,8 +77,8 @@ class Action:
         return id(self)
 
     @property
-    def node_package(self) -> str:
-        return self.options["package"]
+    def node_executable(self) -> str:
+        return self.options["executable"]
 
 
 ACTIONS = {
@@ -88,35 +86,54 @@ ACTIONS = {
     for name in (
         "DeclareLaunchArgument",
         "EmitEvent",
-        "IncludeLaunchDescription",
         "LaunchDescription",
         "Node",
         "OnProcessExit",
+        "OnProcessIO",
+        "OnShutdown",
         "OpaqueFunction",
-        "PythonLaunchDescriptionSource",
         "RegisterEventHandler",
         "SetEnvironmentVariable",
+        "SetLaunchConfiguration",
         "Shutdown",
         "TimerAction",
     )
 }
+WARNINGS: list[str] = []
+
+
+def get_logger(name: str) -> Any:
+    assert name == "semcal_ros"
+    return SimpleNamespace(warning=WARNINGS.append)
+
+
+def load_python_launch_file_as_module(path: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("launch_file_under_test", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 STAND_INS = {
     "launch": ("LaunchDescription",),
     "launch.actions": (
         "DeclareLaunchArgument",
         "EmitEvent",
-        "IncludeLaunchDescription",
         "OpaqueFunction",
         "RegisterEventHandler",
         "SetEnvironmentVariable",
+        "SetLaunchConfiguration",
         "Shutdown",
         "TimerAction",
     ),
     "launch.conditions": (IfCondition,),
-    "launch.event_handlers": ("OnProcessExit",),
+    "launch.event_handlers": ("OnProcessExit", "OnProcessIO", "OnShutdown"),
     "launch.events": (matches_action,),
     "launch.events.process": (ShutdownProcess,),
-    "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
+    "launch.launch_description_sources": (load_python_launch_file_as_module,),
+    "launch.logging": (get_logger,),
     "launch.substitutions": (LaunchConfiguration,),
     "launch_ros": (),
     "launch_ros.actions": ("Node",),
@@ -132,6 +149,7 @@ class Started:
     executable: str
     name: str
     namespace: str
+    fallback: dict[str, Any]
     files: list[str]
     parameters: dict[str, Any]
     ros_arguments: list[str]
@@ -148,7 +166,8 @@ class Context:
     launch_configurations: dict[str, str]
     environment: dict[str, str]
     nodes: list[Started] = field(default_factory=list)
-    on_exit: list[Action] = field(default_factory=list)
+    handlers: list[Action] = field(default_factory=list)
+    is_shutdown: bool = False
     arguments: dict[str, Action] = field(default_factory=dict)
 
     def node(self, executable: str) -> Started:
@@ -157,15 +176,6 @@ class Context:
 
 def _as_bool(text: str) -> bool:
     return {"true": True, "1": True, "false": False, "0": False}[text.lower()]
-
-
-def _describe(path: str | Path) -> Action:
-    spec = importlib.util.spec_from_file_location("launch_file_under_test", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.generate_launch_description()
 
 
 def _declare(action: Action, context: Context) -> None:
@@ -185,26 +195,23 @@ def _start(action: Action, context: Context) -> None:
     assert options.pop("output") == "screen"
     options.pop("condition", None)
     # As the defaults of the original.
-    respawn = options.pop("respawn", False)
-    if isinstance(respawn, LaunchConfiguration):
-        respawn = _as_bool(respawn.perform(context))
+    options.setdefault("respawn", False)
     options.setdefault("respawn_delay", None)
-    files, parameters = [], {}
-    for item in options.pop("parameters"):
-        if isinstance(item, str):
-            # What comes later wins: a file must not win over an argument.
-            assert not parameters
-            files.append(item)
-            continue
-        for name, value in item.items():
-            plain = value.evaluate(context) if isinstance(value, ParameterValue) else value
-            parameters[name] = plain
+    items = options.pop("parameters")
+    files = [item for item in items if isinstance(item, str)]
+    values = [
+        item if isinstance(item, str) else {name: value.value for name, value in item.items()}
+        for item in items
+    ]
+    # What comes later wins: a file must not win over an argument.
+    *fallback, parameters = [value for value in values if isinstance(value, dict)]
+    assert values == [*fallback, *files, parameters]
     started = Started(
         **options,
+        fallback=fallback[0] if fallback else {},
         files=files,
         parameters=parameters,
         environment=dict(context.environment),
-        respawn=respawn,
         action=action,
     )
     context.nodes.append(started)
@@ -221,17 +228,16 @@ def _visit(action: Action, context: Context) -> None:
     elif kind == "DeclareLaunchArgument":
         _declare(action, context)
     elif kind == "OpaqueFunction":
-        for child in action.options["function"](context):
+        for child in action.options["function"](context, *action.options.get("args", ())) or ():
             _visit(child, context)
+    elif kind == "SetLaunchConfiguration":
+        name, value = action.given
+        context.launch_configurations[name] = value
     elif kind == "SetEnvironmentVariable":
         name, value = action.given
         context.environment[name] = value
-    elif kind == "IncludeLaunchDescription":
-        for name, value in action.options["launch_arguments"]:
-            context.launch_configurations[name] = value.perform(context)
-        _visit(_describe(action.given[0].given[0]), context)
     elif kind == "RegisterEventHandler":
-        context.on_exit.append(action.given[0])
+        context.handlers.append(action.given[0])
     elif kind == "Node":
         _start(action, context)
     else:
@@ -242,8 +248,12 @@ Run = Callable[..., Context]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Launch a file with arguments, in an environment."""
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Launch a file with arguments, in an environment and a folder with some files."""
+    monkeypatch.chdir(tmp_path)
+    for file in FILES:
+        Path(file).touch()
+    WARNINGS.clear()
     for name, members in STAND_INS.items():
         module = ModuleType(name)
         for member in members:
@@ -252,10 +262,15 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
         monkeypatch.setitem(sys.modules, name, module)
 
     def launch(
-        path: Path, arguments: dict[str, str] | None = None, environment: Any = ()
+        path: Path,
+        arguments: dict[str, str] | None = None,
+        environment: Any = (),
+        context: Context | None = None,
     ) -> Context:
-        context = Context(dict(arguments or {}), dict(environment))
-        _visit(_describe(path), context)
+        context = context or Context({}, {})
+        context.launch_configurations.update(arguments or {})
+        context.environment.update(environment)
+        _visit(load_python_launch_file_as_module(str(path)).generate_launch_description(), context)
         return context
 
     return launch
@@ -271,11 +286,14 @@ class _Declared(Exception):
 def _settings(executable: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The parameters that a node declares, by name; the node itself is not started."""
     from semcal_ros.nodes.common import base
+    from semcal_ros.nodes.common.parameters import DIRECTORY
 
     found: dict[str, Any] = {}
 
     def record(_node: Any, declarations: Any) -> None:
         found.update({declaration.name: declaration for declaration in declarations})
+        if any(declaration.confined for declaration in found.values()):
+            found.setdefault(DIRECTORY.name, DIRECTORY)
         raise _Declared
 
     module = importlib.import_module(f"semcal_ros.nodes.{executable}")
@@ -293,15 +311,20 @@ EVERYTHING = {
     "config": "jsm820",
     "calibration": "2024",
     "calibration_server": "true",
+    "output": "live.yaml",
+    "directory": ".",
     "use_sim_time": "true",
     "log_level": "debug",
 }
 REPLAY_EVERYTHING = {
     **EVERYTHING,
     "bag": "2025",
+    "topics": "all",
+    "exclude": "calibration",
     "rate": "5",
     "loop": "true",
     "clock": "true",
+    "start_paused": "true",
     "wait_for_subscribers": "3",
 }
 CASES = [
@@ -373,7 +396,8 @@ def test_arguments_reach_every_node(run: Run) -> None:
 def test_a_home_folder_is_found(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     file = tmp_path / "more.yaml"
-    file.touch()
+    for name in ("more.yaml", "cal.yaml"):
+        (tmp_path / name).touch()
     given = {"calibration": "~/cal.yaml", "bag": "~/recording", "params_file": "~/more.yaml"}
     context = run(REPLAY, given)
     corrector, player = context.node("stream_corrector"), context.node("bag_player")
@@ -382,16 +406,74 @@ def test_a_home_folder_is_found(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_p
     assert corrector.files == player.files == [str(file)]
 
 
+WRONG = [
+    (SUITE, "namespace", "my-lab"),
+    (SUITE, "config", "jsm"),
+    (SUITE, "config", "missing.yaml"),
+    (SUITE, "calibration", "missing.yaml"),
+    (SUITE, "calibration_server", "ja"),
+    (SUITE, "output", "missing/live.yaml"),
+    (SUITE, "output", "."),
+    (SUITE, "directory", "missing"),
+    (SUITE, "params_file", "missing.yaml"),
+    (SUITE, "use_sim_time", "ja"),
+    (SUITE, "respawn", "ja"),
+    (SUITE, "large_images", "ja"),
+    (REPLAY, "params_file", "missing.yaml"),
+    (REPLAY, "bag", "missing"),
+    (REPLAY, "rate", "fast"),
+    (REPLAY, "rate", "0"),
+    (REPLAY, "rate", "nan"),
+    (REPLAY, "loop", "ja"),
+    (REPLAY, "clock", "ja"),
+    (REPLAY, "start_paused", "ja"),
+    (REPLAY, "wait_for_subscribers", "1.5"),
+    (REPLAY, "wait_for_subscribers", "-1"),
+]
+
+
+@pytest.mark.parametrize(("path", "name", "value"), WRONG)
+def test_a_wrong_argument_is_refused_by_name_before_the_first_node(
+    run: Run, path: Path, name: str, value: str
+) -> None:
+    """launch would leave the nodes running that have been started before."""
+    context = Context({}, {})
+    with pytest.raises(RuntimeError, match=f"^argument {name}:={value}: "):
+        run(path, {**(BAG if path == REPLAY else {}), name: value}, context=context)
+    assert context.nodes == []
+
+
 @pytest.mark.parametrize("path", [SUITE, REPLAY])
-def test_a_missing_params_file_is_refused(run: Run, path: Path) -> None:
-    with pytest.raises(RuntimeError, match=r"missing\.yaml"):
-        run(path, {**BAG, "params_file": "missing.yaml"})
+def test_every_argument_is_checked(run: Run, path: Path) -> None:
+    """Those without a choice must be in the list above, but for names of topics, which anything may be."""
+    arguments = run(path, BAG if path == REPLAY else {}).arguments
+    free = {name for name, action in arguments.items() if action.options["choices"] is None}
+    assert free - {name for _, name, _ in WRONG} == ({"topics", "exclude"} & set(arguments))
 
 
 @pytest.mark.parametrize(("name", "value"), [("mode", "both"), ("log_level", "loud")])
 def test_a_wrong_choice_is_refused(run: Run, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=name):
         run(SUITE, {name: value})
+
+
+@pytest.mark.parametrize("path", [SUITE, REPLAY])
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("calibraton", "calibration"), ("param_file", "params_file"), ("log-level", "log_level")],
+)
+def test_a_misspelt_argument_is_told(run: Run, path: Path, name: str, meant: str) -> None:
+    run(path, {**(BAG if path == REPLAY else {}), name: "x"})
+    (warning,) = WARNINGS
+    assert name in warning
+    assert f"{meant}:=x" in warning
+
+
+def test_arguments_of_a_launch_file_that_includes_this_one_are_no_mistakes(run: Run) -> None:
+    run(SUITE, {"rviz": "true", "name": "x", "camera": "y", "ros_namespace": "/lab"})
+    # The one that is nearly meant is given.
+    run(SUITE, {"calibration": "2024", "calibration_2": "x"})
+    assert WARNINGS == []
 
 
 def test_every_argument_is_described(run: Run) -> None:
@@ -414,7 +496,8 @@ def test_an_argument_left_alone_leaves_a_parameter_alone(
     context = run(REPLAY, BAG)
     for node in context.nodes:
         settings = _settings(node.executable, monkeypatch)
-        for name in {*context.arguments} & {*settings} - {"bag", "wait_for_subscribers"}:
+        own = {"bag", "topics", "wait_for_subscribers"}
+        for name in ({*context.arguments} & {*settings}) - own:
             assert name not in node.parameters
             shown = context.launch_configurations[name]
             default = settings[name].default
@@ -422,6 +505,72 @@ def test_an_argument_left_alone_leaves_a_parameter_alone(
                 assert _as_bool(shown) is default
             else:
                 assert type(default)(shown) == default
+
+
+def test_a_live_calibration_can_be_saved(run: Run, tmp_path: Path) -> None:
+    """By default beside the calibration in use, else in the working directory."""
+    server = {"calibration_server": "true"}
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "cal.yaml").touch()
+    for given, folder in [
+        ({}, tmp_path),
+        ({"calibration": "folder/cal.yaml"}, tmp_path / "folder"),
+        ({"calibration": "2024", "output": "folder/new.yaml"}, tmp_path / "folder"),
+    ]:
+        node = run(SUITE, {**server, **given}).node("calibration_server")
+        assert node.fallback == {"directory": str(folder)}
+        assert node.parameters.get("output") == given.get("output")
+        assert "directory" not in node.parameters
+    node = run(SUITE, {**server, "directory": "folder"}).node("calibration_server")
+    assert node.parameters["directory"] == "folder"
+
+
+# -- examples ------------------------------------------------------------------------------------------
+
+
+def _declared_in_xml(path: Path) -> tuple[str, dict[str, str], dict[str, str]]:
+    (include,) = (root := ElementTree.parse(path).getroot()).findall("include")
+    declared = {arg.attrib["name"]: arg.attrib["default"] for arg in root.findall("arg")}
+    passed = {arg.attrib["name"]: arg.attrib["value"] for arg in include.findall("arg")}
+    return include.attrib["file"], declared, passed
+
+
+def _declared_in_yaml(path: Path) -> tuple[str, dict[str, str], dict[str, str]]:
+    parts = load_yaml(path.read_text(encoding="utf-8"), str(path))["launch"]
+    (include,) = [part["include"] for part in parts if "include" in part]
+    arguments = [part["arg"] for part in parts if "arg" in part]
+    declared = {argument["name"]: argument["default"] for argument in arguments}
+    return include["file"], declared, {arg["name"]: arg["value"] for arg in include["arg"]}
+
+
+@pytest.mark.parametrize(
+    ("path", "read"),
+    [
+        (SUITE.with_suffix(".xml"), _declared_in_xml),
+        (SUITE.with_suffix(".yaml"), _declared_in_yaml),
+    ],
+)
+def test_the_other_launch_files_include_this_one(
+    run: Run, path: Path, read: Callable[[Path], Any]
+) -> None:
+    file, declared, passed = read(path)
+    assert file == f"$(dirname)/{SUITE.name}"
+    assert passed == {name: f"$(var {name})" for name in declared}
+    arguments = run(SUITE).arguments
+    for name, default in declared.items():
+        assert default == arguments[name].options["default_value"]
+
+
+def test_the_example_of_a_params_file_shows_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = ROOT / "config" / "semcal_parameters.yaml"
+    sections = load_yaml(path.read_text(encoding="utf-8"), str(path))
+    assert len(sections) >= 4
+    for node, section in sections.items():
+        namespace, _, executable = node.rpartition("/")
+        assert namespace == "/sem"
+        settings = _settings(executable, monkeypatch)
+        (values,) = section.values()
+        assert values == {name: settings[name].default for name in values}
 
 
 # -- the environment -----------------------------------------------------------------------------------
@@ -470,7 +619,22 @@ def test_a_replay_needs_a_recording(run: Run) -> None:
 def test_a_replay_waits_for_the_suite(run: Run) -> None:
     context = run(REPLAY, BAG)
     assert [node.executable for node in context.nodes][-1] == "bag_player"
-    assert context.node("bag_player").parameters == {"bag": "recording", "wait_for_subscribers": 1}
+    assert context.node("bag_player").parameters == {
+        "bag": "recording",
+        "topics": "inputs",
+        "wait_for": "magnification:2 image:1",
+    }
+
+
+def test_a_replay_waits_for_every_node_that_it_starts(run: Run) -> None:
+    """Frames are lost without a magnification, and before the rectifier hears the compensator."""
+    given = {**BAG, "mode": "separate", "calibration_server": "true"}
+    player = run(REPLAY, given).node("bag_player").parameters
+    awaited = dict(word.split(":") for word in player["wait_for"].split())
+    assert awaited == {"magnification": "4", "image": "3", "image_stabilized": "1", "stage": "1"}
+    player = run(REPLAY, {**given, "wait_for_subscribers": "3"}).node("bag_player").parameters
+    assert player["wait_for_subscribers"] == 3
+    assert "wait_for" not in player
 
 
 def test_the_nodes_go_by_the_clock_that_the_player_publishes(run: Run) -> None:
@@ -480,21 +644,44 @@ def test_the_nodes_go_by_the_clock_that_the_player_publishes(run: Run) -> None:
         assert node.parameters[name] is True
 
 
-def _after_exit(context: Context, action: Action, status: int) -> list[Any]:
-    """The actions that follow the exit of a process."""
+def _handle(context: Context, kind: str, event: Any) -> list[Any]:
+    """What the handlers of a kind of event answer."""
     found: list[Any] = []
-    for handler in context.on_exit:
-        if handler.options["target_action"](action):
-            event = SimpleNamespace(action=action, returncode=status, process_name="name")
-            found += handler.options["on_exit"](event, context) or []
+    for handler in [h for h in context.handlers if type(h).__name__ == kind]:
+        options = dict(handler.options)
+        target = options.pop("target_action", None)
+        ((_, answer),) = options.items()
+        if target is None or target(event.action):
+            given = (event,) if kind == "OnProcessIO" else (event, context)
+            found += answer(*given) or []
     return found
+
+
+def _after_exit(context: Context, action: Any, status: int) -> list[Any]:
+    """The actions that follow the exit of a process."""
+    event = SimpleNamespace(action=action, returncode=status, process_name="name")
+    return _handle(context, "OnProcessExit", event)
+
+
+def _after_shutdown(context: Context) -> str:
+    """The error with which launch ends; empty if it ends with status 0."""
+    context.is_shutdown = True
+    for timer in _handle(context, "OnShutdown", SimpleNamespace()):
+        # By default, launch cancels a timer at the shutdown.
+        assert timer.options["cancel_on_shutdown"] is False
+        try:
+            for action in timer.options["actions"]:
+                _visit(action, context)
+        except RuntimeError as error:
+            return str(error)
+    return ""
 
 
 def _names(actions: list[Any]) -> list[str]:
     return [type(action).__name__ for action in actions]
 
 
-def _is_started_again(context: Context, node: Started, status: int) -> bool:
+def _is_started_again(node: Started, actions: list[Any]) -> bool:
     """Whether launch does so: it waits for the delay and then looks whether the process was shut down meanwhile.
 
     Whatever the status is: launch/actions/execute_local.py of https://github.com/ros2/launch.
@@ -502,7 +689,7 @@ def _is_started_again(context: Context, node: Started, status: int) -> bool:
     if not node.respawn:
         return False
     assert node.respawn_delay, "without a delay launch does not wait for what follows the exit"
-    for action in _after_exit(context, node.action, status):
+    for action in actions:
         if type(action).__name__ == "Shutdown":
             return False
         if type(action).__name__ == "EmitEvent":
@@ -532,20 +719,18 @@ def test_a_node_that_cannot_start_ends_the_replay(run: Run, executable: str) -> 
 def test_a_node_that_dies_ends_the_replay_only_if_it_does_not_come_back(
     run: Run, status: int
 ) -> None:
-    for respawn in ("true", "false"):
+    for respawn, index in itertools.product(("true", "false"), range(3)):
         context = run(REPLAY, {**BAG, "respawn": respawn})
-        for node in context.nodes:
-            ends = "Shutdown" in _names(_after_exit(context, node.action, status))
-            again = _is_started_again(context, node, status)
-            assert ends is not again
-            assert again is (respawn == "true" and node.executable != "bag_player")
+        node = context.nodes[index]
+        actions = _after_exit(context, node.action, status)
+        again = _is_started_again(node, actions)
+        assert ("Shutdown" in _names(actions)) is not again
+        assert again is (respawn == "true" and node.executable != "bag_player")
 
 
 def test_other_ends_do_not_end_the_replay(run: Run) -> None:
     context = run(REPLAY, BAG)
     assert _names(_after_exit(context, context.node("stream_corrector").action, 0)) == ["EmitEvent"]
-    assert _after_exit(context, ACTIONS["Node"](package="another"), 1) == []
-    assert _after_exit(context, SimpleNamespace(), 1) == []
 
 
 # -- nodes that die ------------------------------------------------------------------------------------
@@ -557,17 +742,20 @@ def test_a_node_that_dies_is_started_again_after_a_delay(run: Run, mode: str) ->
     for node in context.nodes:
         assert 0.0 < node.respawn_delay <= 2.0
         # kill -9, a crash, an exception.
-        assert all(_is_started_again(context, node, status) for status in (-9, -11, 1))
-        assert _after_exit(context, node.action, -9) == []
+        for status in (-9, -11, 1):
+            actions = _after_exit(context, node.action, status)
+            assert actions == []
+            assert _is_started_again(node, actions)
 
 
 @pytest.mark.parametrize("path", [SUITE, REPLAY])
 def test_a_node_that_ended_by_itself_is_not_started_again(run: Run, path: Path) -> None:
     """Status 2: with what it was given it will never start. Status 0: it was asked to end."""
-    context = run(path, {**BAG, "calibration_server": "true"})
-    for node in context.nodes:
-        assert not _is_started_again(context, node, 2)
-        assert not _is_started_again(context, node, 0)
+    given = {"calibration_server": "true", **(BAG if path == REPLAY else {})}
+    for status in (2, 0):
+        context = run(path, given)
+        for node in context.nodes:
+            assert not _is_started_again(node, _after_exit(context, node.action, status))
 
 
 def test_only_the_node_that_ended_stays_away(run: Run) -> None:
@@ -589,3 +777,45 @@ def test_processes_of_other_packages_are_left_alone(run: Run) -> None:
     for status in (0, 1, 2, -9):
         assert _after_exit(context, ACTIONS["Node"](package="another"), status) == []
         assert _after_exit(context, SimpleNamespace(), status) == []
+
+
+# -- the status of the launch itself -------------------------------------------------------------------
+
+
+def _say(context: Context, node: Started, text: bytes) -> None:
+    _handle(context, "OnProcessIO", SimpleNamespace(action=node.action, text=text))
+
+
+def test_a_launch_in_which_every_node_has_failed_fails(run: Run) -> None:
+    context = run(SUITE)
+    for node in context.nodes:
+        _say(context, node, b"first\ncal.yaml: not valid YAML; calibrate again\n\n")
+        _after_exit(context, node.action, 2)
+    # Which node, its status, and its own reason, which says what to do.
+    expected = "name ended with status 2: cal.yaml: not valid YAML; calibrate again"
+    assert _after_shutdown(context) == "; ".join([expected] * 2)
+    assert _after_shutdown(context) == "", "it is said once"
+
+
+def test_a_launch_of_which_a_node_was_left_ends_well(run: Run) -> None:
+    """Interrupted by its user, it ends with 0, though one node could not start."""
+    context = run(SUITE)
+    _after_exit(context, context.nodes[0].action, 2)
+    assert _after_shutdown(context) == ""
+
+
+@pytest.mark.parametrize("path", [SUITE, REPLAY])
+def test_an_interrupted_launch_ends_well(run: Run, path: Path) -> None:
+    """Even where a node was interrupted while it started, and ended with the signal."""
+    context = run(path, BAG if path == REPLAY else {})
+    context.is_shutdown = True
+    for node in context.nodes:
+        assert "Shutdown" not in _names(_after_exit(context, node.action, -2))
+    assert _after_shutdown(context) == ""
+
+
+def test_a_replay_of_which_one_node_has_failed_fails(run: Run) -> None:
+    for index, status in itertools.product(range(3), (0, 2)):
+        context = run(REPLAY, BAG)
+        _after_exit(context, context.nodes[index].action, status)
+        assert _after_shutdown(context) == ("name ended with status 2" if status else "")

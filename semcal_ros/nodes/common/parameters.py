@@ -26,7 +26,6 @@ __all__ = [
     "DIAGNOSTICS_PERIOD",
     "DIRECTORY",
     "INTERPOLATION",
-    "REPLAYED_CALIBRATION",
     "ParameterDeclaration",
     "Parameters",
 ]
@@ -140,13 +139,6 @@ CALIBRATION = ParameterDeclaration(
     "Calibration file; empty to wait for one on the topic `calibration`.",
     confined=True,
 )
-REPLAYED_CALIBRATION = ParameterDeclaration(
-    "replayed_calibration",
-    "ignore",
-    "What to do with a calibration that comes while a recording is played on the topic `calibration`, where another one"
-    " is in force already.",
-    choices=("ignore", "take"),
-)
 INTERPOLATION = ParameterDeclaration(
     "interpolation",
     "linear",
@@ -200,10 +192,7 @@ class Parameters:
         return self._allowed.resolve(path)
 
     def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
-        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after.
-
-        A parameter that is set to the value that it has does not change, unless it names a file.
-        """
+        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after."""
         self._applies[name] = apply
         if check is not None:
             self._checks[name] = check
@@ -228,10 +217,6 @@ class Parameters:
             declaration = self._declared.get(parameter.name)
             if declaration is None:
                 continue
-            before = self._values[parameter.name]
             self._values[parameter.name] = declaration.convert(parameter.value)
-            # What a file holds may have changed; nothing else has.
-            if self._values[parameter.name] == before and not declaration.confined:
-                continue
             if parameter.name in self._applies:
                 self._applies[parameter.name](self._values[parameter.name])
