@@ -20,7 +20,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,6 +53,10 @@ class Plan:
     relay: bool = False
     profile: bool = True
     tracking: str = "auto"
+    #: Of the image that the subscriber takes: as it is, or with ``compressed``.
+    compressed: bool = False
+    #: How far the clock of the publisher is ahead, s.
+    clock_ahead_s: float = 0.0
 
 
 # -- the processes ---------------------------------------------------------------------------------
@@ -100,7 +104,8 @@ def publish(plan: Plan) -> None:
         # A microscope that was held up does not send what it missed in a burst.
         start += max(0.0, late_s[-1] - 1.0 / plan.rate_hz)
         message = messages[k % len(messages)]
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+        stamp_ns = time.time_ns() + round(1e9 * plan.clock_ahead_s)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         message.header.frame_id = str(k)
         publisher.publish(message)
     print(
@@ -120,7 +125,7 @@ def subscribe(plan: Plan) -> None:
     """Takes image_rect until a signal; prints number and latency of all frames."""
     import rclpy
     from rclpy.executors import ExternalShutdownException
-    from sensor_msgs.msg import Image
+    from sensor_msgs.msg import CompressedImage, Image
 
     rclpy.init()
     node = rclpy.create_node("sink", namespace="/sem")
@@ -129,9 +134,12 @@ def subscribe(plan: Plan) -> None:
     def receive(message: Any) -> None:
         stamp = message.header.stamp
         late_s = 1e-9 * (time.time_ns() - stamp.sec * 10**9 - stamp.nanosec)
-        seen.append((int(message.header.frame_id), late_s))
+        seen.append((int(message.header.frame_id), late_s + plan.clock_ahead_s))
 
-    node.create_subscription(Image, "image_rect", receive, quality(10))
+    if plan.compressed:
+        node.create_subscription(CompressedImage, "image_rect/compressed", receive, quality(10))
+    else:
+        node.create_subscription(Image, "image_rect", receive, quality(10))
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
     print(json.dumps(seen))
@@ -199,7 +207,14 @@ class Watch:
 
 
 @contextmanager
-def process(role: str, plan: Plan, folder: Path, environment: dict[str, str]) -> Iterator[Any]:
+def process(
+    role: str,
+    plan: Plan,
+    folder: Path,
+    environment: dict[str, str],
+    place: Callable[[str, list[str]], list[str]] = lambda _role, command: command,
+) -> Iterator[Any]:
+    """A process of a role, which ``place`` may put on a machine of its own."""
     output = folder / f"{role}.out"
     if role == "node" and not plan.relay:
         command = [sys.executable, "-m", "semcal_ros.nodes.stream_corrector", "--ros-args"]
@@ -212,7 +227,7 @@ def process(role: str, plan: Plan, folder: Path, environment: dict[str, str]) ->
         command += ["--role", role, json.dumps(asdict(plan))]
     with open(output, "wb") as stream, open(folder / f"{role}.err", "wb") as errors:
         made = subprocess.Popen(
-            command, cwd=REPOSITORY, stdout=stream, stderr=errors, env=environment
+            place(role, command), cwd=REPOSITORY, stdout=stream, stderr=errors, env=environment
         )
     try:
         yield made
@@ -225,10 +240,11 @@ def process(role: str, plan: Plan, folder: Path, environment: dict[str, str]) ->
             made.wait()
 
 
-def diagnostics(environment: dict[str, str], stop: threading.Event) -> dict[str, str]:
-    """What the corrector says of itself, in the end."""
+def watch(plan: Plan) -> None:
+    """Prints what the corrector said of itself, in the end."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.executors import ExternalShutdownException
 
     found: dict[str, str] = {}
     rclpy.init()
@@ -236,15 +252,13 @@ def diagnostics(environment: dict[str, str], stop: threading.Event) -> dict[str,
 
     def keep(array: Any) -> None:
         for status in array.status:
-            if "stream_corrector" in status.name:
+            if status.name.startswith("/sem/stream_corrector:"):
                 found.update({value.key: value.value for value in status.values})
 
     node.create_subscription(DiagnosticArray, "/diagnostics", keep, 10)
-    while not stop.is_set():
-        rclpy.spin_once(node, timeout_sec=0.2)
-    node.destroy_node()
-    rclpy.shutdown()
-    return found
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
+    print(json.dumps(found))
 
 
 def measured(plan: Plan) -> dict[str, Any]:
@@ -255,30 +269,42 @@ def measured(plan: Plan) -> dict[str, Any]:
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     if plan.profile:
         environment |= dict.fromkeys(DDS_VARIABLES, str(PROFILE)) | MALLOC
-    os.environ.update(environment)
+    return run_processes(plan, environment)
+
+
+def run_processes(
+    plan: Plan,
+    environment: dict[str, str],
+    place: Callable[[str, list[str]], list[str]] = lambda _role, command: command,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Run the processes, ``place`` telling where each runs, and gather what they say."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         calibration().save(folder / "cal.yaml")
         text = Config(0.8 / plan.rate_hz).text
         (folder / "config.yaml").write_text(text, encoding="utf-8")
-        stop = threading.Event()
-        said: dict[str, str] = {}
-        listener = threading.Thread(target=lambda: said.update(diagnostics(environment, stop)))
-        listener.start()
         with (
-            process("sink", plan, folder, environment),
-            process("node", plan, folder, environment) as node,
+            process("watch", plan, folder, environment, place),
+            process("sink", plan, folder, environment, place),
+            process("node", plan, folder, environment, place) as node,
         ):
-            watch = Watch(node.pid)
-            with process("source", plan, folder, environment) as source:
-                source.wait(plan.seconds + WARM_UP_S + 2 * TIMEOUT_S)
-            watch.close()
+            watched = Watch(node.pid)
+            with process("source", plan, folder, environment, place) as source:
+                meanwhile()
+                try:
+                    source.wait(plan.seconds + WARM_UP_S + 2 * TIMEOUT_S)
+                except subprocess.TimeoutExpired as error:
+                    raise OSError("the publisher is held up") from error
+            watched.close()
             time.sleep(1.5)
-        stop.set()
-        listener.join()
-        sent = json.loads((folder / "source.out").read_text())
-        seen = json.loads((folder / "sink.out").read_text() or "[]")
-    return result(plan, sent, seen, watch, said)
+        said, sent, seen = (
+            json.loads((folder / f"{role}.out").read_text() or "[]")
+            for role in ("watch", "source", "sink")
+        )
+        if not sent:
+            raise OSError((folder / "source.err").read_text().strip().splitlines()[-1])
+    return result(plan, sent, seen, watched, dict(said))
 
 
 def result(
@@ -293,8 +319,10 @@ def result(
     got = len(set(numbers))
     return {
         **asdict(plan),
+        "sent": sent["sent"],
         "in": sent["sent"] - first,
         "out": got,
+        "last": max(numbers, default=None),
         "lost": sent["sent"] - first - got,
         "late_source_ms": sent["late_ms"],
         "latest_source_ms": sent["latest_ms"],
@@ -332,7 +360,7 @@ def main() -> None:
     parser.add_argument("--role", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role:
-        roles = {"source": publish, "sink": subscribe, "node": relay}
+        roles = {"source": publish, "sink": subscribe, "node": relay, "watch": watch}
         roles[options.role[0]](Plan(**json.loads(options.role[1])))
         return
     if not options.size or not options.rate:

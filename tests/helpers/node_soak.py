@@ -15,6 +15,7 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
+from benchmarks.network.namespaces import Network
 from tests.helpers.node_scenes import SIZE, image_message, magnification_message, texture
 from tests.helpers.ros_process import LATCHED, RELIABLE, Peer
 from tests.helpers.stream_bench import (
@@ -31,7 +32,12 @@ from tests.helpers.stream_bench import (
     restartable,
 )
 
-__all__ = ["Soak"]
+__all__ = ["MACHINES", "Soak"]
+
+# The microscope's, on which the test runs, and one for the nodes of each namespace.
+MACHINES = ("microscope", "sem", "lab")
+# Long enough for a stream to stand still, short of the 20 s after which Fast DDS forgets a participant.
+UNPLUGGED_S = 3.0
 
 FRAME_PERIOD_S = 0.1
 FAULT_PERIOD_S = 1.0
@@ -56,11 +62,15 @@ class Soak:
 
     The rectifier and the stream corrector work on the test's own frames, whose truth is known; the compensator and the
     calibration server on those of the virtual SEM.
+
+    On a network the test itself runs on the machine ``microscope``; the nodes of each namespace have a machine of that
+    name, and their cables are pulled out, too.
     """
 
     peer: Peer
     folder: Path
     seed: int
+    network: Network | None = None
     restarts: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     history: list[str] = field(default_factory=list)
@@ -93,7 +103,9 @@ class Soak:
         CALIBRATION.save(self.folder / "cal.yaml")
         with ExitStack() as stack:
             self._nodes = {
-                name: stack.enter_context(restartable(executable, parameters, *arguments))
+                name: stack.enter_context(
+                    restartable(executable, parameters, *arguments, place=self._place(name))
+                )
                 for name, (executable, parameters, arguments) in self._plan().items()
             }
             self._set_magnification(self._magnification)
@@ -127,6 +139,12 @@ class Soak:
             "/lab/drift_compensator": ("drift_compensator", {}, lab),
             "/lab/calibration_server": ("calibration_server", {"config": "virtual_sem"}, lab),
         }
+
+    def _place(self, name: str) -> Callable[[list[str]], list[str]] | None:
+        network = self.network
+        if network is None:
+            return None
+        return lambda command: network.command(name.split("/")[1], command)
 
     # -- the stream ------------------------------------------------------------------------------------
 
@@ -165,7 +183,17 @@ class Soak:
             ("knob", self._turn_knob),
             ("clock back", self._clock_back),
         ]
+        if self.network is not None:
+            others += [
+                (f"cable of {name}", lambda n=name: self._unplug(n)) for name in MACHINES[1:]
+            ]
         return kills + others
+
+    def _unplug(self, name: str) -> None:
+        assert self.network is not None
+        self.network.plug(name, connected=False)
+        self._stream(UNPLUGGED_S)
+        self.network.plug(name, connected=True)
 
     def _kill(self, name: str) -> None:
         node: Restartable = self._nodes[name]

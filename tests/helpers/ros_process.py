@@ -51,7 +51,8 @@ _TEMPLATE = Template()
 class NodeProcess:
     """One executable; ``output`` is what it wrote so far.
 
-    It is a copy of a process that has done the imports already. With ``cold`` it is started as a user starts it.
+    It is a copy of a process that has done the imports already. With ``cold`` it is started as a user starts it, by the
+    command that ``place`` makes of it.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class NodeProcess:
         arguments: tuple[str, ...] = (),
         *,
         cold: bool = False,
+        place: Callable[[list[str]], list[str]] | None = None,
     ) -> None:
         self.name = name
         command = ["--ros-args"]
@@ -74,9 +76,10 @@ class NodeProcess:
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
         self._log = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 - lives as long as the process
         self.process: subprocess.Popen[bytes] | Copy
-        if cold:
+        if cold or place is not None:
+            started = [sys.executable, "-m", f"semcal_ros.nodes.{name}", *command]
             self.process = subprocess.Popen(
-                [sys.executable, "-m", f"semcal_ros.nodes.{name}", *command],
+                started if place is None else place(started),
                 stdout=self._log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,

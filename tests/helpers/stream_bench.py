@@ -107,10 +107,15 @@ class Restartable:
     """An executable that can be killed and started again with what it was given the first time."""
 
     def __init__(
-        self, name: str, parameters: Mapping[str, Any] | None = None, arguments: Sequence[str] = ()
+        self,
+        name: str,
+        parameters: Mapping[str, Any] | None = None,
+        arguments: Sequence[str] = (),
+        place: Callable[[list[str]], list[str]] | None = None,
     ) -> None:
         self._given = name, dict(parameters or {}), tuple(arguments)
-        self.process = NodeProcess(*self._given)
+        self._place = place
+        self.start_again()
 
     @property
     def output(self) -> str:
@@ -130,15 +135,18 @@ class Restartable:
         self.process.close()
 
     def start_again(self) -> None:
-        self.process = NodeProcess(*self._given)
+        self.process = NodeProcess(*self._given, place=self._place)
 
 
 @contextmanager
 def restartable(
-    name: str, parameters: Mapping[str, Any] | None = None, *arguments: str
+    name: str,
+    parameters: Mapping[str, Any] | None = None,
+    *arguments: str,
+    place: Callable[[list[str]], list[str]] | None = None,
 ) -> Iterator[Restartable]:
     """An executable to be killed; it must be up again, and in order, at the end."""
-    made = Restartable(name, parameters, arguments)
+    made = Restartable(name, parameters, arguments, place)
     try:
         yield made
         assert made.alive(), made.output
