@@ -14,6 +14,7 @@ drift        registration beside phase correlation, ECC, scikit-image, imreg_dft
              where they are installed, and the Cramer-Rao bound; the time of the tracker, and what
              it leaves of a drift inside the frames
 rectify      rectification beside a bare cv2.remap; its map beside the exact inverse
+ball         what makes a reconstructed ball too small, one cause at a time
 live         one frame through core and node, and the stream over DDS, beside a bare remap and copy
 ===========  =======================================================================================
 
@@ -48,6 +49,7 @@ PARTS = {
     "coverage": "benchmarks.calibration.coverage",
     "drift": "benchmarks.drift",
     "rectify": "benchmarks.rectification",
+    "ball": "benchmarks.ball",
     "live": "benchmarks.live",
 }
 

@@ -1,1 +1,1 @@
-"""What makes a reconstructed ball too small, and whether its interval holds the truth."""
+"""What makes a reconstructed ball too small."""

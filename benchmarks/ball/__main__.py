@@ -2,7 +2,7 @@
 
 Poses, points and normals are the true ones; patches are measured in twelve frames of half a turn to and fro. The
 figure is the part of the movement that the measured positions lack: the ball comes out smaller by
-as much. ``python -m benchmarks.ball.coverage`` reconstructs whole recordings.
+as much. ``python -m examples.nano_ball --only-looks --seeds 60`` reconstructs whole recordings.
 """
 
 from __future__ import annotations

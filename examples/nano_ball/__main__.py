@@ -5,6 +5,7 @@ calibrated, the ball is reconstructed with that calibration and compared with th
 seen.
 
     .venv/bin/python -m examples.nano_ball            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
+    .venv/bin/python -m examples.nano_ball --only-looks --seeds 60   # balls of 60 other looks, half an hour
     .venv/bin/python -m examples.nano_ball --quick    # 40 frames of two thirds of a turn to and fro
 """
 
@@ -26,6 +27,7 @@ import trimesh
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
+from examples.nano_ball.looks import compare_looks
 from semcal_ros import Calibration
 from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe
 from semcal_ros.cli import main as semcal
@@ -162,6 +164,12 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
 # -- all of it ------------------------------------------------------------------------------------
 
 
+def report(path: Path, summary: dict[str, Any]) -> None:
+    path.write_text(json.dumps(summary, indent=1))
+    for name, value in summary.items():
+        print(f"{name:28} {value}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--frames", type=int, help="of the ball (default 2000)")
@@ -171,12 +179,21 @@ def main() -> None:
         help="40 frames of a simpler movement, a smaller calibration",
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--seeds", type=int, help="number of balls of other looks besides (default 5; quick: none)"
+    )
+    parser.add_argument("--only-looks", action="store_true", help="only the balls of other looks")
     parser.add_argument("--output", type=Path, default=Path("nano_ball_output"))
     parser.add_argument("--images", type=Path, help="folder for the figures (default: the output)")
     given = parser.parse_args()
     frames = given.frames or (40 if given.quick else 2000)
     out, images = given.output, given.images or given.output
     out.mkdir(parents=True, exist_ok=True)
+    seeds = given.seeds if given.seeds is not None else (0 if given.quick else 5)
+    looks = compare_looks(seeds) if seeds else {}
+    if given.only_looks:
+        report(out / "looks.json", looks)
+        return
     config = out / "strips.yaml"
     config.write_text(CONFIG)
 
@@ -209,10 +226,7 @@ def main() -> None:
     # 4. Compare with the truth.
     truth = json.loads((out / "ball" / "truth.json").read_text())
     errors = compared(out / "cloud.ply", out / "ball.ply", truth, result)
-    summary = {"seconds": seconds, **result, **errors}
-    (out / "summary.json").write_text(json.dumps(summary, indent=1))
-    for name, value in summary.items():
-        print(f"{name:24} {value}")
+    report(out / "summary.json", {"seconds": seconds, **result, **errors, **looks})
 
     # 5. Figures.
     model = Calibration.load(out / "cal.yaml")

@@ -36,7 +36,7 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["Reconstruction", "reconstruct"]
+__all__ = ["Reconstruction", "describe_departure", "reconstruct"]
 
 # A surface that is seen from outside bulges towards the gun nearly everywhere; its mirror image
 # nearly nowhere. Below this share the choice between the two is worth a warning.
@@ -199,7 +199,7 @@ def reconstruct(
     if outside:
         notes.append(f"{outside} frames are outside the calibrated range")
     if not ball.roundness.is_ball:
-        notes.append(_describe_departure(structure, ball))
+        notes.append(describe_departure(structure, ball))
     notes += _list_doubts(structure, microscope.scan is not None)
     return Reconstruction(structure, ball, tracker.frames, tuple(notes))
 
@@ -228,7 +228,8 @@ def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyfr
     return [keyframes[int(k)] for k in chosen]
 
 
-def _describe_departure(structure: Structure, ball: Ball) -> str:
+def describe_departure(structure: Structure, ball: Ball) -> str:
+    """Say how a body departs from a ball: what, how high, where."""
     found = ball.roundness
     x, y, z = found.towards
     frame = int(structure.frames[structure.adjustment.reference])

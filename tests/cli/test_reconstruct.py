@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 
-from semcal_ros.applications.reconstruction import SurfaceMesh
+from semcal_ros.applications.reconstruction import Roundness, SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.files.meshes import encode_mesh, save_cloud, save_mesh
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.drift import drift_preset
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
+from semcal_ros.workflows.reconstruct import describe_departure
 from tests.helpers.made_once import folder_once
 from tests.helpers.semcal_runs import run
 
@@ -59,6 +62,12 @@ def test_the_ball_comes_out(folder, capsys):
     low, high = result["diameter_interval_m"]
     assert low < 900e-9 < high
     assert high - low < 0.06 * 900e-9
+    assert result["is_ball"]
+    # On a true ball, the most significant departure is what noise leaves: of many windows the largest.
+    departure = result["departure"]
+    assert abs(departure["height_m"]) < 5.0 * departure["height_sigma_m"]
+    assert np.linalg.norm(departure["towards"]) == pytest.approx(1.0)
+    assert not any("not a ball" in note for note in result["notes"])
     assert result["convexity"] > 0.8
     assert not result["watertight"]
     assert 0.1 < result["coverage"] < 0.6
@@ -90,6 +99,20 @@ def test_a_specimen_that_does_not_turn_is_refused(folder, capsys):
     assert run("reconstruct", folder / "grid", *options) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
     assert not (folder / "flat.ply").exists()
+
+
+def test_a_departure_is_told_with_place_and_height():
+    structure = SimpleNamespace(frames=np.array([3, 17]), adjustment=SimpleNamespace(reference=1))
+    towards = np.array([0.0, 0.5, -np.sqrt(0.75)])
+    found = Roundness(False, 2e-9, "bump", 45e-9, 2e-9, towards, 300)
+    text = describe_departure(structure, SimpleNamespace(roundness=found))
+    assert text.startswith("this is not a ball: a bump of 45.0 +- 2.0 nm lies 30 deg from")
+    assert "towards 90 deg" in text
+    assert "frame 17" in text
+    dent = replace(found, height_m=-45e-9)
+    assert "a dent of 45.0" in describe_departure(structure, SimpleNamespace(roundness=dent))
+    other = replace(found, kind="ellipsoid")
+    assert "ellipsoid by 45.0" in describe_departure(structure, SimpleNamespace(roundness=other))
 
 
 def tetrahedron():

@@ -416,7 +416,7 @@ def draw_ball_plan(
         "least_cosine": float(rng.uniform(0.05, 0.25)),
         "detector_side": (float(side * np.cos(azimuth)), float(side * np.sin(azimuth))),
         "charging": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
-        "substrate_contrast": float(rng.choice([0.0, rng.uniform(0.1, 0.5)])),
+        "substrate_contrast": float(rng.choice([0.0, rng.uniform(0.1, 0.25)])),
         "tip_length_m": float(rng.choice([0.0, 5e-6])),
         "tip_radius_m": float(rng.uniform(50e-9, 120e-9)),
     } | given
@@ -433,7 +433,7 @@ def draw_ball_plan(
         rolls=1.0,
         yaws=float(rng.choice([1.0, 2.0])),
         travel_m=(60e-9, 50e-9, 400e-9),
-        centre_m=(0.0, 0.0, float(rng.uniform(-8e-6, 8e-6))),
+        centre_m=(0.0, 0.0, float(rng.normal(0.0, 10e-6))),
         mount_rad=(float(mount[0]), float(mount[1]), float(mount[2])),
         wobble_rad=math.radians(rng.uniform(0.0, 6.0)),
         off_centre_m=(0.0, float(off[0]), float(off[1])),
