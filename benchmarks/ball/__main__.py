@@ -151,18 +151,18 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[], Any]]] = {
     "points within 35 deg of the beam": ({"slopes_deg": (0.0, 35.0)}, nullcontext),
     "points beyond 35 deg": ({"slopes_deg": (35.0, 58.0)}, nullcontext),
     "calibration 0.1 % too large": ({"scale": 1.001}, nullcontext),
-    "both, without a limb": ({"slope_power": 0.0}, both),
     "both, grains of 60 nm": ({"grain_m": 60e-9}, both),
-    "grains of 18 nm": ({"grain_m": 18e-9}, nullcontext),
     "grains of 60 nm": ({"grain_m": 60e-9}, nullcontext),
+    "both, without a limb": ({"slope_power": 0.0}, both),
     "no limb": ({"slope_power": 0.0}, nullcontext),
+    "axis along y": ({"mount_rad": (0.0, 0.0, np.pi / 2.0)}, nullcontext),
     "strong limb": ({"slope_power": 1.3, "least_cosine": 0.04}, nullcontext),
+    "60 electrons (300)": ({"electrons": 60.0}, nullcontext),
+    "grains of 18 nm": ({"grain_m": 18e-9}, nullcontext),
+    "11 nm per px (6.5)": ({"pixel_m": 11e-9, "grain_m": 45e-9}, nullcontext),
+    "axis tilted by 25 deg": ({"mount_rad": (0.0, 0.44, 0.8)}, nullcontext),
     "detector on one side": ({"detector_side": (0.3, 0.15)}, nullcontext),
     "charging": ({"charging": 0.3}, nullcontext),
-    "axis along y": ({"mount_rad": (0.0, 0.0, np.pi / 2.0)}, nullcontext),
-    "axis tilted by 25 deg": ({"mount_rad": (0.0, 0.44, 0.8)}, nullcontext),
-    "11 nm per px (6.5)": ({"pixel_m": 11e-9, "grain_m": 45e-9}, nullcontext),
-    "60 electrons (300)": ({"electrons": 60.0}, nullcontext),
 }
 
 
@@ -173,6 +173,7 @@ def main() -> None:
         with changed():
             values = np.array([missing_percent(seed, **given) for seed in range(seeds)])
         error = float(values.std(ddof=1) / np.sqrt(seeds))
+        print(f"{name}: {values.mean():+.3f} +- {error:.3f} %", flush=True)
         rows.append(
             [name, float(values.mean()), error, float(np.median(values)), float(values.min())]
         )
