@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.table import quick_from_command_line, show
 from semcal_ros.applications.reconstruction import TrackKeyframe, patches
-from semcal_ros.applications.reconstruction.appearance import compute_log_grey
+from semcal_ros.applications.reconstruction.appearance import compute_log_grey, prepare_appearance
 from semcal_ros.applications.reconstruction.patches import PatchSettings, PosedSurface
 from semcal_ros.applications.reconstruction.shading import Shading
 from semcal_ros.synthetic import Detector
@@ -64,6 +64,21 @@ def smoothed_in_the_image() -> Iterator[None]:
     with (
         mock.patch(f"{__name__}.compute_log_grey", log_grey),
         mock.patch.object(patches, "_smooth_patches", unchanged),
+    ):
+        yield
+
+
+@contextmanager
+def normalised_in_the_image() -> Iterator[None]:
+    """As it was: the local mean and contrast of the image divided out instead of the shading."""
+
+    def texture(image: Any) -> Any:
+        return prepare_appearance(image, smoothing_px=SMOOTHING_PX).texture
+
+    with (
+        smoothed_in_the_image(),
+        mock.patch(f"{__name__}.compute_log_grey", texture),
+        shading_left_in(),
     ):
         yield
 
@@ -143,6 +158,9 @@ def missing_percent(
 
 CASES: dict[str, tuple[dict[str, Any], Callable[[], Any]]] = {
     "as it is": ({}, nullcontext),
+    "local mean and contrast divided out": ({}, normalised_in_the_image),
+    "the same within 35 deg of the beam": ({"slopes_deg": (0.0, 35.0)}, normalised_in_the_image),
+    "the same beyond 35 deg": ({"slopes_deg": (35.0, 58.0)}, normalised_in_the_image),
     "shading left in": ({}, shading_left_in),
     "smoothed in the image": ({}, smoothed_in_the_image),
     "both of these": ({}, both),
@@ -152,6 +170,7 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[], Any]]] = {
     "points beyond 35 deg": ({"slopes_deg": (35.0, 58.0)}, nullcontext),
     "calibration 0.1 % too large": ({"scale": 1.001}, nullcontext),
     "both, grains of 60 nm": ({"grain_m": 60e-9}, both),
+    "local mean divided out, 60 nm": ({"grain_m": 60e-9}, normalised_in_the_image),
     "grains of 60 nm": ({"grain_m": 60e-9}, nullcontext),
     "both, without a limb": ({"slope_power": 0.0}, both),
     "no limb": ({"slope_power": 0.0}, nullcontext),
