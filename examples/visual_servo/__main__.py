@@ -180,6 +180,12 @@ def main() -> int:
     parser.add_argument(
         "--replay", action="store_true", help="the recording then replayed to the nodes"
     )
+    parser.add_argument(
+        "--plants",
+        type=int,
+        metavar="RUNS",
+        help="stages and pictures that are not as assumed, so many runs of each",
+    )
     parser.add_argument("--rate", type=float, default=1.0, help="of the replay")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="jsm820")
     parser.add_argument("--drift", choices=tuple(DRIFTS), default="slow")
@@ -190,8 +196,15 @@ def main() -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     scope = preset(options.preset)
-    if options.quick and not options.live:
+    if (options.quick or options.plants) and not options.live:
         scope = scope.with_image_size(QUICK_SIZE, QUICK_SIZE)
+    if options.plants:
+        from examples.visual_servo.plants import show_plants, try_plants
+
+        # With the camera as it is, so that what is seen is the stage's and the picture's doing.
+        case = Case("true camera", scope.camera_at, corrected=True)
+        show_plants(try_plants(scope, case, options.plants))
+        return 0
     continuous, discrete = calibrations(scope, options.seed + 1, quick=options.quick)
     print(f"calibrated {options.preset} ({time.monotonic() - began:.0f} s)", flush=True)
     continuous.save(options.output / "cal.yaml")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import LiveScene, Pose, VirtualMicroscope, drift_preset
+from semcal_ros.synthetic.actuator import ActuatorFaults, StageActuator
 
 # Between the end of a frame and the moment from which the stage obeys: transport and work.
 LATENCY_S = 0.1
@@ -47,6 +48,11 @@ class Task:
     drift: str = "slow"
     seed: int = 0
     settings: ServoSettings = field(default_factory=ServoSettings)
+    stage: ActuatorFaults = field(default_factory=ActuatorFaults)
+    #: What the detector makes of an image: a body in front of the target, a reversed contrast.
+    seen: Callable[[np.ndarray], np.ndarray] = lambda image: image
+    #: Largest fraction of the interval by which a frame is late.
+    late: float = 0.0
 
 
 @dataclass
@@ -106,28 +112,37 @@ def servo_run(task: Task, case: Case) -> Run:
         seed=task.seed,
     )
     servo, corrector, target = Servo(task.goal, task.settings), Corrector(), NestedTarget()
+    stage, rng = StageActuator(task.stage), np.random.default_rng(task.seed)
     period_s = scope.timing.acquisition_time_s + LATENCY_S
-    start_s = 0.0
+
+    def interval() -> float:
+        return period_s * (1.0 + task.late * float(rng.random()))
+
+    start_s, interval_s = 0.0, interval()
     for g, frames in task.schedule:
         scene.set_magnification(g, start_s)
         for _ in range(frames):
             frame = scene.frame(start_s)
+            frame = replace(frame, image=task.seen(frame.image))
             camera, picture, shift_m = case.camera_at(g), frame.image, np.zeros(2)
             if case.corrected:
                 picture, shift_m = corrector.corrected(picture, start_s, camera, scope.timing)
             view = find_target(picture, target)
             if case.corrected and not view.accepted:
                 corrector.reset()
-            command_s = start_s + period_s
+            command_s = start_s + interval_s
             step = servo.update(
                 view,
                 PlaneCamera.from_camera(camera),
                 start_s + scope.timing.centre_offset_s,
-                interval_s=period_s,
+                interval_s=interval_s,
                 now_s=command_s,
                 shift_m=shift_m,
             )
-            scene.set_twist(command_s, (step.twist[0], step.twist[1]), step.twist[2])
+            interval_s = interval()
+            x, y, turn = (float(v) for v in step.twist)
+            for time_s, velocity in stage.obey((x, y), command_s, command_s + interval_s):
+                scene.set_twist(time_s, velocity, turn)
             servo.record_command(command_s, step.twist)
             _record(run, task, g, frame, step)
             start_s = command_s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,7 +10,10 @@ from semcal_ros.bridge.fields import assign_floats
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["fill_camera_info"]
+if TYPE_CHECKING:  # its fit needs scipy.optimize, which takes long to import
+    from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
+
+__all__ = ["fill_camera_info", "fill_raw_camera_info"]
 
 
 def fill_camera_info(
@@ -56,3 +59,28 @@ def fill_camera_info(
     assign_floats(message, "k", k)
     assign_floats(message, "r", r)
     assign_floats(message, "p", np.hstack([k, np.zeros((3, 1))]))
+
+
+def fill_raw_camera_info(
+    message: Any, camera: PlumbBobCamera | None, header: HeaderMessage, width: int, height: int
+) -> None:
+    """Describe a raw image as image_pipeline does: K, D and R of the raw image, P of the rectified one.
+
+    Parameters
+    ----------
+    message
+        A sensor_msgs/msg/CameraInfo.
+    camera
+        The model fitted to the camera, or None: K, R and P are zero then, which says "uncalibrated".
+    header
+        Header of the image, copied verbatim.
+    width, height
+        Size of the raw image with its data bar, px.
+    """
+    copy_header(message.header, header)
+    message.width, message.height = int(width), int(height)
+    message.distortion_model = "plumb_bob"
+    assign_floats(message, "d", np.zeros(5) if camera is None else camera.D)
+    assign_floats(message, "k", np.zeros((3, 3)) if camera is None else camera.K)
+    assign_floats(message, "r", np.zeros((3, 3)) if camera is None else camera.R)
+    assign_floats(message, "p", np.zeros((3, 4)) if camera is None else camera.P)

@@ -11,9 +11,9 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["AllowedPaths"]
 
 
-def _resolve(path: str) -> Path:
+def _resolve(path: str, directory: str = "") -> Path:
     try:
-        return Path(os.path.realpath(os.path.expanduser(path)))
+        return Path(os.path.realpath(os.path.join(directory, os.path.expanduser(path))))
     except ValueError as error:
         raise InvalidValueError(f"file name {path!r} ({error})", expected="a path") from error
 
@@ -24,7 +24,8 @@ class AllowedPaths:
     Parameters
     ----------
     directory
-        Folder in which the files must lie. Empty: the folders of ``trusted``.
+        Folder in which the files must lie, and from which relative names start. Empty: the folders of
+        ``trusted``, and the working directory.
     trusted
         Files named at the start, which are allowed wherever they are.
 
@@ -35,10 +36,11 @@ class AllowedPaths:
     """
 
     def __init__(self, directory: str = "", trusted: Sequence[str] = ()) -> None:
-        self._trusted = tuple(_resolve(path) for path in trusted)
+        self._start = str(_resolve(directory)) if directory else ""
+        self._trusted = tuple(_resolve(path, self._start) for path in trusted)
         self._folders = tuple(path.parent for path in self._trusted)
         if directory:
-            folder = _resolve(directory)
+            folder = Path(self._start)
             if not folder.is_dir():
                 raise InvalidValueError(
                     f"directory {directory}, which is not a folder", expected="an existing folder"
@@ -53,7 +55,7 @@ class AllowedPaths:
         InvalidValueError
             The file lies elsewhere.
         """
-        real = _resolve(path)
+        real = _resolve(path, self._start)
         if real in self._trusted or any(real.is_relative_to(folder) for folder in self._folders):
             return real
         if not self._folders:

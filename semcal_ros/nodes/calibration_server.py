@@ -23,7 +23,9 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
+from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import calibration_digest, report_scale_warnings
 from semcal_ros.nodes.frames.overlay import corner_overlay
@@ -47,7 +49,7 @@ _PARAMETERS = (
         "Field for what the distortion parameters cannot describe (joint).",
         choices=tuple(RESIDUAL_MODES),
     ),
-    ParameterDeclaration("output", "", "File that ~/save writes.", confined=True),
+    OUTPUT,
     ParameterDeclaration("allow_writing", True, "Whether ~/save may write files.", fixed=True),
 )
 # Frames, the report, parameters, views, a calibration, and a call that cancels it.
@@ -64,9 +66,11 @@ class _Candidate:
 
 
 class CalibrationServer(StreamNode):
-    """Services ~/add_view, ~/calibrate, ~/cancel, ~/save, ~/clear; topics ``calibration``, ~/progress, ~/overlay.
+    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/save, ~/clear; topics ``calibration``,
+    ~/progress, ~/overlay.
 
-    ~/calibrate answers when the calibration is done; views can be added meanwhile for the next one.
+    ~/calibrate answers when the calibration is done, ~/calibrate_start when it has begun; views can be added meanwhile
+    for the next one.
     """
 
     def __init__(self) -> None:
@@ -78,7 +82,9 @@ class CalibrationServer(StreamNode):
         self._calibration: Calibration | None = None
         self._running: CalibrationProcess | None = None
         self._stage: Stage | None = None
+        self._beside: threading.Thread | None = None
         self._warnings = ScaleWarnings()
+        self._output = OutputFile(self.parameters, self.reporter.info)
         self._text = self.endpoints.latched_publisher(String, "calibration")
         self._progress = self.endpoints.latched_publisher(DiagnosticStatus, "~/progress")
         self._overlay = self.endpoints.stream_publisher(Image, "~/overlay")
@@ -93,6 +99,7 @@ class CalibrationServer(StreamNode):
             ("clear", self._clear, quick),
             # A call during a calibration is refused at once instead of waiting for its end.
             ("calibrate", self._calibrate, ReentrantCallbackGroup()),
+            ("calibrate_start", self._start_calibration, quick),
             ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
         )
         self._answers = [
@@ -101,17 +108,25 @@ class CalibrationServer(StreamNode):
         ]
         self.closing.callback(self._end_calibration)
         self._report_progress("no views yet")
+        self.reporter.info(self._saving)
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report what is wrong with the stage and with the last calibration."""
         doubts = [self._warnings.summary] if self._warnings.count else []
         return super().conditions() + self._position.conditions() + doubts
 
+    @property
+    def _saving(self) -> str:
+        """What ~/save would do now, in words."""
+        return self._output.plan if self.parameters["allow_writing"] else "~/save is switched off"
+
     def _end_calibration(self) -> None:
         with self._lock:
             running = self._running
         if running is not None:
             running.cancel()
+        if self._beside is not None:
+            self._beside.join()
 
     def _report_answer(self, success: bool, text: str) -> None:
         self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
@@ -137,6 +152,10 @@ class CalibrationServer(StreamNode):
         magnification = self.known_magnification(frame)
         if magnification is None or frame.mixed:
             return
+        if self.frames is not None and self.frames.has_rivals:
+            with self._lock:
+                self._newest = None
+            return
         with self._lock:
             before = self._newest
             visit = 0 if before is None else before.visit
@@ -145,7 +164,12 @@ class CalibrationServer(StreamNode):
 
     # -- services ----------------------------------------------------------------------------------
 
+    def _refuse_rivals(self) -> None:
+        if self.frames is not None:
+            self.frames.refuse_rivals()
+
     def _add_view(self) -> str:
+        self._refuse_rivals()
         with self._lock:
             newest, name = self._newest, f"view {len(self._views)}"
         frame = None if newest is None else newest.frame
@@ -177,9 +201,10 @@ class CalibrationServer(StreamNode):
             count = len(self._views)
         self.reporter.count_published(frame.stamp_ns)
         tilt = None if newest.stage is None else newest.stage.tilt_rad
-        return f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners" + (
-            "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
-        )
+        text = f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners"
+        text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
+        # Who collects views wants to save a calibration, and can still change where.
+        return text + (f"; {self._saving}" if count == 1 else "")
 
     def _clear(self) -> str:
         with self._lock:
@@ -190,7 +215,28 @@ class CalibrationServer(StreamNode):
         return f"{count} views removed"
 
     def _calibrate(self) -> str:
+        return self._complete(self._begin())
+
+    def _start_calibration(self) -> str:
         running = self._begin()
+        self._beside = threading.Thread(target=self._complete_beside, args=(running,), daemon=True)
+        self._beside.start()
+        return f"calibrating from {len(running.job.views)} views; ~/progress shows it, ~/cancel ends it"
+
+    def _complete_beside(self, running: CalibrationProcess) -> None:
+        """Report, in place of an answer, how a calibration has ended."""
+        try:
+            success, text = True, self._complete(running)
+        except NODE_ERRORS as error:
+            success, text = False, " ".join(str(error).split())
+        if self.context.ok():
+            self._report_answer(success, text)
+            if success:
+                self.reporter.info(f"~/calibrate_start: {text}")
+            else:
+                self.reporter.warn(f"~/calibrate_start: {text}")
+
+    def _complete(self, running: CalibrationProcess) -> str:
         text = ""
         try:
             result = running.run(self.context.ok, lambda stage: self._show(running, stage))
@@ -212,6 +258,7 @@ class CalibrationServer(StreamNode):
         return result.summary
 
     def _begin(self) -> CalibrationProcess:
+        self._refuse_rivals()
         with self._lock:
             if self._running is not None:
                 raise CalibrationError(
@@ -275,13 +322,9 @@ class CalibrationServer(StreamNode):
             )
         with self._lock:
             calibration = self._calibration
-        path = self.parameters["output"]
         if calibration is None:
             raise InvalidValueError("no calibration to save", do="call ~/calibrate first")
-        if not path:
-            raise InvalidValueError("no file to save to", do="set the parameter output")
-        calibration.save(self.parameters.allowed_path(path))
-        return f"saved to {path}"
+        return self._output.write(calibration.save)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -18,9 +18,14 @@ from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.bridge.projection import fill_projection
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
+from semcal_ros.nodes.common.parameters import (
+    CALIBRATION,
+    REPLAYED_CALIBRATION,
+    ParameterDeclaration,
+)
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 
 __all__ = ["ParameterServer", "main"]
@@ -46,9 +51,12 @@ class ParameterServer(SemNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("parameter_server", (CALIBRATION, *_SIZE))
+        super().__init__(
+            "parameter_server", (CALIBRATION, REPLAYED_CALIBRATION, OUT_OF_RANGE, *_SIZE)
+        )
         self._reading: MagnificationReading | None = None
         self._published_g: float | None = None
+        self._range = RangeWatch(self.reporter)
         self._text = self.endpoints.latched_publisher(String, "calibration")
         self._info = self.endpoints.latched_publisher(CameraInfo, "camera_info")
         self._projection = self.endpoints.latched_publisher(Float64MultiArray, "projection")
@@ -76,9 +84,16 @@ class ParameterServer(SemNode):
         """Return True: a constant magnification is normal."""
         return True
 
+    def introduction(self) -> list[str]:
+        """Extend the base class: also the calibration."""
+        return [*super().introduction(), self._calibration.introduction]
+
     def conditions(self) -> list[str]:
-        """Extend the base class: also report a calibration that is missing, or whose scale is in doubt."""
-        return super().conditions() + self._calibration.conditions()
+        """Extend the base class: also report a calibration that is missing, or that does not cover the
+        magnification, or whose scale is in doubt.
+        """
+        outside = ["magnification outside the calibrated range"] * self._range.is_outside
+        return super().conditions() + outside + self._calibration.conditions()
 
     # -- topics ------------------------------------------------------------------------------------
 
@@ -123,13 +138,13 @@ class ParameterServer(SemNode):
             if g == self._published_g:
                 return
             camera = source.current.at(g).resized(width, height)
+            self._range.check(source.current, camera, g)
             self._publish(camera, width, height)
         except SemcalError as error:
             self.reporter.reject(error)
             return
         self._published_g = g
         self.reporter.note("magnification", g)
-        self.reporter.note("in_calibrated_range", camera.in_range)
 
     def _publish(self, camera: Any, width: int, height: int) -> None:
         projection = Float64MultiArray()
@@ -141,7 +156,8 @@ class ParameterServer(SemNode):
             return
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.frame_id)
         info = CameraInfo()
-        fill_camera_info(info, camera, header, width, height)
+        flagged = not camera.in_range and self.parameters[OUT_OF_RANGE.name] == "flag"
+        fill_camera_info(info, None if flagged else camera, header, width, height)
         self._info.publish(info)
 
     # -- services ----------------------------------------------------------------------------------

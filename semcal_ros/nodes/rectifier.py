@@ -41,7 +41,7 @@ class RectifierNode(CalibratedStreamNode):
                 return
             camera = self.camera(frame, g)
         self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
-        self.output.publish(None if frame.mixed else camera, frame)
+        self.publish(camera, frame)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -41,7 +41,7 @@ class StreamCorrector(CalibratedStreamNode):
         raster = None if drift is None else drift.raster
         memory = self.output.memory(frame)
         self.rectifier.rectify(frame.image, used, raster, self.config.scan, out=memory)
-        self.output.publish(None if frame.mixed else camera, frame)
+        self.publish(camera, frame)
         if drift is not None:
             self._drifts.publish(drift, frame)
 

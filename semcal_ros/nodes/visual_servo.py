@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
@@ -17,6 +19,7 @@ from semcal_ros.applications.servoing import (
     Servo,
     ServoStatus,
     ServoStep,
+    TargetView,
     choose_projection,
     find_target,
 )
@@ -33,7 +36,8 @@ __all__ = ["VisualServo", "main"]
 
 # Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
-# The stage stops after this many frame times, and at least this time, without a frame: one lost frame does not stop it.
+# The stage stops when the specimen has not been seen for this many frame times, and at least this time: one lost frame
+# does not stop it.
 _SILENCE, _SHORTEST_SILENCE_S = 2.5, 0.5
 # Stamps that differ from now by more are from another clock: no frame takes that long to arrive.
 _OTHER_CLOCK_S = 30.0
@@ -48,9 +52,9 @@ _RESET_AGAIN_S = 2.0
 class VisualServo(SemNode):
     """Takes rectified images with their camera and drift, and publishes velocities of the stage.
 
-    The stage stands still unless every one of these holds: ``~/start`` was called; frames come; the frame has a
-    camera; the target is found in the image with the size that this camera implies; the magnification has not
-    changed since; the image follows the stage.
+    The stage stands still unless every one of these holds: ``~/start`` was called; frames come, soon after they were
+    taken; the frame has a camera; the target is found in the image with the size that this camera implies; the
+    magnification has not changed since; the image follows the stage.
     """
 
     def __init__(self) -> None:
@@ -65,7 +69,10 @@ class VisualServo(SemNode):
                 values.on_change(setting.name, self._apply)
         self._active = bool(values["start"])
         self._state = "" if self._active else "waiting for ~/start"
+        # Stamp of the last frame, and when (time.monotonic) it had been scanned.
         self._last: tuple[int, float] | None = None
+        # The watchdog has a thread of its own: a frame that takes long to work on must not hold it up.
+        self._lock = threading.RLock()
         self._interval_s = 0.0
         self._shortest_s = np.inf
         self._magnification_value: float | None = None
@@ -93,7 +100,9 @@ class VisualServo(SemNode):
         ]
         # A simulated clock may stand still; the stage must not keep moving because of it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watchdog = self.create_timer(_TICK_S, self._watch, clock=steady)
+        alone = MutuallyExclusiveCallbackGroup()
+        self._watchdog = self.create_timer(_TICK_S, self._watch, alone, clock=steady)
+        self._signals = self.create_timer(_TICK_S, self._end.follow, clock=steady)
 
     def _stop_stage(self) -> None:
         if self.context.ok():
@@ -102,18 +111,32 @@ class VisualServo(SemNode):
     # -- control -----------------------------------------------------------------------------------
 
     def _apply(self, _value: Any) -> None:
-        self._servo.goal = read_goal(self.parameters)
-        self._servo.settings = read_servo_settings(self.parameters)
+        with self._lock:
+            self._servo.goal = read_goal(self.parameters)
+            self._servo.settings = read_servo_settings(self.parameters)
 
     def _on_start(self) -> str:
-        self._servo.restart()
-        self._last, self._shortest_s = None, np.inf
-        self._active, self._state = True, "waiting for frames"
-        return "the stage is servoed"
+        waiting = self._missing_inputs()
+        with self._lock:
+            self._servo.restart()
+            self._last, self._shortest_s = None, np.inf
+            self._active = True
+            self._set_state(f"waiting for {waiting or 'frames'}")
+        return (
+            f"waiting for {waiting}; then the stage is servoed"
+            if waiting
+            else "the stage is servoed"
+        )
+
+    def _missing_inputs(self) -> str:
+        """Return what the control needs and nobody publishes, in words."""
+        missing = [t for t in self._input.required_topics if not self.count_publishers(t)]
+        return f"a publisher of {', '.join(missing)}" if missing else ""
 
     def _on_stop(self) -> str:
-        self._active = False
-        self._halt("waiting for ~/start")
+        with self._lock:
+            self._active = False
+            self._halt("waiting for ~/start")
         return "the stage stands still"
 
     def _on_magnification(self, reading: MagnificationReading) -> None:
@@ -123,13 +146,16 @@ class VisualServo(SemNode):
             self._halt("the magnification has changed")
 
     def _watch(self) -> None:
-        self._end.follow()
-        if self._last is None or not self._stage.is_moving:
-            return
-        silent_s = time.monotonic() - self._last[1]
-        if silent_s > max(_SILENCE * self._frame_time_s(), _SHORTEST_SILENCE_S):
-            self._halt("no frames")
-            self._last = None
+        with self._lock:
+            if self._last is None or not self._stage.is_moving:
+                return
+            if time.monotonic() - self._last[1] > self._longest_silence_s():
+                self._halt("no frames")
+                self._last = None
+
+    def _longest_silence_s(self) -> float:
+        """Return for how long the stage may move without being seen."""
+        return max(_SILENCE * self._frame_time_s(), _SHORTEST_SILENCE_S)
 
     def _frame_time_s(self) -> float:
         """Return how long the microscope takes for a frame.
@@ -143,9 +169,10 @@ class VisualServo(SemNode):
 
     def _halt(self, reason: str) -> None:
         """Stop the stage."""
-        self._send(np.zeros(3))
-        self._servo.stop(ServoStatus.NOT_READY, reason)
-        self._set_state(reason)
+        with self._lock:
+            self._send(np.zeros(3))
+            self._servo.stop(ServoStatus.NOT_READY, reason)
+            self._set_state(reason)
 
     def _send(self, twist: np.ndarray[Any, Any]) -> None:
         self._stage.send(twist)
@@ -172,19 +199,42 @@ class VisualServo(SemNode):
         # As if the frame had arrived as soon as it was complete.
         return now_s - centre_offset_s, None
 
+    def _scanned_s(self, frame: ServoFrame, time_s: float, now_s: float | None) -> float:
+        """Return when the scan of a frame ended, on the clock of time.monotonic."""
+        if now_s is None:
+            return time.monotonic()
+        scan = self.config.scan
+        after_s = 0.0 if scan is None else scan.acquisition_time_s - scan.centre_offset_s
+        return time.monotonic() - max(now_s - time_s - after_s, 0.0)
+
     def _on_frame(self, frame: ServoFrame) -> None:
-        before, self._last = self._last, (frame.stamp_ns, time.monotonic())
-        step = self._step(frame, before)
+        time_s, now_s = self._times(frame.stamp_ns)
+        scanned_s = self._scanned_s(frame, time_s, now_s)
+        before, self._last = self._last, (frame.stamp_ns, scanned_s)
+        # What takes long, without the lock: the watchdog may have to stop the stage meanwhile.
+        view = find_target(frame.image, self._target)
+        with self._lock:
+            step = self._step(frame, view, before, (time_s, now_s))
+            late_s = time.monotonic() - scanned_s
+            if late_s > self._longest_silence_s():
+                reason = f"frames are {late_s:.1f} s old when they have been worked on"
+                step = self._servo.stop(ServoStatus.NOT_READY, reason, step.fit)
+            moves = self._active and not step.reason
+            self._send(step.twist if moves else np.zeros(3))
+            if self._active:
+                self._set_state(step.reason or ("converged" if step.converged else "servoing"))
         self._keep_in_view(frame, step)
-        moves = self._active and not step.reason
-        self._send(step.twist if moves else np.zeros(3))
         self._errors.publish(step, frame.header)
         self._note(step)
-        if self._active:
-            self._set_state(step.reason or ("converged" if step.converged else "servoing"))
         self.reporter.count_published(frame.stamp_ns)
 
-    def _step(self, frame: ServoFrame, before: tuple[int, float] | None) -> ServoStep:
+    def _step(
+        self,
+        frame: ServoFrame,
+        view: TargetView,
+        before: tuple[int, float] | None,
+        times: tuple[float, float | None],
+    ) -> ServoStep:
         if before is None or frame.stamp_ns <= before[0]:
             return self._servo.stop(ServoStatus.NOT_READY, "waiting for a second frame")
         self._interval_s = (frame.stamp_ns - before[0]) * 1e-9
@@ -195,15 +245,13 @@ class VisualServo(SemNode):
         except NODE_ERRORS as error:
             self.reporter.warn_seldom(str(error))
             return self._servo.stop(ServoStatus.NOT_READY, " ".join(str(error).split()))
-        view = find_target(frame.image, self._target)
-        time_s, now_s = self._times(frame.stamp_ns)
         in_instrument = self.parameters["goal_frame"] == "instrument"
         return self._servo.update(
             view,
             camera,
-            time_s,
+            times[0],
             interval_s=self._interval_s,
-            now_s=now_s,
+            now_s=times[1],
             shift_m=frame.drift_m if in_instrument else np.zeros(2),
         )
 
@@ -251,7 +299,7 @@ class VisualServo(SemNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable."""
-    return run_node(VisualServo, args)
+    return run_node(VisualServo, args, threads=2)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,15 @@ class FakeSubscription:
         self.depth = depth
         self.lost = 0
         self.restarts = 0
+        self.rivals = ""
+        self.names: list[str] = []
         self.waiting: deque[tuple[Any, Any]] = deque()
+
+    def publishers(self) -> list[str]:
+        return self.names
+
+    def find_rivals(self) -> str:
+        return self.rivals
 
     def take(self) -> tuple[Any, Any] | None:
         return self.waiting.popleft() if self.waiting else None
@@ -71,7 +79,7 @@ class FakeParameters:
         self._changes[name] = check or (lambda _value: None), apply
 
     def set(self, name: str, value: Any) -> None:
-        check, apply = self._changes[name]
+        check, apply = self._changes.get(name, (lambda _value: None, lambda _value: None))
         check(value)
         self._values[name] = value
         apply(value)

@@ -81,7 +81,8 @@ def test_a_view_keeps_what_the_stage_said(session: Session) -> None:
     session.peer.wait_for(known, "the stage")
     answer = session.call("add_view")
     assert answer.success
-    assert answer.message.endswith(", tilted by 17.2 degrees")
+    assert ", tilted by 17.2 degrees; ~/save will write " in answer.message
+    assert answer.message.endswith(f" {session.folder}/calibration.yaml")
     # A wrong one makes it unknown again.
     publisher.publish(JointState(name=["tilt"], position=[17.2]))
 
@@ -200,7 +201,7 @@ def test_the_calibration_is_saved_where_the_parameter_says(calibrated: Session) 
     file = calibrated.folder / "live.yaml"
     assert calibrated.set_output(file).successful
     answer = calibrated.call("save")
-    assert answer.success, answer.message
+    assert (answer.success, answer.message) == (True, f"saved to {file}")
     assert file.read_text() == calibrated.texts[-1].data
 
 

@@ -80,6 +80,21 @@ def test_a_calibration_can_begin_as_soon_as_the_one_before_is_cancelled(session:
     assert session.texts == []
 
 
+def test_a_calibration_that_is_only_started_can_be_followed_and_cancelled(session: Session) -> None:
+    answer = session.call("calibrate_start")
+    assert answer.success
+    assert answer.message.startswith("calibrating from 1 views; ")
+    _held_worker(session)
+    assert "a calibration is running" in session.call("calibrate_start").message
+    session.peer.wait_for(lambda: session.shown().get("stage") == "start", "the progress")
+    assert session.call("cancel").success
+    session.peer.wait_for(lambda: session.shown()["message"] == "cancelled", "the end")
+    # Too few views; nobody waits for the answer.
+    assert session.call("calibrate_start").success
+    session.peer.wait_for(lambda: "at least 3 views" in session.shown()["message"], "the refusal")
+    assert "stage" not in session.shown()
+
+
 def test_a_killed_calibration_is_a_plain_failure(session: Session) -> None:
     pending = session.begin("calibrate")
     os.kill(_held_worker(session), signal.SIGKILL)

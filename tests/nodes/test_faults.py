@@ -156,6 +156,8 @@ def test_a_magnification_out_of_the_calibrated_range_is_answered_and_said(bench:
     )
     assert state["in_calibrated_range"] == "False"
     assert int(state["level"]) >= 1
+    # Whoever takes the camera sees it too, as image_geometry and others look at K.
+    assert not any(bench.infos[-1].k) and not any(bench.infos[-1].p)
 
 
 def test_a_corrupt_calibration_on_the_topic_leaves_the_old_one_in_force(bench: Bench) -> None:

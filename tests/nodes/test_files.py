@@ -50,6 +50,8 @@ def test_files_are_read_from_the_folder_of_the_one_given_at_start(
             assert reason in result.reason
         # Fixed for as long as the node runs.
         assert not peer.set_parameter(SERVER, "directory", _text(outside)).successful
+        # A dump that is loaded again names it too.
+        assert peer.set_parameter(SERVER, "directory", _text("")).successful
 
         file = inside / "cal.yaml"
         assert peer.set_parameter(SERVER, "calibration", _text(file)).successful

@@ -279,8 +279,9 @@ class Suite:
             self.start(name)
 
     def start(self, name: str) -> None:
+        queue = {} if name == "parameter_server" else PATIENT
         self.processes[name] = self._stack.enter_context(
-            running(name, {"calibration": self._file, **PATIENT})
+            running(name, {"calibration": self._file, **queue})
         )
 
     def restart(self, name: str) -> None:

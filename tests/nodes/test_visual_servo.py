@@ -55,6 +55,7 @@ class Microscope:
         self.projections = make(Float64MultiArray, "projection", LATCHED)
         self.matrices = make(Image, "projection_stamped", RELIABLE)
         self.with_stamped = False
+        self.late_s = 0.0
         self.knob = make(Float64, "magnification", LATCHED)
         self.twists = peer.collect(Twist, "virtual_sem/stage")
         self.errors = peer.collect(PoseWithCovarianceStamped, "visual_servo/error")
@@ -90,7 +91,7 @@ class Microscope:
 
         def sent() -> Any:
             if time.monotonic() >= due[0]:
-                self.frame()
+                self.frame(self.late_s)
                 due[0] = time.monotonic() + 0.15
             return condition()
 
@@ -160,6 +161,30 @@ def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer
         # 2.5 of the 0.5 s of a frame, and not of the 20 s between the two that came.
         peer.wait_for(lambda: microscope.speed == 0.0, "a stop", timeout_s=8.0)
         peer.wait_for(lambda: "no frames" in peer.state(SERVO).get("servo_state", ""), "the reason")
+
+
+def test_frames_that_come_too_late_do_not_move_it(peer: Peer) -> None:
+    with servoed(peer) as (microscope, _):
+        microscope.frames_until(lambda: _moves(microscope), "motion")
+        microscope.late_s = 4.0
+        microscope.frames_until(lambda: microscope.speed == 0.0, "the stop")
+        first = len(microscope.twists)
+        state = microscope.frames_until(
+            lambda: "s old" in peer.state(SERVO)["servo_state"] and peer.state(SERVO), "the reason"
+        )
+        microscope.frames_until(lambda: len(microscope.twists) > first + 5, "some more")
+        assert not any(twist.linear.x for twist in microscope.twists[first:])
+        assert "frames are" in state["message"]
+        microscope.late_s = 0.0
+        microscope.frames_until(lambda: _moves(microscope), "motion again")
+
+
+def test_a_start_without_a_stream_says_what_it_waits_for(peer: Peer) -> None:
+    with running("visual_servo", {"config": "virtual_sem"}):
+        answer = peer.trigger(f"{SERVO}/start")
+    assert answer.success
+    for topic in ("image_rect", "camera_info", "drift"):
+        assert topic in answer.message
 
 
 def test_the_stamped_projection_of_a_frame_is_enough(peer: Peer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -32,7 +33,7 @@ from semcal_ros.core.arrays import AnyImage, Array, Indices, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.estimates import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath, omit_numbers
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
@@ -306,13 +307,23 @@ def _collect_notes(
             if undeformed.axis.base_seen
             else "neither drift nor base holds them, and their sigma says so"
         )
-        notes.append(f"no drift in {lost} of {len(path)} frames: {left}")
+        notes.append(f"no drift in {lost} of {len(path)} frames ({_name_reasons(path)}): {left}")
     if abs(undeformed.length_m / settings.length_m - 1.0) > _NOTED_LENGTH:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
         )
     return tuple(notes)
+
+
+def _name_reasons(path: DriftPath) -> str:
+    """Return why frames have no drift, the most frequent reason first."""
+    counts = Counter(
+        omit_numbers(update.reason) or "after a frame whose drift was only predicted"
+        for update, trusted in zip(path.updates, path.trusted, strict=True)
+        if not trusted
+    )
+    return "; ".join(reason for reason, _ in counts.most_common())
 
 
 class _SeriesMeasurement:

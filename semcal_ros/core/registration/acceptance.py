@@ -10,7 +10,7 @@ from semcal_ros.core.registration.inverse_compositional import Alignment
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import RegistrationSettings
 
-__all__ = ["find_failure"]
+__all__ = ["find_divergence", "find_failure"]
 
 
 # The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
@@ -19,6 +19,15 @@ _STAGE_TOLERANCE_PX = 1.0
 # The two halves may differ by chance, and by what distortion is left in the images: 0.3 px is a
 # change of scale of 1 part in 1000 over the 300 px between the middles of halves of 600 px.
 _HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
+
+
+def find_divergence(alignment: Alignment) -> Rejection[MatchFailure] | None:
+    """Reject an alignment that did not converge."""
+    if alignment.converged:
+        return None
+    return Rejection(
+        MatchFailure.NOT_CONVERGED, f"refinement did not converge in {alignment.iterations} steps"
+    )
 
 
 def find_failure(
@@ -44,15 +53,17 @@ def find_failure(
         Largest difference between the upper and the lower end of the image that a drift during the
         scan explains, px.
     """
-    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(alignment.covariance))))
-    if not worst <= limits.max_sigma_px:
+    best, worst = np.sqrt(np.maximum(np.linalg.eigvalsh(alignment.covariance), 0.0)).tolist()
+    if not worst <= limits.max_sigma_px and best <= limits.max_sigma_px:
         return Rejection(
             MatchFailure.UNDETERMINED, f"featureless in one direction (sigma {worst:.2f} px)"
         )
-    if not alignment.converged:
+    # What does not converge scatters in every direction, and that is no lack of structure.
+    if rejection := find_divergence(alignment):
+        return rejection
+    if not worst <= limits.max_sigma_px:
         return Rejection(
-            MatchFailure.NOT_CONVERGED,
-            f"refinement did not converge in {alignment.iterations} steps",
+            MatchFailure.UNDETERMINED, f"too little structure for its noise (sigma {worst:.2f} px)"
         )
     apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
     if apart > peak.step_px + _STAGE_TOLERANCE_PX:

@@ -10,6 +10,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.acceptance import find_divergence
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
@@ -20,11 +21,9 @@ from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["NOTHING_TO_COMPARE", "choose_peak"]
+__all__ = ["choose_peak"]
 
 
-#: Reason for which none of the peaks could be refined.
-NOTHING_TO_COMPARE = "nothing to compare: featureless in one direction, or too little overlap"
 # Part of the residual by which two shifts must differ to be told apart: below it, the error of the
 # interpolation, which depends on the fraction of the shift, decides instead of the specimen.
 _MIN_RESIDUAL_DIFFERENCE = 0.05
@@ -60,7 +59,8 @@ def choose_peak(
     Returns
     -------
     The peak with its alignment, which is None where there was no need to refine it; or a rejection
-    where the image does not tell which one.
+    where the image does not tell which one, or with the reason why the highest of them cannot be
+    refined where none can.
 
     Notes
     -----
@@ -79,9 +79,11 @@ def choose_peak(
     if len(competitors) == 1:
         return competitors[0], None
     best: tuple[CoarsePeak, Alignment, Array | None] | None = None
+    rejections: list[Rejection[MatchFailure]] = []
     for peak in competitors:
-        alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
-        if alignment is None or not alignment.converged:
+        alignment = _refine(reference, pyramid, peak)
+        if isinstance(alignment, Rejection):
+            rejections.append(alignment)
             continue
         energies = tile_residual_energies(level, pyramid, alignment.shift_px)
         if best is None:
@@ -100,20 +102,29 @@ def choose_peak(
         if deviations < 0.0:
             best = peak, alignment, energies
     if best is None:
-        return Rejection(MatchFailure.UNDETERMINED, NOTHING_TO_COMPARE)
+        # The same for all of them, or else that of the shift that is the likeliest by correlation.
+        return rejections[0]
     return best[:2]
+
+
+def _refine(
+    reference: Reference, pyramid: Pyramid, peak: CoarsePeak
+) -> Alignment | Rejection[MatchFailure]:
+    """Align at a peak; a rejection where that does not converge."""
+    alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
+    if isinstance(alignment, Rejection):
+        return alignment
+    return find_divergence(alignment) or alignment
 
 
 def _prefer_prediction(
     reference: Reference, pyramid: Pyramid, predicted: CoarsePeak, highest: CoarsePeak
 ) -> tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]:
     """The predicted peak, unless the highest one explains the image clearly better."""
-    alignments = [
-        align(reference.levels, pyramid, np.array(p.shift_px)) for p in (predicted, highest)
-    ]
+    alignments = [_refine(reference, pyramid, p) for p in (predicted, highest)]
     energies = [
         None
-        if alignment is None or not alignment.converged
+        if isinstance(alignment, Rejection)
         else tile_residual_energies(reference.levels[-1], pyramid, alignment.shift_px)
         for alignment in alignments
     ]
@@ -124,7 +135,7 @@ def _prefer_prediction(
             MatchFailure.AMBIGUOUS,
             f"ambiguous: the image shows a shift of ({x:.1f}, {y:.1f}) px, far from the prediction",
         )
-    return predicted, alignments[0]
+    return predicted, None if isinstance(alignments[0], Rejection) else alignments[0]
 
 
 def _is_predicted(peak: CoarsePeak, guess: Array, guess_covariance: Array) -> bool:

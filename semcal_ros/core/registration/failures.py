@@ -20,7 +20,9 @@ class MatchFailure(Enum):
     NO_PEAK = "no peak"
     #: Several shifts explain the image equally well, or another one than was predicted does.
     AMBIGUOUS = "ambiguous"
-    #: The gradient of the images leaves a direction of the shift open, or too little overlaps.
+    #: The images share fewer rows or columns than a comparison needs.
+    TOO_LITTLE_OVERLAP = "too little overlap"
+    #: The gradient of the images leaves a direction of the shift open.
     UNDETERMINED = "undetermined"
     #: The refinement did not converge.
     NOT_CONVERGED = "not converged"

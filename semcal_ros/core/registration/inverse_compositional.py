@@ -23,6 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, equilibrate
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
@@ -77,6 +79,7 @@ _ROWS_RATIO = 2.0
 # By how many standard deviations the common information must exceed what chance gives: once in a
 # million images of noise.
 _CHANCE = 5.0
+_FEATURELESS = "featureless in one direction: no more gradient in common there than by chance"
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,9 @@ class _Comparison:
         return np.asarray(self.shift + limit * self.fit.step)
 
 
-def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Alignment | None:
+def align(
+    levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array
+) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift.
 
     Parameters
@@ -187,8 +192,8 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
 
     Returns
     -------
-    Alignment or None
-        None where too little overlaps or the gradient leaves a direction undetermined.
+    The alignment, which may not have converged; or a rejection where too little overlaps, the gradient
+    leaves a direction undetermined, or the images have no structure in common.
     """
     shift = np.asarray(start_px, dtype=np.float64)
     mean = float(image.at(levels[0].factor).mean(dtype=np.float64))
@@ -197,7 +202,7 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
         hessian = None
         for _ in range(_MAX_COARSE_PASSES):
             comparison = _compare(level, image, shift / level.factor, mean, hessian)
-            if comparison is None:
+            if isinstance(comparison, Rejection):
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
             passes += 1
@@ -207,8 +212,8 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
     hessian = None
     for _ in range(_MAX_PASSES):
         comparison = _compare(levels[-1], image, shift / levels[-1].factor, mean, hessian)
-        if comparison is None:
-            return None
+        if isinstance(comparison, Rejection):
+            return comparison
         passes += 1
         shift = comparison.improved * levels[-1].factor
         # Far from the right shift the gradients have less in common.
@@ -219,42 +224,54 @@ def align(levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array) -> Al
         converged = remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
         if converged:
             break
-    assert comparison is not None
-    if not _has_common_gradient(comparison):
-        return None
-    return _summarise(comparison, covariance, converged, passes)
+    assert isinstance(comparison, _Comparison)
+    found = comparison.fit.information
+    chance = _find_chance_gradient(comparison.level, comparison.geometry, found)
+    return chance or _summarise(comparison, covariance, converged, passes)
 
 
 def _compare(
     level: PyramidLevel, image: Pyramid, shift: Array, mean: float, hessian: Array | None
-) -> _Comparison | None:
+) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
     comparison, None to compute it."""
     pixels = image.at(level.factor)
     size = pixels.shape[1], pixels.shape[0]
     window = tile_window(level, size, shift)
     if window is None:
-        return None
+        shared = _overlap_fraction(level.size, size, shift)
+        reason = f"too little overlap ({100.0 * shared:.0f} % of the image)"
+        return Rejection(MatchFailure.TOO_LITTLE_OVERLAP, reason)
     geometry = prepare_geometry(level, window)
     sums = tile_sums(level, window, pixels, shift, mean, hessian)
     fit = solve_step(geometry, sums)
-    return (
-        None if fit is None else _Comparison(level, window, geometry, sums, fit, shift, size, mean)
-    )
+    if fit is None:
+        information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
+        return _find_chance_gradient(level, geometry, information) or Rejection(
+            MatchFailure.UNDETERMINED, _FEATURELESS
+        )
+    return _Comparison(level, window, geometry, sums, fit, shift, size, mean)
 
 
-def _has_common_gradient(comparison: _Comparison) -> bool:
-    """Whether the images have more gradient in common than chance gives, in every direction."""
-    level, geometry, fit = comparison.level, comparison.geometry, comparison.fit
+def _find_chance_gradient(
+    level: PyramidLevel, geometry: TileGeometry, information: Array
+) -> Rejection[MatchFailure] | None:
+    """Reject images that have no more gradient in common than chance gives, in one direction or all."""
     energy = geometry.normal_matrices.sum(axis=0)[:2, :2] * np.outer(
         geometry.gradient_share, geometry.gradient_share
     )
     pixels = min(float(geometry.normal_matrices[:, 3, 3].sum()), float(HESSIAN_PIXELS))
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
-    values, vectors = np.linalg.eigh(fit.information)
-    weakest = vectors[:, 0]
-    return bool(values[0] > _CHANCE * chance * float(weakest @ energy @ weakest))
+    values, vectors = np.linalg.eigh(information)
+    by_chance = _CHANCE * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
+    if values[0] > by_chance[0]:
+        return None
+    if values[1] > by_chance[1]:
+        return Rejection(MatchFailure.UNDETERMINED, _FEATURELESS)
+    return Rejection(
+        MatchFailure.DISSIMILAR, "images differ: no more gradient in common than by chance"
+    )
 
 
 def _sum_blocks(comparison: _Comparison, scores: Array) -> Array:
@@ -417,7 +434,7 @@ def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array)
     """
     mean = float(image.at(level.factor).mean(dtype=np.float64))
     comparison = _compare(level, image, shift_px / level.factor, mean, None)
-    if comparison is None:
+    if isinstance(comparison, Rejection):
         return None
     energies = np.full(level.normal_matrices.shape[:2], np.nan)
     squares = squared_residuals(comparison.geometry, comparison.sums, comparison.fit)

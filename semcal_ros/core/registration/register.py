@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
-from semcal_ros.core.registration.ambiguity import NOTHING_TO_COMPARE, choose_peak
+from semcal_ros.core.registration.ambiguity import choose_peak
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
@@ -302,18 +302,19 @@ def register(
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin
         return Registration(unmeasured_alignment(), float("nan"), chosen, nearest)
-    peak, alignment = chosen
-    if alignment is None:
-        alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
-    if alignment is None or not alignment.converged:
+    peak, refined = chosen
+    alignment = (
+        align(reference.levels, pyramid, np.array(peak.shift_px)) if refined is None else refined
+    )
+    if isinstance(alignment, Rejection) or not alignment.converged:
         # A coarse search is only good to a fraction of its pixels, and fine textures forgive less.
         finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True)
         if finest and np.max(np.abs(np.subtract(finest[0].shift_px, peak.shift_px))) < peak.step_px:
             peak = finest[0]
             levels = [level for level in reference.levels if level.factor <= peak.step_px]
             alignment = align(levels, pyramid, np.array(peak.shift_px))
-    if alignment is None:
-        return _reject(MatchFailure.UNDETERMINED, NOTHING_TO_COMPARE)
+    if isinstance(alignment, Rejection):
+        return Registration(unmeasured_alignment(), float("nan"), alignment)
     correlation = _correct_correlation(reference, gray, alignment)
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     moved = replace(

@@ -8,10 +8,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from semcal_ros.bridge.diagnostics import (
     DiagnosticLevel,
@@ -19,7 +21,9 @@ from semcal_ros.bridge.diagnostics import (
     fill_diagnostic_status,
 )
 from semcal_ros.config.config import load_config
+from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
 from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import (
     CONFIG,
     DIAGNOSTICS_PERIOD,
@@ -65,11 +69,18 @@ class SemNode(Node):
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         # First: the middleware may destroy a node whose constructor is still running.
         self.closing = ExitStack()
+        declared = (CONFIG, DIAGNOSTICS_PERIOD, *declarations)
+        if command_line().wants_help:
+            raise HelpWanted(name, declared)
         super().__init__(name, namespace=DEFAULT_NAMESPACE)
-        self.parameters = Parameters(self, (CONFIG, DIAGNOSTICS_PERIOD, *declarations))
+        self._executable = name
+        self.parameters = Parameters(self, declared)
+        unused = self._unused_parameters(of_topics=False)
         self.config = load_config(self.parameters["config"])
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
+        if unused:
+            self.reporter.info(f"not parameters of this node, and ignored: {', '.join(unused)}")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._report_timer = self.create_timer(
             self.parameters["diagnostics_period"],
@@ -83,6 +94,51 @@ class SemNode(Node):
         """Close what :attr:`closing` holds, then destroy the node as the base class does."""
         self.closing.close()
         super().destroy_node()
+
+    def introduction(self) -> list[str]:
+        """Return what a user who starts the node wants to know, a few words each."""
+        about = EXECUTABLES.get(self._executable)
+        purpose = self._executable if about is None else about.purpose.rstrip(".")
+        return [purpose, f"config {self.config.name}"]
+
+    def introduce(self) -> None:
+        """Say in one line of the log what the finished node is, and where it listens and speaks."""
+        topics = self.endpoints.describe_topics()
+        self.reporter.info("; ".join([*self.introduction(), *filter(None, [topics])]))
+
+    # -- parameters --------------------------------------------------------------------------------
+
+    def _unused_parameters(self, *, of_topics: bool) -> list[str]:
+        """Return what :meth:`CommandLine.unused_names` does, for the parameters of topics or for all others."""
+        given = [name for name in self._parameter_overrides if is_quality(name) == of_topics]
+        return command_line().unused_names(given, self._parameters, self.get_fully_qualified_name())
+
+    def refuse_unknown_topics(self) -> None:
+        """Refuse ``qos_overrides`` of topics that the finished node does not have.
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`CommandLine.unused_names`.
+        """
+        self._unused_parameters(of_topics=True)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Extend the base class: a read-only parameter accepts the value that it has.
+
+        ``ros2 param load`` of a dump sets all parameters, those too.
+        """
+        changed = [p for p in parameter_list if not self._is_unchanged_constant(p)]
+        if not changed and parameter_list:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changed)
+
+    def _is_unchanged_constant(self, parameter: Parameter) -> bool:
+        name = parameter.name
+        if not self.has_parameter(name) or not self.describe_parameter(name).read_only:
+            return False
+        value = self.get_parameter(name).value
+        return type(value) is type(parameter.value) and bool(value == parameter.value)
 
     # -- diagnostics -------------------------------------------------------------------------------
 

@@ -11,7 +11,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from semcal_ros.nodes.common.qos import latched, overridable, service_queue, stream_output
+from semcal_ros.nodes.common.qos import (
+    camera_output,
+    latched,
+    overridable,
+    service_queue,
+    stream_output,
+)
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageInfo
 
@@ -41,25 +47,65 @@ class Endpoints:
         group: CallbackGroup | None = None,
         *,
         raw: bool = False,
+        source: str = "",
+        streams: bool = False,
     ) -> AdaptiveSubscription:
-        """Subscribe; the callback takes the message, or its bytes if ``raw``, and its information."""
+        """Subscribe; the callback takes the message, or its bytes if ``raw``, and its information.
+
+        ``source`` and ``streams`` are those of :class:`AdaptiveSubscription`.
+        """
         subscription = AdaptiveSubscription(
-            self._node, message_type, topic, callback, profile, group, raw=raw
+            self._node,
+            message_type,
+            topic,
+            callback,
+            profile,
+            group,
+            raw=raw,
+            source=source,
+            streams=streams,
         )
         self._subscriptions.append(subscription)
         return subscription
 
-    def stream_publisher(self, message_type: Any, topic: str) -> Any:
-        """Create a publisher of messages that belong to single frames."""
-        return self._publisher(message_type, topic, stream_output())
+    def stream_publisher(self, message_type: Any, topic: str, name: str | None = None) -> Any:
+        """Create a publisher of messages that belong to single frames.
+
+        ``name`` is the full name of a topic that follows another one.
+        """
+        return self._publisher(message_type, topic, stream_output(), name)
+
+    def camera_publisher(self, message_type: Any, topic: str, name: str) -> Any:
+        """Create a publisher of the cameras of single frames, with a name as for :meth:`stream_publisher`."""
+        return self._publisher(message_type, topic, camera_output(), name)
+
+    def beside(self, topic: str, neighbour: str) -> str:
+        """Return the full name of a topic in the namespace of another one, which may have been remapped.
+
+        A remap of ``topic`` itself counts more.
+        """
+        own = self._node.resolve_topic_name(topic)
+        if own != self._node.resolve_topic_name(topic, only_expand=True):
+            return own
+        return f"{self._node.resolve_topic_name(neighbour).rpartition('/')[0]}/{topic}"
+
+    def below(self, topic: str, name: str) -> str:
+        """Return the full name ``<topic>/<name>``, where ``topic`` may have been remapped."""
+        own = f"{topic}/{name}"
+        resolved = self._node.resolve_topic_name(own)
+        if resolved != self._node.resolve_topic_name(own, only_expand=True):
+            return resolved
+        return f"{self._node.resolve_topic_name(topic)}/{name}"
 
     def latched_publisher(self, message_type: Any, topic: str) -> Any:
         """Create a publisher whose last message also reaches late subscribers."""
         return self._publisher(message_type, topic, latched())
 
-    def _publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:
+    def _publisher(
+        self, message_type: Any, topic: str, profile: QoSProfile, name: str | None = None
+    ) -> Any:
         publisher = self._node.create_publisher(
-            message_type, topic, profile, qos_overriding_options=overridable()
+            message_type, name or topic, profile, qos_overriding_options=overridable()
         )
         self._publishers[topic] = publisher
         return publisher
@@ -94,9 +140,12 @@ class Endpoints:
             except NODE_ERRORS as error:
                 response.message = " ".join(str(error).split())
                 response.success = False
-                self._node.get_logger().warning(f"{name}: {response.message}")
             if on_answer is not None:
                 on_answer(response.success, response.message)
+            if response.success:
+                self._node.get_logger().info(f"{name}: {response.message}")
+            else:
+                self._node.get_logger().warning(f"{name}: {response.message}")
             return response
 
         return self._node.create_service(
@@ -118,4 +167,12 @@ class Endpoints:
         """Return what is wrong with the subscribed topics, a few words each."""
         weak = [f"{s.topic} without {s.downgraded}" for s in self._subscriptions if s.downgraded]
         foreign = [(s.topic, s.foreign_types) for s in self._subscriptions if s.foreign_types]
-        return weak + [f"{types} on {topic}" for topic, types in foreign]
+        rivals = [s.rivals for s in self._subscriptions if s.rivals]
+        return weak + [f"{types} on {topic}" for topic, types in foreign] + rivals
+
+    def describe_topics(self) -> str:
+        """Return the full names of all topics of this node, in words."""
+        inputs = sorted({s.full_topic for s in self._subscriptions})
+        outputs = sorted({str(p.topic_name) for p in self._publishers.values()})
+        parts = [("subscribes to", inputs), ("publishes", outputs)]
+        return "; ".join(f"{verb} {', '.join(names)}" for verb, names in parts if names)

@@ -26,6 +26,7 @@ __all__ = [
     "DIAGNOSTICS_PERIOD",
     "DIRECTORY",
     "INTERPOLATION",
+    "REPLAYED_CALIBRATION",
     "ParameterDeclaration",
     "Parameters",
 ]
@@ -139,6 +140,13 @@ CALIBRATION = ParameterDeclaration(
     "Calibration file; empty to wait for one on the topic `calibration`.",
     confined=True,
 )
+REPLAYED_CALIBRATION = ParameterDeclaration(
+    "replayed_calibration",
+    "ignore",
+    "What to do with a calibration that comes while a recording is played on the topic `calibration`, where another one"
+    " is in force already.",
+    choices=("ignore", "take"),
+)
 INTERPOLATION = ParameterDeclaration(
     "interpolation",
     "linear",
@@ -192,7 +200,10 @@ class Parameters:
         return self._allowed.resolve(path)
 
     def on_change(self, name: str, apply: Apply, check: Check | None = None) -> None:
-        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after."""
+        """Call ``check(value)``, which may raise, before each change is accepted, and ``apply(value)`` after.
+
+        A parameter that is set to the value that it has does not change, unless it names a file.
+        """
         self._applies[name] = apply
         if check is not None:
             self._checks[name] = check
@@ -217,6 +228,10 @@ class Parameters:
             declaration = self._declared.get(parameter.name)
             if declaration is None:
                 continue
+            before = self._values[parameter.name]
             self._values[parameter.name] = declaration.convert(parameter.value)
+            # What a file holds may have changed; nothing else has.
+            if self._values[parameter.name] == before and not declaration.confined:
+                continue
             if parameter.name in self._applies:
                 self._applies[parameter.name](self._values[parameter.name])

@@ -13,6 +13,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 __all__ = [
+    "camera_output",
     "image_input",
     "latched",
     "overridable",
@@ -53,6 +54,14 @@ def value_input(depth: int = 100) -> QoSProfile:
 def stream_output(depth: int = 8) -> QoSProfile:
     """Return the quality for images and for the messages that go with each of them."""
     return _profile(depth, DurabilityPolicy.VOLATILE)
+
+
+def camera_output(depth: int = 8) -> QoSProfile:
+    """Return the quality for camera_info, the same for all its publishers: of images and of `parameter_server`.
+
+    Transient local, as that of the latter has to be: it also suits a subscriber that asks for less.
+    """
+    return _profile(depth, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def latched() -> QoSProfile:

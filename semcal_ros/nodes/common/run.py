@@ -29,6 +29,9 @@ from rclpy.signals import uninstall_signal_handlers
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.middleware.ament_prefix import add_environment_prefix
 from semcal_ros.middleware.security import check_security
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.command_line import CommandLine, HelpWanted, starting_with
+from semcal_ros.nodes.common.help import format_help
 
 __all__ = ["DeferredSignals", "run_node"]
 
@@ -88,13 +91,21 @@ def run_node(
     -------
     Exit status: 0, or 2 after one line on stderr if the node cannot start with what it was given.
     """
+    with starting_with(sys.argv[1:] if args is None else args) as line:
+        return _run(factory, line, threads)
+
+
+def _run(factory: Callable[[], Node], line: CommandLine, threads: int) -> int:
     sys.setswitchinterval(_SWITCH_S)
     add_environment_prefix()
     try:
         try:
+            if line.wants_help:
+                return _print_help(factory)
+            line.refuse_foreign()
             check_security()
             with _refusals():
-                rclpy.init(args=None if args is None else [sys.argv[0], *args])
+                rclpy.init(args=[sys.argv[0], *line.arguments])
             node = _make(factory)
         except _START_ERRORS as error:
             print(" ".join(str(error).split()), file=sys.stderr)
@@ -123,10 +134,33 @@ def _make(factory: Callable[[], Node]) -> Node | None:
     """Make the node; return None if a signal shut the middleware down meanwhile."""
     try:
         with _refusals():
-            return factory()
+            node = factory()
+            if isinstance(node, SemNode):
+                with _destroyed_if_refused(node):
+                    node.refuse_unknown_topics()
+                node.introduce()
+            return node
     except RuntimeError:
         # All others have become errors of the suite.
         return None
+
+
+@contextmanager
+def _destroyed_if_refused(node: Node) -> Iterator[None]:
+    try:
+        yield
+    except SemcalError:
+        node.destroy_node()
+        raise
+
+
+def _print_help(factory: Callable[[], Node]) -> int:
+    try:
+        factory()
+    except HelpWanted as wanted:
+        print(format_help(wanted.name, wanted.declarations))
+        return 0
+    raise AssertionError("a node that starts in spite of --help")
 
 
 class _Thread(SingleThreadedExecutor):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 
 from semcal_ros.nodes.common.qos import overridable, relax
+from semcal_ros.nodes.common.source_watch import SourceWatch
 
 __all__ = ["AdaptiveSubscription", "MessageCounter", "MessageInfo", "published_ns"]
 
@@ -90,6 +92,10 @@ class AdaptiveSubscription:
         The requested quality; overridable by parameters.
     raw
         Whether the callback takes the serialized bytes.
+    source
+        One word for what comes on a topic that must have one publisher; it is watched then.
+    streams
+        Whether that comes all the time.
     """
 
     def __init__(
@@ -102,6 +108,8 @@ class AdaptiveSubscription:
         group: CallbackGroup | None = None,
         *,
         raw: bool = False,
+        source: str = "",
+        streams: bool = False,
     ) -> None:
         self._node = node
         self._type = message_type
@@ -116,6 +124,11 @@ class AdaptiveSubscription:
         # The override parameters are written into the profile.
         self._requested = self._profile = profile
         self._subscription = self._subscribe(overridable())
+        self._received = 0
+        self._watch: SourceWatch | None = None
+        if source:
+            name, now_s = self._subscription.topic_name, time.monotonic()
+            self._watch = SourceWatch(source, name, streams=streams, now_s=now_s)
 
     @property
     def downgraded(self) -> str:
@@ -164,6 +177,7 @@ class AdaptiveSubscription:
         self._callback(message, info)
 
     def _count(self, info: MessageInfo) -> None:
+        self._received += 1
         number = info.get("publication_sequence_number")
         self._counter.count(number, self._subscription.get_publisher_count())
 
@@ -211,8 +225,8 @@ class AdaptiveSubscription:
     def check_publishers(self) -> None:
         """Check who publishes; call it periodically.
 
-        Warns of publishers of another type, which the middleware ignores silently, and returns to the requested
-        quality once there are no publishers left.
+        Warns of publishers of another type, which the middleware ignores silently, and of those that are one too many
+        or silent; returns to the requested quality once there are no publishers left.
         """
         publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
         foreign = {p.topic_type for p in publishers} - {self._type_name}
@@ -226,6 +240,41 @@ class AdaptiveSubscription:
             self._node.destroy_subscription(self._subscription)
             self._profile = self._requested
             self._subscription = self._subscribe()
+        if self._watch is not None:
+            names = self._sources(publishers)
+            warnings, news = self._watch.check(time.monotonic(), self._received, names)
+            for text in warnings:
+                self._node.get_logger().warning(text)
+            for text in news:
+                self._node.get_logger().info(text)
+
+    def _sources(self, publishers: list[Any]) -> list[str]:
+        return [
+            f"{p.node_namespace.rstrip('/')}/{p.node_name}"
+            for p in publishers
+            if p.topic_type == self._type_name
+        ]
+
+    def publishers(self) -> list[str]:
+        """Return the full names of the nodes that publish on the topic at this moment, once for each publisher."""
+        found = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
+        return self._sources(found)
+
+    def find_rivals(self) -> str:
+        """Return which publishers are one too many at this moment, in a few words; empty if none is."""
+        if self._watch is None:
+            return ""
+        return self._watch.describe_rivals(time.monotonic(), self.publishers())
+
+    @property
+    def rivals(self) -> str:
+        """What :meth:`find_rivals` returned at the last check."""
+        return "" if self._watch is None else self._watch.rivals
+
+    @property
+    def full_topic(self) -> str:
+        """The name of the topic after namespace and remaps."""
+        return str(self._subscription.topic_name)
 
     @property
     def foreign_types(self) -> str:

@@ -7,13 +7,30 @@ from typing import Any
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.nodes.common.parameters import CALIBRATION, INTERPOLATION, ParameterDeclaration
+from semcal_ros.nodes.common.parameters import (
+    CALIBRATION,
+    INTERPOLATION,
+    REPLAYED_CALIBRATION,
+    ParameterDeclaration,
+)
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.compressed import compressed_parameters
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 
 __all__ = ["CalibratedStreamNode"]
+
+_WITHOUT_CAMERA = (
+    ParameterDeclaration(
+        "uncalibrated",
+        "pass",
+        "What happens to frames while there is no calibration. pass: they go out unrectified, with a camera_info"
+        " of zeros that says so. drop: image_rect stays silent.",
+        choices=("pass", "drop"),
+    ),
+    OUT_OF_RANGE,
+)
 
 
 class CalibratedStreamNode(StreamNode):
@@ -21,7 +38,15 @@ class CalibratedStreamNode(StreamNode):
 
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(
-            name, (CALIBRATION, INTERPOLATION, *compressed_parameters("image_rect"), *declarations)
+            name,
+            (
+                CALIBRATION,
+                REPLAYED_CALIBRATION,
+                INTERPOLATION,
+                *_WITHOUT_CAMERA,
+                *compressed_parameters("image_rect"),
+                *declarations,
+            ),
         )
         self.rectifier = Rectifier(self.parameters["interpolation"])
         self.parameters.on_change("interpolation", self._set_interpolation)
@@ -32,10 +57,11 @@ class CalibratedStreamNode(StreamNode):
             self.reporter,
             on_change=self.on_calibration,
         )
-        self.output = RectifiedOutput(self.parameters, self.endpoints, self.reporter)
+        self.output = RectifiedOutput(self.config, self.parameters, self.endpoints, self.reporter)
         # After the last compressed image.
         self.closing.callback(self.output.close)
-        self._out_of_range = False
+        self._range = RangeWatch(self.reporter)
+        self._dropped = 0
         # Only the latest: most frames have the magnification of the frame before.
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
 
@@ -57,15 +83,29 @@ class CalibratedStreamNode(StreamNode):
         if self._camera is None or self._camera[0] is not current or self._camera[1] != seen_at:
             self._camera = current, seen_at, self.calibration.camera(*seen_at)
         camera = self._camera[2]
-        self._out_of_range = camera is not None and not camera.in_range
-        self.reporter.note("in_calibrated_range", camera is not None and camera.in_range)
+        self._range.check(current, camera, magnification)
         return camera
+
+    def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
+        """Publish the image in the memory of the output, with its camera if it has one that counts."""
+        if self.calibration.current is None and self.parameters["uncalibrated"] == "drop":
+            self._dropped += 1
+            self.reporter.note("frames_uncalibrated", self._dropped)
+            return
+        extrapolated = camera is not None and not camera.in_range
+        if frame.mixed or (extrapolated and self.parameters["out_of_range"] == "flag"):
+            camera = None
+        self.output.publish(camera, frame)
+
+    def introduction(self) -> list[str]:
+        """Extend the base class: also the calibration."""
+        return [*super().introduction(), self.calibration.introduction]
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report a calibration that is missing, or that does not cover the
         magnification, or whose scale is in doubt.
         """
         found = super().conditions()
-        if self.calibration.current is not None and self._out_of_range:
+        if self.calibration.current is not None and self._range.is_outside:
             found.append("magnification outside the calibrated range")
         return found + self.calibration.conditions()

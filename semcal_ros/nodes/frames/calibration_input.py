@@ -23,7 +23,7 @@ from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import read_calibration_text
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import CALIBRATION, Parameters
+from semcal_ros.nodes.common.parameters import CALIBRATION, REPLAYED_CALIBRATION, Parameters
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
@@ -38,6 +38,8 @@ _KEPT_DIGESTS = 16
 # Several nodes publish calibrations, perhaps including this one: with a depth of 1, its own message that comes back
 # would displace another node's message that has not been taken yet.
 _QUEUE = 10
+# Names that the players of recordings have: that of this suite, and that of `ros2 bag play`.
+_PLAYERS = ("bag_player", "rosbag2_player")
 
 
 def calibration_digest(text: str) -> str:
@@ -47,12 +49,16 @@ def calibration_digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A calibration with its text, its source, and when it came into force, ns; 0 for the file given at start."""
+    """A calibration with its text, its source, and when it came into force, ns; 0 for the file given at start.
+
+    ``replayed``: it came while a recording was played on the topic.
+    """
 
     calibration: Calibration
     text: str
     source: str
     since_ns: int
+    replayed: bool = False
 
 
 @dataclass(frozen=True, order=True)
@@ -93,6 +99,10 @@ class CalibrationInput:
     The latest wins: a message counts from its publication, a file from when it was named or reloaded. The file
     given at start is older than anything on the topic, so that a restarted node returns to the calibration in force.
 
+    While a recording is played on the topic, nobody can tell its old calibration, which is published now, from one
+    that was made now. It then only fills in, unless :data:`~semcal_ros.nodes.common.parameters.REPLAYED_CALIBRATION`
+    says otherwise.
+
     Texts are parsed beside the stream and take effect between two frames.
 
     Parameters
@@ -100,7 +110,8 @@ class CalibrationInput:
     config
         The configuration of the node.
     parameters
-        Parameters among which is :data:`~semcal_ros.nodes.common.parameters.CALIBRATION`.
+        Parameters among which are :data:`~semcal_ros.nodes.common.parameters.CALIBRATION` and
+        :data:`~semcal_ros.nodes.common.parameters.REPLAYED_CALIBRATION`.
     endpoints, reporter
         Where to subscribe, and the log and counters.
     on_change
@@ -134,7 +145,10 @@ class CalibrationInput:
         if path:
             self._take_over(replace(self._read(path), since_ns=0))
         parameters.on_change(CALIBRATION.name, self._apply_file, self._check_file)
-        endpoints.subscribe(String, "calibration", self._on_message, value_input(_QUEUE))
+        self._refused = ""
+        self._topic = endpoints.subscribe(
+            String, "calibration", self._on_message, value_input(_QUEUE)
+        )
 
     @property
     def current(self) -> Calibration | None:
@@ -146,11 +160,19 @@ class CalibrationInput:
         """The node's configuration with the display width of the calibration in force."""
         return self._config
 
+    @property
+    def introduction(self) -> str:
+        """What is known about the calibration, in a few words."""
+        return (
+            "no calibration yet" if self._loaded is None else f"calibration {self._loaded.source}"
+        )
+
     def conditions(self) -> list[str]:
         """Return what the diagnostics should say about the calibration in force, a few words each."""
         if self._loaded is None:
             return ["uncalibrated"]
-        return [self._warnings.summary] if self._warnings.count else []
+        doubts = [self._warnings.summary] if self._warnings.count else []
+        return doubts + [self._refused] * bool(self._refused)
 
     @property
     def has_published(self) -> bool:
@@ -191,7 +213,13 @@ class CalibrationInput:
 
     def _apply_file(self, path: str) -> None:
         if self._checked is not None and self._checked[0] == path:
-            self._install(replace(self._checked[1], since_ns=time.time_ns()))
+            loaded = replace(self._checked[1], since_ns=time.time_ns())
+            if self._loaded is not None and loaded.text == self._loaded.text:
+                # Nothing changes for the images; a drift must go on.
+                self._loaded = loaded
+                self._reporter.note("calibration", loaded.source)
+            else:
+                self._install(loaded)
         self._checked = None
 
     # -- topic -------------------------------------------------------------------------------------
@@ -231,7 +259,25 @@ class CalibrationInput:
         if isinstance(result, SemcalError):
             self._reporter.reject(result)
         elif not (self._is_older(result.since_ns) or self._is_same(result.text, result.since_ns)):
-            self._install(result)
+            players = [p for p in self._topic.publishers() if p.rpartition("/")[2] in _PLAYERS]
+            if players and self._refuses_replayed(result, players[0]):
+                return
+            self._install(replace(result, replayed=bool(players)))
+
+    def _refuses_replayed(self, loaded: _Loaded, player: str) -> bool:
+        """Refuse, with one warning, a calibration that is perhaps of a recording, where another one is in force."""
+        current = self._loaded
+        taken = self._parameters[REPLAYED_CALIBRATION.name] == "take"
+        if taken or current is None or current.replayed:
+            return False
+        digest = calibration_digest(loaded.text)
+        self._refused = f"calibration {digest} not used while {player} plays"
+        self._reporter.warn(
+            f"calibration {digest} on the topic is not used: {player} plays a recording there, and"
+            f" {current.source} is in force; to use it, set {REPLAYED_CALIBRATION.name} to take and"
+            " play again, or set the parameter calibration"
+        )
+        return True
 
     def _install(self, loaded: _Loaded) -> None:
         self._take_over(loaded)
@@ -239,13 +285,15 @@ class CalibrationInput:
 
     def _take_over(self, loaded: _Loaded) -> None:
         calibration, source = loaded.calibration, loaded.source
-        self._loaded = loaded
+        displaced, self._loaded, self._refused = self._loaded, loaded, ""
         self._config = replace(self._node_config, display_width_m=calibration.display_width_m)
         low, high = calibration.magnification_range
         digest = calibration_digest(loaded.text)
-        self._reporter.info(
-            f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}"
-        )
+        text = f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}"
+        if displaced is not None and source == _TOPIC != displaced.source:
+            self._reporter.warn(f"{text}; it displaces {displaced.source}")
+        else:
+            self._reporter.info(text)
         self._reporter.note("calibration", source)
         self._reporter.note("calibration_digest", digest)
         self._warnings = report_scale_warnings(self._reporter, calibration)

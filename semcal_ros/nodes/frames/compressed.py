@@ -91,7 +91,8 @@ class CompressedOutput:
         self._reporter = reporter
         self._topic = f"{topic}/compressed"
         self._prefix = f"{topic}.compressed"
-        self._publisher = endpoints.stream_publisher(CompressedImage, self._topic)
+        name = endpoints.below(topic, "compressed")
+        self._publisher = endpoints.stream_publisher(CompressedImage, self._topic, name)
         self._in_hand = threading.Lock()
         self._ended = False
         self._submitted = 0

@@ -67,7 +67,12 @@ class MagnificationInput:
         message_type = message_class(source.type)
         self._has_stamp = optional_stamp_ns(message_type()) is not None
         self._subscription = endpoints.subscribe(
-            message_type, source.topic, self._on_message, value_input(), group
+            message_type,
+            source.topic,
+            self._on_message,
+            value_input(),
+            group,
+            source="magnification",
         )
         self.received = 0
         self._last_ns = 0
@@ -115,6 +120,15 @@ class MagnificationInput:
         if reading is None or self._is_doubted():
             return None
         return replace(reading, config=config).magnification(image_width_px)
+
+    def find_rivals(self) -> str:
+        """As :meth:`AdaptiveSubscription.find_rivals`."""
+        return self._subscription.find_rivals()
+
+    @property
+    def rivals(self) -> str:
+        """As :attr:`AdaptiveSubscription.rivals`."""
+        return self._subscription.rivals
 
     def doubt(self, since_ns: int) -> None:
         """Doubt the magnification: the microscope was restarted after ``since_ns`` and may soon publish another one.

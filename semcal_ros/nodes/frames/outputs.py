@@ -9,11 +9,13 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.camera_info import fill_camera_info, fill_raw_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import Parameters
@@ -57,15 +59,50 @@ class ImageOutput:
 
 
 class RectifiedOutput:
-    """Publishes ``image_rect`` with ``camera_info`` and ``projection_stamped``, which have its header."""
+    """Publishes ``image_rect`` with ``camera_info`` and ``projection_stamped``, which have its header.
 
-    def __init__(self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter) -> None:
+    The same camera_info goes out on ``image_rect/camera_info``; that of the raw image, as image_pipeline means it, on
+    ``image_raw/camera_info``.
+
+    Parameters
+    ----------
+    config
+        Where the raw images come from.
+    parameters, endpoints, reporter
+        As for :class:`ImageOutput`.
+    """
+
+    def __init__(
+        self,
+        config: MicroscopeConfig,
+        parameters: Parameters,
+        endpoints: Endpoints,
+        reporter: Reporter,
+    ) -> None:
+        self._reporter = reporter
+        self._databar_rows = config.image.databar_rows
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
-        self._info = endpoints.stream_publisher(CameraInfo, "camera_info")
-        self._projection = endpoints.stream_publisher(Image, "projection_stamped")
-        self._messages = CameraInfo(), Image()
+        beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
+        info, projection = CameraInfo(), Image()
+        self._outputs = [
+            (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
+            (
+                endpoints.camera_publisher(
+                    CameraInfo, own, endpoints.below("image_rect", "camera_info")
+                ),
+                info,
+            ),
+            (endpoints.stream_publisher(Image, "projection_stamped"), projection),
+        ]
+        self._messages = info, projection
+        raw = config.image.topic
+        self._raw_info = CameraInfo()
+        self._raw_publisher = endpoints.camera_publisher(
+            CameraInfo, f"{raw}/camera_info", endpoints.below(raw, "camera_info")
+        )
         # What the messages describe, apart from their headers.
         self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
+        self._raw_described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """As :meth:`ImageOutput.memory`."""
@@ -78,7 +115,11 @@ class RectifiedOutput:
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""
         # The camera first: a subscriber that has the image can then use it at once.
-        for publisher, message in zip((self._info, self._projection), self._messages, strict=True):
+        if self._raw_publisher.get_subscription_count():
+            self._describe_raw(camera, frame)
+            copy_header(self._raw_info.header, frame.header)
+            self._raw_publisher.publish(self._raw_info)
+        for publisher, message in self._outputs:
             if publisher.get_subscription_count():
                 self._describe(camera, frame)
                 copy_header(message.header, frame.header)
@@ -92,6 +133,18 @@ class RectifiedOutput:
             fill_camera_info(info, camera, frame.header, *frame.size)
             fill_stamped_projection(projection, camera, frame.header, *frame.size)
             self._described = camera, frame.size
+
+    def _describe_raw(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
+        known = self._raw_described
+        if known is None or known[0] is not camera or known[1] != frame.size:
+            width, height = frame.size
+            model = None if camera is None else fit_plumb_bob(camera, width, height)
+            if model is not None:
+                self._reporter.note("raw_camera_info_error_px", model.worst_px)
+            fill_raw_camera_info(
+                self._raw_info, model, frame.header, width, height + self._databar_rows
+            )
+            self._raw_described = camera, frame.size
 
 
 class DriftOutput:

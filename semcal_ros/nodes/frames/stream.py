@@ -18,6 +18,7 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
@@ -139,7 +140,13 @@ class FrameInput:
         kind = message_class(IMAGE_TYPE if topic else source.type)
         self._source = SourceTimestamps(endpoints, source if topic else None)
         self._images = endpoints.subscribe(
-            kind, topic or source.topic, self._on_images, image_input(), group
+            kind,
+            topic or source.topic,
+            self._on_images,
+            image_input(),
+            group,
+            source="image",
+            streams=True,
         )
         self._skips_late = self._images.depth <= image_input().depth
         self._transport = ""
@@ -222,6 +229,19 @@ class FrameInput:
             self._image_bytes = image_bytes
             rmw = get_rmw_implementation_identifier()
             self._transport = transport_advice(image_bytes, os.environ, rmw)
+
+    def refuse_rivals(self) -> None:
+        """Refuse images or magnifications from more than one publisher; raises :class:`InvalidValueError`."""
+        found = self._images.find_rivals() or self._magnification.find_rivals()
+        if found:
+            raise InvalidValueError(
+                found, expected="one", do="end the others; remove views taken meanwhile by ~/clear"
+            )
+
+    @property
+    def has_rivals(self) -> bool:
+        """Whether the last check found more than one publisher of images or of magnifications."""
+        return bool(self._images.rivals or self._magnification.rivals)
 
     def conditions(self) -> list[str]:
         """Return, in a few words, whether the images are too large for the transport."""

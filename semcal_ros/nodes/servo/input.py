@@ -107,6 +107,11 @@ class ServoInput:
             kind = PoseWithCovarianceStamped
             self._inputs.append(endpoints.subscribe(kind, "drift", drift, stream_output()))
 
+    @property
+    def required_topics(self) -> tuple[str, ...]:
+        """The topics without which no frame is complete."""
+        return tuple(s.topic for s in self._inputs if s.topic != "projection_stamped")
+
     def _on_projection(self, message: Any, _info: MessageInfo) -> None:
         try:
             self._projections.append(projection_from_message(message))

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration import inverse_compositional
 from semcal_ros.core.registration import register as register_module
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.fractional_delay import (
@@ -276,7 +277,14 @@ def test_featureless_in_one_direction_however_noisy_is_refused() -> None:
 def test_too_small_an_overlap_is_not_searched() -> None:
     # Half of the width and half of the height: a quarter of the area, though each is more than 30 %.
     pair = _pair((96.4, -95.7), 4.0)
-    _refused(register_pair(*pair), "stands out", "nothing to compare", "differ", "ambiguous")
+    _refused(
+        register_pair(*pair),
+        "stands out",
+        "too little overlap",
+        "featureless",
+        "differ",
+        "ambiguous",
+    )
     less = register_pair(*pair, settings=RegistrationSettings(min_overlap=0.2))
     assert less.accepted, less.reason
     assert less.alignment.overlap == pytest.approx(0.25, abs=0.01)
@@ -330,3 +338,41 @@ def test_pictures_with_less_than_the_least_correlation_are_refused() -> None:
     lenient = register_pair(reference, image, settings=RegistrationSettings(min_correlation=0.3))
     assert lenient.rejection is None or lenient.rejection.status is not MatchFailure.DISSIMILAR
     assert lenient.correlation == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_shifts_that_cannot_be_refined_say_why(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """One peak and competing ones alike once had a single reason for all causes."""
+    reference, other = _pair((0.0, 0.0), 4.0)[0], noisy(Texture(7).view((0.0, 0.0), SIZE), 4.0, 5)
+    y, x = np.mgrid[:SIZE, :SIZE] / 9.0
+    rng = np.random.default_rng(0)
+    stripes = [
+        128.0 + 60.0 * np.sin(0.9 * x + 0.4 * y) + rng.normal(0.0, 4.0, x.shape) for _ in "ab"
+    ]
+    apart = (0.0, 0.0), (0.0, 3.0)
+    for pair, shifts, status, told in (
+        ((reference, other), apart, MatchFailure.DISSIMILAR, "images differ"),
+        (stripes, apart, MatchFailure.UNDETERMINED, "featureless in one direction"),
+        (
+            (reference, reference),
+            ((180.0, 0.0), (-180.0, 0.0)),
+            MatchFailure.TOO_LITTLE_OVERLAP,
+            "too little overlap (6 % of the image)",
+        ),
+    ):
+        peaks = [CoarsePeak(shift, 0.9, 20.0, 1.0) for shift in shifts[:count]]
+        monkeypatch.setattr(register_module, "find_coarse_peaks", lambda *_, p=peaks, **__: p)
+        rejection = register_pair(*pair).rejection
+        assert rejection is not None
+        assert rejection.status is status
+        assert rejection.reason.startswith(told)
+
+
+def test_what_does_not_converge_is_not_called_featureless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inverse_compositional, "_MAX_PASSES", 1)
+    for count in (1, 2):
+        peaks = [CoarsePeak((5.0 + k, -2.0), 0.9, 20.0, 4.0) for k in range(count)]
+        monkeypatch.setattr(register_module, "find_coarse_peaks", lambda *_, p=peaks, **__: p)
+        rejection = register_pair(*_pair((2.3, -1.6), 4.0)).rejection
+        assert rejection is not None
+        assert rejection.status is MatchFailure.NOT_CONVERGED

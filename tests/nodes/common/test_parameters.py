@@ -105,6 +105,17 @@ def test_a_change_is_checked_before_and_applied_after() -> None:
     assert seen == [(2.0, 2.0)]
 
 
+def test_the_value_that_it_has_is_no_change_unless_it_names_a_file(tmp_path: Path) -> None:
+    file = str(tmp_path / "cal.yaml")
+    node, parameters = declared(RATE, CALIBRATION, calibration=file)
+    seen: list[Any] = []
+    for name in ("rate", "calibration"):
+        parameters.on_change(name, seen.append)
+    for name, value in (("rate", 1.0), ("rate", 1), ("calibration", file), ("rate", 2.0)):
+        assert node.set(name, value).successful
+    assert seen == [file, 2.0]
+
+
 def test_parameters_of_ros_itself_pass() -> None:
     node, _ = declared(RATE)
     assert node.set("use_sim_time", True).successful

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from std_msgs.msg import String
 
 from semcal_ros.config.config import load_config
-from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.calibration_input import CalibrationInput, calibration_digest
 from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import make_calibration
 
@@ -28,7 +29,9 @@ class Bench:
 
     def __init__(self, path: str = "") -> None:
         self.endpoints: Any = FakeEndpoints()
-        self.parameters: Any = FakeParameters({"calibration": path})
+        self.parameters: Any = FakeParameters(
+            {"calibration": path, "replayed_calibration": "ignore"}
+        )
         self.changes: list[float] = []
         self.reporter, self.log = fake_reporter()
         self.input = CalibrationInput(
@@ -49,8 +52,11 @@ class Bench:
         self.endpoints.subscriptions["calibration"].callback(String(data=text_of(width_m)), info)
 
     def wait_for(self, width_m: float) -> None:
+        self.wait_until(lambda: self.input.current is not None and self.width_m == width_m)
+
+    def wait_until(self, done: Callable[[], bool]) -> None:
         deadline = time.monotonic() + TIMEOUT_S
-        while self.input.current is None or self.width_m != width_m:
+        while not done():
             assert time.monotonic() < deadline
             self.endpoints.hand_over()
             time.sleep(0.001)
@@ -130,6 +136,63 @@ def test_what_this_node_has_published_does_not_come_back_as_news(file: str) -> N
     bench.receive(0.11, sent_ns=time.time_ns() + 10**12)
     bench.wait_for(0.11)
     assert bench.changes == [0.10, 0.11]
+
+
+@pytest.mark.parametrize("player", ["/sem/bag_player", "/rosbag2_player"])
+def test_a_calibration_that_may_be_of_a_recording_does_not_displace_another(
+    file: str, player: str
+) -> None:
+    bench = Bench(file)
+    topic = bench.endpoints.subscriptions["calibration"]
+    topic.names = ["/sem/parameter_server", player]
+    bench.receive(0.10, sent_ns=time.time_ns())
+    bench.wait_until(lambda: len(bench.log) > 1)
+    assert bench.width_m == 0.05
+    assert f"{player} plays a recording there, and {file} is in force" in bench.log[-1]
+    digest = calibration_digest(text_of(0.10))
+    assert bench.input.conditions() == [f"calibration {digest} not used while {player} plays"]
+    bench.parameters.set("replayed_calibration", "take")
+    bench.receive(0.11, sent_ns=time.time_ns())
+    bench.wait_for(0.11)
+    # What came from a recording may give way to the next one.
+    bench.parameters.set("replayed_calibration", "ignore")
+    bench.receive(0.12, sent_ns=time.time_ns())
+    bench.wait_for(0.12)
+    # One made live is worth more again.
+    topic.names = ["/sem/calibration_server"]
+    bench.receive(0.13, sent_ns=time.time_ns())
+    bench.wait_for(0.13)
+    topic.names = [player]
+    bench.receive(0.14, sent_ns=time.time_ns())
+    bench.wait_until(lambda: bool(bench.input.conditions()))
+    assert bench.width_m == 0.13
+
+
+def test_a_calibration_of_a_recording_fills_in_where_there_is_none() -> None:
+    bench = Bench()
+    bench.endpoints.subscriptions["calibration"].names = ["/sem/bag_player"]
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+
+
+def test_a_file_that_is_displaced_is_named_in_a_warning(file: str) -> None:
+    bench = Bench(file)
+    bench.receive(0.10, sent_ns=1)
+    bench.wait_for(0.10)
+    assert bench.log[-1].endswith(f"; it displaces {file}")
+
+
+def test_a_file_that_is_set_again_unchanged_is_no_change(file: str) -> None:
+    bench = Bench(file)
+    bench.parameters.set("calibration", file)
+    assert bench.changes == []
+    # But it counts from now on.
+    bench.receive(0.10, sent_ns=1)
+    bench.receive(0.11, sent_ns=time.time_ns() + 10**12)
+    bench.wait_for(0.11)
+    assert bench.changes == [0.11]
+    bench.parameters.set("calibration", file)
+    assert bench.changes == [0.11, 0.05]
 
 
 def test_a_bad_text_is_refused_and_the_old_calibration_stays() -> None:

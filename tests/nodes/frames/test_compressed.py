@@ -38,7 +38,10 @@ class Stub:
         self.results: Callable[[], None] = lambda: None
         self.results_waiting = threading.Semaphore(0)
 
-    def stream_publisher(self, message_type: Any, topic: str) -> Any:
+    def below(self, topic: str, name: str) -> str:
+        return f"{topic}/{name}"
+
+    def stream_publisher(self, message_type: Any, topic: str, name: str) -> Any:
         assert (message_type, topic) == (CompressedImage, TOPIC)
         return SimpleNamespace(
             publish=self._publish, get_subscription_count=lambda: self.subscribers

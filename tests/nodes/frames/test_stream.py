@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from semcal_ros.config.config import load_config
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, is_late
 from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import image_message, magnification_message, texture
@@ -150,3 +151,18 @@ def test_one_turn_of_the_executor_is_bounded() -> None:
     bench.receive(*(1.0 + 0.1 * number for number in range(20)))
     assert len(bench.frames) == 9
     assert len(bench.images.waiting) == 11
+
+
+@pytest.mark.parametrize("topic", ["image_raw", "magnification"])
+def test_images_or_magnifications_of_two_publishers_are_refused_where_they_would_be_kept(
+    topic: str,
+) -> None:
+    bench = Bench()
+    bench.input.refuse_rivals()
+    bench.endpoints.subscriptions[topic].rivals = "2 publishers on it: /a, /b"
+    assert bench.input.has_rivals
+    with pytest.raises(InvalidValueError, match="/a, /b; expected one; end the others"):
+        bench.input.refuse_rivals()
+    # A stream goes on all the same.
+    bench.receive(1.0)
+    assert bench.stamps_s == [1.0]

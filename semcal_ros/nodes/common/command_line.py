@@ -1,0 +1,153 @@
+"""What a node was started with: refuses what it would otherwise ignore, and tells what `--help` shows."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.files.parameter_file import ParameterSection, read_parameter_sections
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+
+__all__ = [
+    "CommandLine",
+    "HelpWanted",
+    "command_line",
+    "is_quality",
+    "nearest_name",
+    "starting_with",
+]
+
+_HELP = ("-h", "--help")
+# rclpy declares these by itself.
+_OF_ROS = ("use_sim_time", "start_type_description_service")
+_OF_QOS = "qos_overrides."
+
+
+class HelpWanted(Exception):
+    """Raised where a node would start ROS, with what is known about it by then."""
+
+    def __init__(self, name: str, declarations: Sequence[ParameterDeclaration]) -> None:
+        super().__init__(name)
+        self.name = name
+        self.declarations = tuple(declarations)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """The arguments of one executable.
+
+    Attributes
+    ----------
+    arguments
+        Without the name of the executable.
+    """
+
+    arguments: tuple[str, ...] = ()
+
+    @property
+    def wants_help(self) -> bool:
+        """Whether help is asked for outside of the arguments for ROS."""
+        return any(argument in _HELP for argument in self._foreign())
+
+    def _foreign(self) -> list[str]:
+        found, for_ros = [], False
+        for argument in self.arguments:
+            if argument in ("--ros-args", "--"):
+                for_ros = argument == "--ros-args"
+            elif not for_ros:
+                found.append(argument)
+        return found
+
+    def refuse_foreign(self) -> None:
+        """Refuse arguments that are not for ROS; raises :class:`InvalidValueError`."""
+        foreign = self._foreign()
+        if foreign:
+            given = " ".join(foreign)
+            parameter = next((a for a in foreign if ":=" in a), "NAME:=VALUE")
+            raise InvalidValueError(
+                f"{given}, which ROS would ignore",
+                expected=f"parameters after --ros-args -p, as in `--ros-args -p {parameter}`",
+                do="see --help",
+            )
+
+    def unused_names(self, given: Iterable[str], declared: Iterable[str], node: str) -> list[str]:
+        """Return given parameters that the node does not have, from sections that are meant for several nodes.
+
+        Parameters
+        ----------
+        given, declared
+            Names of the parameters that the node was given, and of those that it has.
+        node
+            Its fully qualified name.
+
+        Raises
+        ------
+        InvalidValueError
+            Such a name was given to this node alone, or a section of a file has its name without its namespace,
+            which ROS takes for another node.
+        """
+        sections = self._sections()
+        namespace, _, name = node.rpartition("/")
+        for section in sections:
+            if namespace and section.nodes == f"/{name}":
+                raise InvalidValueError(
+                    f"section {name} of {section.file}, which is for the node /{name}",
+                    expected=f"the section {node} of this node, or /**",
+                    do="correct the name of the section, or start the node with -r __ns:=/",
+                )
+        known = list(declared)
+        for_all = frozenset[str]().union(*(s.names for s in sections if "*" in s.nodes))
+        unknown = [key for key in given if key not in known and key not in _OF_ROS]
+        for key in unknown:
+            if key not in for_all:
+                near = nearest_name(key, known)
+                raise InvalidValueError(
+                    f"parameter {key}, which {name} does not have",
+                    expected=f"{near}, perhaps" if near else "one of its parameters",
+                    do="see --help, or `ros2 param list` while it runs",
+                )
+        return unknown
+
+    def _sections(self) -> list[ParameterSection]:
+        pairs = zip(self.arguments, self.arguments[1:], strict=False)
+        files = [value for flag, value in pairs if flag == "--params-file"]
+        return [section for file in files for section in _read_sections(file)]
+
+
+def _read_sections(file: str) -> tuple[ParameterSection, ...]:
+    with suppress(SemcalError):  # ROS itself says what is wrong with it
+        return read_parameter_sections(file)
+    return ()
+
+
+def is_quality(name: str) -> bool:
+    """Return whether a parameter overrides the quality of service of a topic."""
+    return name.startswith(_OF_QOS)
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Return the known name that looks most like a misspelt one; empty if none does."""
+    return next(iter(difflib.get_close_matches(name, list(known), 1)), "")
+
+
+_CURRENT: ContextVar[CommandLine] = ContextVar("command_line", default=CommandLine())  # noqa: B039 - frozen
+
+
+def command_line() -> CommandLine:
+    """Return the command line of the executable that is being started; an empty one elsewhere."""
+    return _CURRENT.get()
+
+
+@contextmanager
+def starting_with(arguments: Sequence[str]) -> Iterator[CommandLine]:
+    """Make these the arguments of the executable that is started inside."""
+    line = CommandLine(tuple(arguments))
+    token = _CURRENT.set(line)
+    try:
+        yield line
+    finally:
+        _CURRENT.reset(token)

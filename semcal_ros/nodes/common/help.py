@@ -1,0 +1,137 @@
+"""What the executables print when they are asked for help; the table at the top of ``doc/nodes.md``."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
+
+__all__ = ["EXECUTABLES", "ExecutableHelp", "format_help"]
+
+_WIDTH = 100  # characters
+
+
+@dataclass(frozen=True)
+class ExecutableHelp:
+    """What one executable is for.
+
+    Attributes
+    ----------
+    purpose
+        One sentence.
+    inputs, outputs, services
+        Topics and services, as the documentation lists them.
+    example
+        Arguments of a typical start.
+    """
+
+    purpose: str
+    inputs: str
+    outputs: str
+    services: str
+    example: str
+
+
+EXECUTABLES = {
+    "stream_corrector": ExecutableHelp(
+        "Removes drift and distortion from the live stream in one interpolation.",
+        "image_raw, magnification, calibration",
+        "image_rect, camera_info, projection_stamped, drift, drift_velocity",
+        "~/reset",
+        "-p config:=jsm820 -p calibration:=cal.yaml",
+    ),
+    "drift_compensator": ExecutableHelp(
+        "Removes drift from the live stream; needs no calibration.",
+        "image_raw, magnification",
+        "image_stabilized, drift, drift_velocity",
+        "~/reset",
+        "-p config:=jsm820",
+    ),
+    "rectifier": ExecutableHelp(
+        "Removes distortion from the live stream.",
+        "image_raw or image_stabilized, magnification, calibration",
+        "image_rect, camera_info, projection_stamped",
+        "",
+        "-p config:=jsm820 -p calibration:=cal.yaml",
+    ),
+    "parameter_server": ExecutableHelp(
+        "Serves the calibration at any magnification, on topics and as parameters.",
+        "magnification, calibration",
+        "calibration, camera_info, projection; parameters such as `p@5250`",
+        "~/reload",
+        "-p config:=jsm820 -p calibration:=cal.yaml",
+    ),
+    "calibration_server": ExecutableHelp(
+        "Collects views of the grid from the live stream, and calibrates from them.",
+        "image_raw, magnification, stage",
+        "calibration, ~/progress, ~/overlay",
+        "~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/save, ~/clear",
+        "-p config:=jsm820 -p output:=live.yaml",
+    ),
+    "virtual_sem": ExecutableHelp(
+        "A simulated live microscope with a stage and a magnification knob.",
+        "~/stage, ~/set_magnification",
+        "image_raw, magnification, stage",
+        "",
+        "-p specimen:=gold -p drift:=slow -p magnification:=5000.0",
+    ),
+    "visual_servo": ExecutableHelp(
+        "Brings a target to a pose in the sem frame by velocities of the stage.",
+        "image_rect, camera_info, projection_stamped or projection, drift, magnification",
+        "velocity of the stage, ~/error",
+        "~/start, ~/stop",
+        "-p goal_x_m:=1e-6 -p start:=true",
+    ),
+    "bag_player": ExecutableHelp(
+        "Replays a recording on its own topics.",
+        "a recording",
+        "its topics, /clock",
+        "~/pause",
+        "-p bag:=recording -p rate:=2.0",
+    ),
+}
+
+
+def format_help(name: str, declarations: Sequence[ParameterDeclaration]) -> str:
+    """Return the help text of an executable.
+
+    Parameters
+    ----------
+    name
+        Of the executable.
+    declarations
+        Its parameters; the last declaration of a name counts.
+    """
+    parameters = {declaration.name: declaration for declaration in declarations}
+    if any(declaration.confined for declaration in parameters.values()):
+        parameters.setdefault(DIRECTORY.name, DIRECTORY)
+    about = EXECUTABLES[name]
+    lines = [
+        about.purpose,
+        "",
+        f"usage: ros2 run semcal_ros {name} [--ros-args [-p PARAMETER:=VALUE]... [-r OLD:=NEW]...]",
+        "",
+        f"  subscribes  {about.inputs}",
+        f"  publishes   {about.outputs}, /diagnostics",
+    ]
+    if about.services:
+        lines.append(f"  services    {about.services}")
+    lines += ["", "Names are relative; the namespace is /sem unless -r __ns:=/NAME gives another."]
+    lines += ["", "parameters (* only read at start):"]
+    for declaration in parameters.values():
+        mark = "*" if declaration.fixed else " "
+        lines.append(f" {mark}{declaration.name} = {_format_default(declaration.default)}")
+        text = f"{declaration.description} Accepted: {declaration.expected}."
+        lines += textwrap.wrap(
+            text, _WIDTH, initial_indent=8 * " ", subsequent_indent=8 * " ", break_on_hyphens=False
+        )
+    lines += ["", f"example: ros2 run semcal_ros {name} --ros-args {about.example}"]
+    return "\n".join(lines)
+
+
+def _format_default(value: bool | float | str) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value) if value != "" else "''"

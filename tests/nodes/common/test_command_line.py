@@ -1,0 +1,108 @@
+"""What a node is started with: nothing is ignored in silence, and help needs no ROS."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.nodes.common.command_line import CommandLine
+from semcal_ros.nodes.common.help import EXECUTABLES
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+DECLARED = ("config", "calibration", "interpolation", "use_sim_time")
+NODE = "/sem/rectifier"
+
+
+def unused(line: CommandLine, *given: str, node: str = NODE) -> list[str]:
+    return line.unused_names(given, DECLARED, node)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("calibration:=cal.yaml",), "--ros-args -p calibration:=cal.yaml"),
+        (("-p", "calibration:=cal.yaml"), "--ros-args -p calibration:=cal.yaml"),
+        (("--ros-args", "-p", "config:=x", "--", "loop"), "loop, which ROS would ignore"),
+    ],
+)
+def test_arguments_that_ros_would_ignore_are_refused(
+    arguments: tuple[str, ...], named: str
+) -> None:
+    with pytest.raises(InvalidValueError, match=re.escape(named)):
+        CommandLine(arguments).refuse_foreign()
+
+
+def test_arguments_for_ros_pass() -> None:
+    CommandLine(("--ros-args", "-p", "config:=x", "-r", "__ns:=/lab", "--")).refuse_foreign()
+    CommandLine().refuse_foreign()
+
+
+def test_a_misspelt_parameter_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(InvalidValueError, match=r"calibraton.* expected calibration, perhaps"):
+        unused(CommandLine(), "config", "calibraton")
+    with pytest.raises(InvalidValueError, match=r"xyz.* expected one of its parameters"):
+        unused(CommandLine(), "xyz")
+
+
+def test_what_ros_itself_declares_is_known() -> None:
+    assert unused(CommandLine(), "config", "use_sim_time", "start_type_description_service") == []
+
+
+def line_with(path: Path, text: str) -> CommandLine:
+    path.write_text(text, encoding="utf-8")
+    return CommandLine(("--ros-args", "--params-file", str(path)))
+
+
+def test_unknown_names_are_refused_in_a_section_of_this_node_and_listed_from_one_for_all(
+    tmp_path: Path,
+) -> None:
+    content = ":\n  ros__parameters:\n    config: x\n    image_rect:\n      depth: 5\n"
+    for own in ("/sem/rectifier", "sem:\n  rectifier"):
+        indented = content if ":" not in own else content.replace("\n  ", "\n    ")
+        line = line_with(tmp_path / "own.yaml", own + indented)
+        with pytest.raises(InvalidValueError, match=r"image_rect\.depth"):
+            unused(line, "config", "image_rect.depth")
+    line = line_with(tmp_path / "all.yaml", "/**" + content)
+    assert unused(line, "config", "image_rect.depth") == ["image_rect.depth"]
+
+
+def test_a_section_that_names_the_node_without_its_namespace_is_refused(tmp_path: Path) -> None:
+    line = line_with(tmp_path / "p.yaml", "rectifier:\n  ros__parameters:\n    config: x\n")
+    with pytest.raises(InvalidValueError, match="expected the section /sem/rectifier"):
+        unused(line)
+    # Without a namespace it is the right one, and for others it may be.
+    assert unused(line, node="/rectifier") == []
+    assert unused(line, node="/sem/stream_corrector") == []
+
+
+def test_help_needs_no_ros_and_says_what_the_documentation_says() -> None:
+    """In one process for all of them, which cannot start ROS."""
+    script = """
+import importlib
+import rclpy
+rclpy.init = None
+from semcal_ros.nodes.common.help import EXECUTABLES
+for name in EXECUTABLES:
+    assert importlib.import_module(f"semcal_ros.nodes.{name}").main(["--help"]) == 0
+    print("=====")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    texts = dict(zip(EXECUTABLES, done.stdout.split("=====\n"), strict=False))
+    manual = (REPOSITORY / "doc" / "nodes.md").read_text(encoding="utf-8")
+    for name, about in EXECUTABLES.items():
+        row = f"| [`{name}`](#{name}) | {about.inputs} | {about.outputs} | "
+        assert row + (f"{about.services} |" if about.services else "|") in manual
+        text = texts[name]
+        assert text.startswith(about.purpose)
+        assert "\n *config = " in text
+        assert f"example: ros2 run semcal_ros {name} --ros-args {about.example}" in text
+        for parameter in re.findall(r"-p (\w+):=", about.example):
+            assert re.search(rf"^ [ *]{parameter} = ", text, re.MULTILINE), parameter
