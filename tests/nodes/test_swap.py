@@ -292,7 +292,7 @@ class Suite:
 def _taken(process: NodeProcess) -> list[str]:
     """Digests of the calibrations that a node took over one after the other, from its log."""
     lines = [line for line in process.output.splitlines() if ": calibration from " in line]
-    return [line.rpartition(", ")[2] for line in lines]
+    return [line.partition("; it displaces ")[0].rpartition(", ")[2] for line in lines]
 
 
 def test_all_nodes_agree_and_find_back_after_a_crash(peer: Peer, files: dict[str, Path]) -> None:

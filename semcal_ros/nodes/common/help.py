@@ -86,9 +86,9 @@ EXECUTABLES = {
     ),
     "bag_player": ExecutableHelp(
         "Replays a recording on its own topics.",
-        "a recording",
+        "a recording, ~/seek, ~/set_rate",
         "its topics, /clock",
-        "~/pause",
+        "~/pause, ~/resume, ~/toggle_paused, ~/play_next",
         "-p bag:=recording -p rate:=2.0",
     ),
 }
