@@ -17,10 +17,15 @@ from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
 from semcal_ros.core.arrays import Array, Image, Mask
-from semcal_ros.core.drift.estimates import DriftPath
+from semcal_ros.core.drift.estimates import DriftPath, DriftSettings
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.registration.register import prepare_reference, register
+from semcal_ros.core.registration.register import (
+    Region,
+    RegistrationSettings,
+    prepare_reference,
+    register,
+)
 
 __all__ = ["Background", "follow_background"]
 
@@ -48,6 +53,13 @@ _ROUGH_PX = 0.4
 _LEAST_CELLS = 4
 # ... and at least this share of them: in a large body a few cells exceed the limit by chance.
 _BODY_SHARE = 0.03
+# Weight of pixels that show nothing of the cover.
+_STILL = 0.99
+# Least side of a square of such pixels in which the noise is measured, px: the corners of its spectrum
+# have some 70 coefficients, which tell the noise to 17 %. A strip of the same area may be half as wide.
+_LEAST_TEXTURE_PX, _LEAST_SIDE_PX = 32, 16
+# Width over height of the rectangles that are tried.
+_TEXTURE_ASPECTS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # Sigma of the soft rim of a covered area, px: a sharp rim would be an edge for the tracker.
 _SOFT_PX = 3.0
 # Sigma over which the surrounding ground fills a covered area, px: several widths of the rim.
@@ -107,7 +119,9 @@ def follow_background(
     moving = _find_changes(grey, rough_px, beam)
     weight = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
-    tracker = DriftTracker(history=history)
+    texture = _find_texture(weight, float(np.max(np.abs(rough_px))))
+    settings = DriftSettings(registration=RegistrationSettings(texture_region=texture))
+    tracker = DriftTracker(settings, history=history)
     for image, time_s, shift in zip(grey, times_s, rough_px, strict=True):
         shifted = _shift_image(weight, shift)
         tracker.update(_cover(image, shifted), time_s, plane.camera, plane.timing)
@@ -155,6 +169,31 @@ def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
             shift = np.asarray(np.median(np.array(good), axis=0))
         shifts.append(shift.copy())
     return np.array(shifts)
+
+
+def _find_texture(weight: Image, drift_px: float) -> Region | None:
+    """Find the largest rectangle that shows the static background in all frames; None if there is none.
+
+    What covers the moving areas is smooth and without noise, and would be taken for the images'. Beside a long beam
+    only strips are left, so rectangles of several aspect ratios are tried, as squares in images that are squeezed.
+    """
+    margin = int(np.ceil(drift_px)) + 1
+    best: Region | None = None
+    area = _LEAST_TEXTURE_PX**2 - 1
+    still = (weight > _STILL).astype(np.float32)
+    for aspect in _TEXTURE_ASPECTS:
+        squeezed = cv2.resize(still, None, fx=1.0 / aspect, fy=1.0, interpolation=cv2.INTER_AREA)
+        whole = np.pad((squeezed > 1.0 - 1e-3).astype(np.uint8), 1)
+        distance = cv2.distanceTransform(whole, cv2.DIST_C, 3)[1:-1, 1:-1]
+        row, col = np.unravel_index(int(np.argmax(distance)), distance.shape)
+        reach = int(distance[row, col]) - 1
+        middle, half = int((col + 0.5) * aspect), int((reach + 0.5) * aspect)
+        left, right = middle - half + margin, middle + half - margin
+        top, bottom = int(row) - reach + margin, int(row) + reach + 1 - margin
+        sides = right - left, bottom - top
+        if min(sides) >= _LEAST_SIDE_PX and sides[0] * sides[1] > area:
+            area, best = sides[0] * sides[1], (left, top, right, bottom)
+    return best
 
 
 def _soften(beam: Mask) -> Image:

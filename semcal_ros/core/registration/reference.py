@@ -31,6 +31,9 @@ class RegistrationSettings:
         Correlation peaks higher than this fraction of the highest compete with it.
     min_deviations
         By how many standard errors a peak must explain the image better than its competitors.
+    texture_region
+        Part of the images, in px of the whole, in which their noise and structure are measured;
+        None: their middle. For images whose middle shows something else, such as a covered area.
     """
 
     min_overlap: float = 0.3
@@ -39,6 +42,7 @@ class RegistrationSettings:
     max_saturated: float = 0.5
     min_competing_height: float = 0.7
     min_deviations: float = 5.0
+    texture_region: Region | None = None
 
 
 @dataclass(frozen=True)

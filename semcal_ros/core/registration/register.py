@@ -54,6 +54,8 @@ __all__ = [
 # 48 px leave 36 px between the margins of the filters: 6 x 6 tiles of 6 px, from whose scatter the
 # covariance of the shift can just be told.
 _MIN_SIDE_PX = 48
+# Fewer pixels a side leave less than a coefficient to a ring of the spectrum.
+_MIN_TEXTURE_PX = 16
 # 160 px leave 24 tiles of the least side, 6 px, along each side; coarser levels would have fewer.
 _MIN_LEVEL_PX = 160
 # Saturation is counted in some 256 x 256 pixels, which tell its share to 0.2 %.
@@ -189,7 +191,10 @@ def prepare_reference(
     defect = _find_defect(gray, limits)
     if defect:
         return Reference(inside, coarse, (), 0.0, defect, limits)
-    statistics = measure_image(gray, averaged)
+    statistics = measure_image(_texture(gray, inside, limits), averaged)
+    if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
+        # A sparse specimen need not show anything there; the whole image decides.
+        statistics = measure_image(gray, averaged)
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
         return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
     levels = []
@@ -200,6 +205,15 @@ def prepare_reference(
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     return Reference(inside, coarse, tuple(levels), statistics.noise_variance, defect, limits)
+
+
+def _texture(gray: AnyImage, inside: Region, limits: RegistrationSettings) -> AnyImage:
+    """The part of a cropped image in which noise and structure are measured."""
+    if limits.texture_region is None:
+        return gray
+    left, top, right, bottom = np.subtract(limits.texture_region, np.tile(inside[:2], 2))
+    part = gray[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+    return part if min(part.shape) >= _MIN_TEXTURE_PX else gray
 
 
 def _reduction_factors(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -315,7 +329,8 @@ def register(
             alignment = align(levels, pyramid, np.array(peak.shift_px))
     if isinstance(alignment, Rejection):
         return Registration(unmeasured_alignment(), float("nan"), alignment)
-    correlation = _correct_correlation(reference, gray, alignment)
+    texture = _texture(gray, inside, reference.settings)
+    correlation = _correct_correlation(reference, texture, alignment)
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     moved = replace(
         alignment,

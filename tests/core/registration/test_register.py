@@ -376,3 +376,16 @@ def test_what_does_not_converge_is_not_called_featureless(monkeypatch: pytest.Mo
         rejection = register_pair(*_pair((2.3, -1.6), 4.0)).rejection
         assert rejection is not None
         assert rejection.status is MatchFailure.NOT_CONVERGED
+
+
+def test_noise_is_measured_where_the_texture_is() -> None:
+    # The middle of the image is covered by something smooth, as a moving body is before tracking.
+    image = _pair((0.0, 0.0), 8.0)[0].astype(np.float32)
+    truth = prepare_reference(image)
+    image[40:152, 40:] = image.mean()
+    settings = RegistrationSettings(texture_region=(0, 153, 192, 192))
+    told = prepare_reference(image, settings=settings)
+    # 39 x 64 px have some 200 coefficients in the corners of their spectrum: 3 sigma are 20 %.
+    assert told.noise_variance == pytest.approx(64.0, rel=0.25)
+    assert told.levels[-1].sigma_px == pytest.approx(truth.levels[-1].sigma_px, rel=0.3)
+    assert prepare_reference(image).noise_variance < 16.0
