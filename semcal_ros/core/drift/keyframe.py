@@ -67,8 +67,13 @@ class Keyframe:
 
     def prepare_reference(self, settings: RegistrationSettings) -> Reference:
         """Prepare it for registrations."""
+        raw = to_gray(self.frame.image)
         return prepare_reference(
-            self.mean, region=self.region, settings=settings, averaged=float(self.averaged)
+            self.mean,
+            region=self.region,
+            settings=settings,
+            averaged=float(self.averaged),
+            raw=raw if raw.shape == self.mean.shape else None,
         )
 
     def with_frame(self, image: AnyImage, region: Region, registration: Registration) -> Keyframe:

@@ -34,6 +34,7 @@ from semcal_ros.core.registration.tile_least_squares import (
     well_posed,
 )
 from semcal_ros.core.registration.tiles import (
+    ALL_PIXELS,
     HESSIAN_PIXELS,
     Pyramid,
     PyramidLevel,
@@ -195,13 +196,24 @@ def align(
     The alignment, which may not have converged; or a rejection where too little overlaps, the gradient
     leaves a direction undetermined, or the images have no structure in common.
     """
+    found = _align(levels, image, start_px, HESSIAN_PIXELS)
+    if isinstance(found, Rejection) and found.status is not MatchFailure.TOO_LITTLE_OVERLAP:
+        # What the gradients of some pixels do not tell from chance, those of all may.
+        return _align(levels, image, start_px, ALL_PIXELS)
+    return found
+
+
+def _align(
+    levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array, enough: int
+) -> Alignment | Rejection[MatchFailure]:
+    """Refine a shift with the common gradient of enough pixels."""
     shift = np.asarray(start_px, dtype=np.float64)
     mean = float(image.at(levels[0].factor).mean(dtype=np.float64))
     passes = 0
     for level in levels[:-1]:
         hessian = None
         for _ in range(_MAX_COARSE_PASSES):
-            comparison = _compare(level, image, shift / level.factor, mean, hessian)
+            comparison = _compare(level, image, shift / level.factor, mean, hessian, enough)
             if isinstance(comparison, Rejection):
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
@@ -211,7 +223,7 @@ def align(
                 break
     hessian = None
     for _ in range(_MAX_PASSES):
-        comparison = _compare(levels[-1], image, shift / levels[-1].factor, mean, hessian)
+        comparison = _compare(levels[-1], image, shift / levels[-1].factor, mean, hessian, enough)
         if isinstance(comparison, Rejection):
             return comparison
         passes += 1
@@ -226,15 +238,20 @@ def align(
             break
     assert isinstance(comparison, _Comparison)
     found = comparison.fit.information
-    chance = _find_chance_gradient(comparison.level, comparison.geometry, found)
+    chance = _find_chance_gradient(comparison.level, comparison.geometry, found, enough)
     return chance or _summarise(comparison, covariance, converged, passes)
 
 
 def _compare(
-    level: PyramidLevel, image: Pyramid, shift: Array, mean: float, hessian: Array | None
+    level: PyramidLevel,
+    image: Pyramid,
+    shift: Array,
+    mean: float,
+    hessian: Array | None,
+    enough: int = HESSIAN_PIXELS,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
-    comparison, None to compute it."""
+    comparison, None to compute it from enough pixels."""
     pixels = image.at(level.factor)
     size = pixels.shape[1], pixels.shape[0]
     window = tile_window(level, size, shift)
@@ -243,24 +260,24 @@ def _compare(
         reason = f"too little overlap ({100.0 * shared:.0f} % of the image)"
         return Rejection(MatchFailure.TOO_LITTLE_OVERLAP, reason)
     geometry = prepare_geometry(level, window)
-    sums = tile_sums(level, window, pixels, shift, mean, hessian)
+    sums = tile_sums(level, window, pixels, shift, mean, hessian, enough)
     fit = solve_step(geometry, sums)
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
-        return _find_chance_gradient(level, geometry, information) or Rejection(
+        return _find_chance_gradient(level, geometry, information, enough) or Rejection(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
     return _Comparison(level, window, geometry, sums, fit, shift, size, mean)
 
 
 def _find_chance_gradient(
-    level: PyramidLevel, geometry: TileGeometry, information: Array
+    level: PyramidLevel, geometry: TileGeometry, information: Array, enough: int
 ) -> Rejection[MatchFailure] | None:
     """Reject images that have no more gradient in common than chance gives, in one direction or all."""
     energy = geometry.normal_matrices.sum(axis=0)[:2, :2] * np.outer(
         geometry.gradient_share, geometry.gradient_share
     )
-    pixels = min(float(geometry.normal_matrices[:, 3, 3].sum()), float(HESSIAN_PIXELS))
+    pixels = min(float(geometry.normal_matrices[:, 3, 3].sum()), float(enough))
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
     values, vectors = np.linalg.eigh(information)

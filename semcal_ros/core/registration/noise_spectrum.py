@@ -101,29 +101,50 @@ def estimate_noise_variance(image: AnyImage) -> float:
     return _noise_floor(*_radial_spectrum(image, _NOISE_CROP_PX))
 
 
-def measure_image(image: AnyImage, averaged: float = 1.0) -> ImageStatistics:
+def measure_image(
+    image: AnyImage, averaged: float = 1.0, raw: AnyImage | None = None
+) -> ImageStatistics:
     """Noise, signal and the best smoothing of ``image`` (at least 16 x 16 px).
 
-    ``averaged`` is the number of images that ``image`` is the mean of: a single image has this
-    many times its noise variance.
+    Parameters
+    ----------
+    image
+        (h, w) grey levels.
+    averaged
+        Number of images that ``image`` is the mean of: a single image has this many times its noise
+        variance.
+    raw
+        One of these images before it was resampled. Interpolation takes noise away at high frequencies
+        and leaves it at lower ones, where the signal is; only the noise of the raw image is white.
 
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
     w, power, count = _radial_spectrum(image, _CROP_PX)
     noise = _noise_floor(w, power, count)
-    # A ring's estimate scatters; what is not clearly above the noise is not signal.
-    scatter = noise * np.sqrt(2.0 / count)
-    signal = np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
+    signal = _find_signal(power, noise, count)
     signal_variance = float(np.sum(signal * count) / np.sum(count))
     if signal_variance <= 0.0 or noise <= 0.0:
         return ImageStatistics(noise, signal_variance, 0.0)
+    white = noise
+    if raw is not None:
+        white = max(noise, _noise_floor(*_radial_spectrum(raw, _CROP_PX)) / averaged)
+        signal = _find_signal(power, white, count)
+        if not np.any(signal):
+            return ImageStatistics(noise, signal_variance, float(_SIGMAS_PX[-1]))
     psi = np.exp(-np.outer(_SIGMAS_PX**2, w**2))
-    single = noise * averaged
-    numerator = psi**2 @ (count * w**2 * ((noise + single) * signal + noise * single))
+    single = white * averaged
+    numerator = psi**2 @ (count * w**2 * ((white + single) * signal + white * single))
     denominator = psi @ (count * w**2 * signal)
     best = int(np.argmin(numerator / denominator**2))
     return ImageStatistics(noise, signal_variance, float(_SIGMAS_PX[best]))
+
+
+def _find_signal(power: Array, noise: float, count: Array) -> Array:
+    """Power of each ring above white noise; zero where it is not clearly above."""
+    # A ring's estimate scatters; what is not clearly above the noise is not signal.
+    scatter = noise * np.sqrt(2.0 / count)
+    return np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
 
 
 def gaussian_taps(sigma_px: float) -> Array:

@@ -165,6 +165,7 @@ def prepare_reference(
     region: Region | None = None,
     settings: RegistrationSettings | None = None,
     averaged: float = 1.0,
+    raw: AnyImage | None = None,
 ) -> Reference:
     """Precompute what :func:`register` needs of a reference that is used many times.
 
@@ -178,6 +179,9 @@ def prepare_reference(
         Limits of acceptance.
     averaged
         Number of images that ``image`` is the mean of, at least 1.
+    raw
+        One of these images, grey and of the same size, before it was resampled, whose noise is white;
+        None if they were not.
 
     Raises
     ------
@@ -191,10 +195,15 @@ def prepare_reference(
     defect = _find_defect(gray, limits)
     if defect:
         return Reference(inside, coarse, (), 0.0, defect, limits)
-    statistics = measure_image(_texture(gray, inside, limits), averaged)
+    before = None if raw is None else raw[inside[1] : inside[3], inside[0] : inside[2]]
+    statistics = measure_image(
+        _texture(gray, inside, limits),
+        averaged,
+        None if before is None else _texture(before, inside, limits),
+    )
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
         # A sparse specimen need not show anything there; the whole image decides.
-        statistics = measure_image(gray, averaged)
+        statistics = measure_image(gray, averaged, before)
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
         return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
     levels = []

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from semcal_ros.core.registration.tile_least_squares import TileGeometry
 
 __all__ = [
+    "ALL_PIXELS",
     "HESSIAN_PIXELS",
     "Pyramid",
     "PyramidLevel",
@@ -46,6 +47,8 @@ _MIN_TILES = 3
 #: Number of pixels from which the Gauss-Newton Hessian is taken at most: their gradients tell it to
 #: 1 %, and the gradients of the image cost more than all other sums.
 HESSIAN_PIXELS = 12_000
+#: More than an image has.
+ALL_PIXELS = 2**62
 # They lie in bands at the top, in the middle and at the bottom of the overlap.
 _HESSIAN_BANDS = 3
 # Images that are smooth by less have structure beyond the band of the shorter filters.
@@ -252,11 +255,12 @@ def tile_sums(
     shift: Array,
     mean: float,
     hessian: Array | None,
+    enough: int = HESSIAN_PIXELS,
 ) -> TileSums:
     """Sums over the window's tiles of ``image`` sample_shifted at the reference's pixels plus ``shift``.
 
     ``image`` is at the resolution of the level; ``mean`` is subtracted from it. ``hessian`` is
-    that of an earlier shift of the same images, None to compute it.
+    that of an earlier shift of the same images, None to compute it from ``enough`` pixels.
     """
     left, top, width, height = _window_rectangle(level, window)
     side_x, side_y = level.side
@@ -274,7 +278,9 @@ def tile_sums(
     cross[..., 3] = tiles @ np.ones(side_x * side_y, dtype=np.float32)
     energy = np.einsum("rcn,rcn->rc", tiles, tiles).astype(np.float64)
     return TileSums(
-        cross, energy, _common_hessian(level, window, sampled) if hessian is None else hessian
+        cross,
+        energy,
+        _common_hessian(level, window, sampled, enough) if hessian is None else hessian,
     )
 
 
@@ -285,11 +291,11 @@ def _split_into_tiles(image: Image, side: tuple[int, int]) -> Image:
     return np.ascontiguousarray(cut).reshape(rows, cols, side[0] * side[1])
 
 
-def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image) -> Array:
+def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image, enough: int) -> Array:
     """Products of both images' gradients, scaled from enough rows of tiles to all of them."""
     side, band = level.side[1], _band(level.sigma_px)
     rows = len(window.y)
-    wanted = max(1, -(-HESSIAN_PIXELS // (sampled.shape[1] * side * _HESSIAN_BANDS)))
+    wanted = max(1, -(-enough // (sampled.shape[1] * side * _HESSIAN_BANDS)))
     bands = [(0, rows)]
     if wanted * _HESSIAN_BANDS < rows:
         starts = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -389,3 +390,32 @@ def test_noise_is_measured_where_the_texture_is() -> None:
     assert told.noise_variance == pytest.approx(64.0, rel=0.25)
     assert told.levels[-1].sigma_px == pytest.approx(truth.levels[-1].sigma_px, rel=0.3)
     assert prepare_reference(image).noise_variance < 16.0
+
+
+def _faint_pair(noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A pair that is resampled by half a pixel, which takes noise away at high frequencies, and the first before."""
+    rng = np.random.default_rng(2)
+    big = cv2.GaussianBlur(rng.standard_normal((440, 440)).astype(np.float32), (0, 0), 4.0)
+    big *= 8.0 / big.std()
+    raw = [big[20:404, 20 + k : 404 + k] + rng.normal(0.0, noise, (384, 384)) for k in (0, 3)]
+    matrix = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5]])
+    moved = [cv2.warpAffine(im.astype(np.float32), matrix, (384, 384)) for im in raw]
+    return moved[0], moved[1], raw[0].astype(np.float32)
+
+
+def test_noise_that_resampling_has_coloured_is_smoothed_as_white_noise_is() -> None:
+    first, _, raw = _faint_pair(12.0)
+    white = prepare_reference(raw).levels[-1].sigma_px
+    told = prepare_reference(first, raw=raw).levels[-1].sigma_px
+    # Without what it was before, it seems to have next to no noise, and structure at all frequencies.
+    assert prepare_reference(first).levels[-1].sigma_px < 0.6 * white
+    # Widths are in steps of 12 %.
+    assert told == pytest.approx(white, rel=0.15)
+
+
+def test_faint_images_are_compared_with_all_their_pixels() -> None:
+    first, second, raw = _faint_pair(40.0)
+    found = register(prepare_reference(first, raw=raw), second)
+    assert found.accepted, found.rejection
+    error_px = np.abs(found.shift_px - [-3.0, 0.0])
+    assert np.all(error_px < 4.0 * np.sqrt(np.diag(found.covariance)))
