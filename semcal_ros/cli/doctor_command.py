@@ -8,15 +8,20 @@ from pathlib import Path
 import click
 
 from semcal_ros.bridge.names import absolute_namespace
-from semcal_ros.cli.options import config_option
+from semcal_ros.cli.options import PATH, config_option
 from semcal_ros.cli.output import echo_json
 from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import Finding, Severity
+from semcal_ros.doctor.legend import explain_figures
+from semcal_ros.doctor.recording import diagnose_recording
 
 __all__ = ["command"]
 
+_ORDER = (Severity.PROBLEM, Severity.NOTE, Severity.OK)
+
 
 @click.command("doctor")
+@click.argument("recording", type=PATH, required=False)
 @config_option
 @click.option(
     "--calibration",
@@ -39,23 +44,35 @@ __all__ = ["command"]
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
-    config: str, calibration: Path | None, namespace: str, seconds: float, as_json: bool
+    recording: Path | None,
+    config: str,
+    calibration: Path | None,
+    namespace: str,
+    seconds: float,
+    as_json: bool,
 ) -> None:
-    """Look for what keeps a live stream from working, and say what to do.
+    """Look for what keeps a live stream from working, or is wrong with a RECORDING, and say what to do.
 
-    One line for each check: ok, note or problem. The exit status is 1 if there is a problem.
+    One line for each check, problems first: problem, note or ok. The exit status is 1 if there is a problem.
 
     \b
     Example:
       semcal doctor --config jsm820 --calibration cal.yaml --seconds 10
+      semcal doctor recording --calibration cal.yaml
     """
-    found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
+    if recording is None:
+        found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
+    else:
+        found = diagnose_recording(recording, config, calibration)
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})
     else:
-        for finding in found:
-            click.echo(f"{finding.level.value:<8} {finding}")
         click.echo(", ".join(f"{count} {name}" for name, count in _count_levels(found).items()))
+        # Who looks for help reads the first lines.
+        for finding in sorted(found, key=lambda finding: _ORDER.index(finding.level)):
+            click.echo(f"{finding.level.value:<8} {finding}")
+        for text in explain_figures(found):
+            click.echo(f"         {text}")
     if any(finding.level is Severity.PROBLEM for finding in found):
         sys.exit(1)
 

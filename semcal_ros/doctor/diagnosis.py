@@ -37,7 +37,7 @@ from semcal_ros.doctor.stream_checks import (
     describe_magnifications,
 )
 
-__all__ = ["diagnose", "evaluate"]
+__all__ = ["diagnose", "evaluate", "judge_calibrations"]
 
 
 def diagnose(
@@ -123,19 +123,20 @@ def evaluate(
     for output in topics[2:]:
         if output.type == "sensor_msgs/msg/Image":
             found += check_output_rate(images, output, session)
-    found += _judge_calibrations(session, magnification, config, given)
+    found += judge_calibrations(session, magnification, config, given)
     for topic in topics:
         if topic.keys == "stage":
             found += check_stage(topic, session, config)
     return found + check_diagnostics(session, namespace)
 
 
-def _judge_calibrations(
+def judge_calibrations(
     session: Session,
     topic: Topic,
     config: MicroscopeConfig,
     given: tuple[str, Calibration] | None,
 ) -> list[Finding]:
+    """Evaluate the magnification and the calibration, with the arguments of :func:`evaluate`."""
     found: list[Finding] = []
     live = None
     if session.calibration_text is not None:

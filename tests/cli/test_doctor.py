@@ -50,7 +50,7 @@ from semcal_ros.doctor.stream_checks import (
     describe_magnifications,
 )
 from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
-from tests.helpers.node_scenes import make_calibration
+from tests.helpers.node_scenes import make_calibration, write_recording
 from tests.helpers.project import NODES, ROOT
 
 OK, NOTE, PROBLEM = Severity.OK, Severity.NOTE, Severity.PROBLEM
@@ -586,6 +586,12 @@ def test_without_ros_it_says_so_and_checks_the_rest(
     status, output = doctor(capsys)
     assert status == 1
     lines = output.splitlines()
+    # Problems first, after the counts.
+    assert lines[0].startswith("1 problems, ")
+    levels = [line.split(maxsplit=1)[0] for line in lines[1:] if not line.startswith(" ")]
+    assert levels == sorted(levels, key=["problem", "note", "ok"].index)
+    assert set(levels) == {"problem", "note", "ok"}
+    assert lines[-1].startswith("         shared memory: ")
     assert any(line.startswith("ok       Python") for line in lines)
     assert any(line.startswith("problem  ROS 2: rclpy is not installed") for line in lines)
     assert any(line.startswith("note     topics: not checked") for line in lines)
@@ -625,3 +631,39 @@ def test_a_middleware_that_cannot_be_loaded_does_not_end_the_command(tmp_path: P
     assert done.returncode == 1, done.stderr
     assert "problem  middleware: RMW_IMPLEMENTATION is rmw_nowhere" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_a_recording_is_checked_without_ros(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    CALIBRATION.save(tmp_path / "cal.yaml")
+    path = tmp_path / "bag"
+    write_recording(path, [1000.0, 2000.0, 3000.0], size=32)
+    arguments = (str(path), "--config", "virtual_sem", "--calibration", str(tmp_path / "cal.yaml"))
+    status, output = doctor(capsys, *arguments)
+    assert status == 0, output
+    for line in (
+        "ok       /sem/image_raw: sensor_msgs/msg/Image in the recording",
+        "ok       images: 5 Hz, 32 x 32 mono8, 1024 bytes",
+        "ok       stamps: frames are 0 ms old when they arrive",
+        "ok       magnification: 3000",
+    ):
+        assert line in output
+    assert "scaled, which holds if the field of view is the same" in output
+
+
+def test_what_is_wrong_with_a_recording_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Each magnification after its image.
+    path = tmp_path / "late"
+    write_recording(path, [1000.0, 2000.0], size=32, lead_s=-0.001)
+    status, output = doctor(capsys, str(path), "--config", "virtual_sem")
+    assert status == 0
+    assert "note     magnification: 1 images come before the first one" in output
+    status, output = doctor(capsys, str(path), "--config", "pixel_size_nm")
+    assert status == 1
+    first = output.splitlines()[1]
+    assert first.startswith("problem  /sem/pixel_size: not in the recording, which holds ")
+    assert "/sem/image_raw (sensor_msgs/msg/Image)" in first
+    assert main(["doctor", str(tmp_path / "nothing")]) == 2
