@@ -276,7 +276,7 @@ class StreamNode(SemNode):
             self._waiting += 1
             self.reporter.note("frames_without_magnification", self._waiting)
             self.reporter.warn_seldom(
-                f"waiting for a magnification on {self.config.magnification.topic}: frames before it are not used"
+                f"frames without a magnification are not used: none has come on {self.config.magnification.topic} yet"
             )
         return frame.magnification
 
