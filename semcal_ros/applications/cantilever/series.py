@@ -214,7 +214,7 @@ def measure_series(
     )
     _check_length(undeformed, settings.length_m)
     frames, shape, misfit = work.deflections(undeformed, tuple(reference), on_frame)
-    notes = _collect_notes(undeformed, frames, background.path, settings)
+    notes = _collect_notes(undeformed, frames, background.path, tuple(reference), settings)
     notes += () if misfit is None else (misfit,)
     return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
@@ -296,12 +296,13 @@ def _collect_notes(
     undeformed: UndeformedBeam,
     frames: Sequence[Deflection],
     path: DriftPath,
+    reference: tuple[int, ...],
     settings: SeriesSettings,
 ) -> tuple[str, ...]:
     notes = list(undeformed.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
         notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
-    if lost := int(np.count_nonzero(~path.trusted)):
+    if lost := sum(not _is_tied(path, frame, reference) for frame in range(len(path))):
         left = (
             "they rest on the base alone"
             if undeformed.axis.base_seen
@@ -314,6 +315,11 @@ def _collect_notes(
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
         )
     return tuple(notes)
+
+
+def _is_tied(path: DriftPath, frame: int, reference: tuple[int, ...]) -> bool:
+    """Whether the drift between a frame and the reference frames is known."""
+    return bool(path.trusted[[frame, *reference]].all())
 
 
 def _name_reasons(path: DriftPath) -> str:
@@ -436,7 +442,7 @@ class _SeriesMeasurement:
         covariance = path.covariance[:, :2, :2]
         before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
         offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
-        if not path.trusted[frame]:
+        if not _is_tied(path, frame, reference):
             offset = max(offset, _UNTRACKED_M)
         # A single reference frame, compared with itself, has only its own noise.
         alone = frame in reference and len(reference) == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from semcal_ros.applications.cantilever.background_drift import (
     follow_background,
 )
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.series import _is_tied
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.estimates import DriftPath
 
 SIZE = 384
 
@@ -58,3 +62,21 @@ def test_drift_beside_a_wide_beam() -> None:
     assert path.trusted.all(), [u.reason for u in path.updates]
     # The contrast is as large as the noise, and a third of the image counts.
     np.testing.assert_allclose(path.drift_px, drift_px, atol=0.12)
+
+
+@pytest.mark.parametrize(
+    ("accepted", "reference", "tied"),
+    [
+        ([1, 1, 0], (0,), [1, 1, 0]),
+        # Tracking began with the second frame: nothing is known of the first.
+        ([0, 1, 1], (0,), [0, 0, 0]),
+        ([0, 1, 1], (1,), [0, 1, 1]),
+        ([1, 0, 1], (0, 1), [0, 0, 0]),
+    ],
+)
+def test_a_frame_is_tied_to_reference_frames_that_have_a_drift(
+    accepted: list[int], reference: tuple[int, ...], tied: list[int]
+) -> None:
+    updates = [SimpleNamespace(accepted=bool(a), restarted=False) for a in accepted]
+    path = DriftPath(updates)  # type: ignore[arg-type]
+    assert [_is_tied(path, k, reference) for k in range(3)] == [bool(t) for t in tied]
