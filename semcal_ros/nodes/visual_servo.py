@@ -71,6 +71,8 @@ class VisualServo(SemNode):
         self._state = "" if self._active else "waiting for ~/start"
         # Stamp of the last frame, and when (time.monotonic) it had been scanned.
         self._last: tuple[int, float] | None = None
+        # The shortest time between a scan and the work on it, by the stamps of a clock that is not this one.
+        self._least_delay_s = np.inf
         # The watchdog has a thread of its own: a frame that takes long to work on must not hold it up.
         self._lock = threading.RLock()
         self._interval_s = 0.0
@@ -94,13 +96,14 @@ class VisualServo(SemNode):
             self._halt,
             with_drift=bool(values["with_drift"]),
         )
+        alone = MutuallyExclusiveCallbackGroup()
         self._triggers = [
             self.endpoints.trigger_service("~/start", self._on_start),
-            self.endpoints.trigger_service("~/stop", self._on_stop),
+            # As the watchdog, not to wait for the end of the work on a frame.
+            self.endpoints.trigger_service("~/stop", self._on_stop, alone),
         ]
         # A simulated clock may stand still; the stage must not keep moving because of it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        alone = MutuallyExclusiveCallbackGroup()
         self._watchdog = self.create_timer(_TICK_S, self._watch, alone, clock=steady)
         self._signals = self.create_timer(_TICK_S, self._end.follow, clock=steady)
 
@@ -119,7 +122,7 @@ class VisualServo(SemNode):
         waiting = self._missing_inputs()
         with self._lock:
             self._servo.restart()
-            self._last, self._shortest_s = None, np.inf
+            self._last, self._shortest_s, self._least_delay_s = None, np.inf, np.inf
             self._active = True
             self._set_state(f"waiting for {waiting or 'frames'}")
         return (
@@ -152,6 +155,9 @@ class VisualServo(SemNode):
             if time.monotonic() - self._last[1] > self._longest_silence_s():
                 self._halt("no frames")
                 self._last = None
+            else:
+                # So that a stage may stop by itself when it hears nothing any more.
+                self._stage.repeat()
 
     def _longest_silence_s(self) -> float:
         """Return for how long the stage may move without being seen."""
@@ -188,36 +194,40 @@ class VisualServo(SemNode):
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
-    def _times(self, stamp_ns: int) -> tuple[float, float | None]:
-        """Return the centre of a frame's acquisition, and now; None if the stamp is of another clock."""
-        scan = self.config.scan
-        centre_offset_s = 0.0 if scan is None else scan.centre_offset_s
-        now_s = self._now_s()
-        time_s = stamp_ns * 1e-9 + self.config.start_offset_s + centre_offset_s
-        if 0.0 <= now_s - time_s < _OTHER_CLOCK_S:
-            return time_s, now_s
-        # As if the frame had arrived as soon as it was complete.
-        return now_s - centre_offset_s, None
+    def _times(self, stamp_ns: int) -> tuple[float, float | None, float]:
+        """Return the centre of a frame's acquisition, now, and how long ago its scan ended.
 
-    def _scanned_s(self, frame: ServoFrame, time_s: float, now_s: float | None) -> float:
-        """Return when the scan of a frame ended, on the clock of time.monotonic."""
-        if now_s is None:
-            return time.monotonic()
+        Now is None if the stamp is of another clock, which is as fast as this one: the frame that came soonest after
+        its scan counts as fresh, and the others are older by as much as they are later.
+        """
         scan = self.config.scan
-        after_s = 0.0 if scan is None else scan.acquisition_time_s - scan.centre_offset_s
-        return time.monotonic() - max(now_s - time_s - after_s, 0.0)
+        centre_s, whole_s = (
+            (0.0, 0.0) if scan is None else (scan.centre_offset_s, scan.acquisition_time_s)
+        )
+        now_s = self._now_s()
+        start_s = stamp_ns * 1e-9 + self.config.start_offset_s
+        delay_s = now_s - start_s - whole_s
+        self._least_delay_s = min(self._least_delay_s, delay_s)
+        if 0.0 <= now_s - start_s - centre_s < _OTHER_CLOCK_S and self._least_delay_s > -whole_s:
+            return start_s + centre_s, now_s, max(delay_s, 0.0)
+        age_s = delay_s - self._least_delay_s
+        # As if the frame had been there as soon as it was complete.
+        return now_s - age_s - (whole_s - centre_s), None, age_s
 
     def _on_frame(self, frame: ServoFrame) -> None:
-        time_s, now_s = self._times(frame.stamp_ns)
-        scanned_s = self._scanned_s(frame, time_s, now_s)
-        before, self._last = self._last, (frame.stamp_ns, scanned_s)
+        before, arrived_s = self._last, time.monotonic()
+        if before is not None and frame.stamp_ns <= before[0]:
+            self._least_delay_s = np.inf
         # What takes long, without the lock: the watchdog may have to stop the stage meanwhile.
         view = find_target(frame.image, self._target)
         with self._lock:
+            time_s, now_s, age_s = self._times(frame.stamp_ns)
+            # The work on a frame takes time, too, and a frame of another clock cannot be younger than that.
+            age_s = max(age_s, time.monotonic() - arrived_s)
+            self._last = frame.stamp_ns, time.monotonic() - age_s
             step = self._step(frame, view, before, (time_s, now_s))
-            late_s = time.monotonic() - scanned_s
-            if late_s > self._longest_silence_s():
-                reason = f"frames are {late_s:.1f} s old when they have been worked on"
+            if age_s > self._longest_silence_s():
+                reason = f"frames are {age_s:.1f} s old when they have been worked on"
                 step = self._servo.stop(ServoStatus.NOT_READY, reason, step.fit)
             moves = self._active and not step.reason
             self._send(step.twist if moves else np.zeros(3))

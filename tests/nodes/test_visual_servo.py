@@ -56,6 +56,7 @@ class Microscope:
         self.matrices = make(Image, "projection_stamped", RELIABLE)
         self.with_stamped = False
         self.late_s = 0.0
+        self._stamp_s = 0.0
         self.knob = make(Float64, "magnification", LATCHED)
         self.twists = peer.collect(Twist, "virtual_sem/stage")
         self.errors = peer.collect(PoseWithCovarianceStamped, "visual_servo/error")
@@ -71,8 +72,9 @@ class Microscope:
 
     def frame(self, ago_s: float = 0.0) -> None:
         """One frame that was scanned until now, or until some time ago."""
-        stamp_s = time.time() - 0.6 - ago_s
-        image = image_message(self.picture, stamp_s)
+        # A stream that falls behind keeps its order.
+        self._stamp_s = max(time.time() - 0.6 - ago_s, self._stamp_s + 0.01)
+        image = image_message(self.picture, self._stamp_s)
         info, drift = CameraInfo(), PoseWithCovarianceStamped()
         fill_camera_info(info, self.camera, image.header, SIZE, SIZE)
         fill_drift(drift, self.drift_m, np.eye(2) * 1e-18, image.header)
@@ -163,10 +165,12 @@ def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer
         peer.wait_for(lambda: "no frames" in peer.state(SERVO).get("servo_state", ""), "the reason")
 
 
-def test_frames_that_come_too_late_do_not_move_it(peer: Peer) -> None:
+@pytest.mark.parametrize("ahead_s", [0.0, 3600.0], ids=["own clock", "another clock"])
+def test_frames_that_come_too_late_do_not_move_it(peer: Peer, ahead_s: float) -> None:
     with servoed(peer) as (microscope, _):
+        microscope.late_s = -ahead_s
         microscope.frames_until(lambda: _moves(microscope), "motion")
-        microscope.late_s = 4.0
+        microscope.late_s = 4.0 - ahead_s
         microscope.frames_until(lambda: microscope.speed == 0.0, "the stop")
         first = len(microscope.twists)
         state = microscope.frames_until(
@@ -175,7 +179,7 @@ def test_frames_that_come_too_late_do_not_move_it(peer: Peer) -> None:
         microscope.frames_until(lambda: len(microscope.twists) > first + 5, "some more")
         assert not any(twist.linear.x for twist in microscope.twists[first:])
         assert "frames are" in state["message"]
-        microscope.late_s = 0.0
+        microscope.late_s = -ahead_s
         microscope.frames_until(lambda: _moves(microscope), "motion again")
 
 

@@ -47,6 +47,10 @@ class StageOutput:
         self._publisher.publish(message)
         self.twist = np.array(twist)
 
+    def repeat(self) -> None:
+        """Publish the last velocity once more."""
+        self.send(self.twist)
+
     def close(self) -> None:
         """Stop the stage and wait until it has received the zero velocity."""
         self.send(np.zeros(3))
