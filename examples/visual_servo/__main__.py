@@ -7,9 +7,10 @@
    scale of the display, with the interpolated calibration, and with the continuous one.
 3. What is judged is where the target really is.
 
-    python -m examples.visual_servo [--quick] [--live | --replay] [--preset jsm820] [--drift slow] [--fixed-axis]
+    python -m examples.visual_servo [--quick] [--live | --replay | --plants 10 | --seeds 5] [--preset jsm820]
 
 With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
+With --seeds each has a calibration, a rough charging target and a drift of its own; median and worst are told.
 With --replay the frames of the continuous case then become a recording, which bag_player replays to the nodes: what
 visual_servo says of each frame is compared with the truth.
 """
@@ -173,6 +174,22 @@ def printed(results: dict[str, dict[str, Any]]) -> None:
         print(f"{name:14}" + "".join(f"{cell:>9}" for cell in cells))
 
 
+def show_seeds(found: list[dict[str, dict[str, Any]]]) -> None:
+    """Median and worst of the final true error over several runs."""
+    print(
+        f"\nfinal true error over {len(found)} seeds      px: median   worst    nm: median   worst"
+    )
+    for name in found[0]:
+        px, nm = (np.array([r[name][f"final_true_{unit}"] for r in found]) for unit in ("px", "nm"))
+        print(f"{name:30}{np.median(px):20.3f}{px.max():8.3f}{np.median(nm):14.1f}{nm.max():8.1f}")
+
+
+def run_cases(task: Task, cases: list[Case]) -> list[Run]:
+    """All cases at the same time."""
+    work = Parallel(n_jobs=min(cpu_count(), 3))
+    return work(delayed(servo_run)(task, case) for case in cases)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer and smaller frames")
@@ -190,6 +207,9 @@ def main() -> int:
     parser.add_argument("--preset", choices=tuple(PRESETS), default="jsm820")
     parser.add_argument("--drift", choices=tuple(DRIFTS), default="slow")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="so many calibrations, targets and drifts"
+    )
     parser.add_argument("--fixed-axis", action="store_true", help="do not learn where the axis is")
     parser.add_argument("--output", type=Path, default=Path("visual_servo_output"))
     options = parser.parse_args()
@@ -218,9 +238,21 @@ def main() -> int:
         return 0
     settings = ServoSettings(axis_sigma_px=0.0) if options.fixed_axis else ServoSettings()
     task = Task(scope, START, GOAL, schedule(options.quick), options.drift, options.seed, settings)
-    work = Parallel(n_jobs=min(cpu_count(), 3))
     cases = cases_of(scope, continuous, discrete)
-    runs = work(delayed(servo_run)(task, case) for case in cases)
+    if options.seeds > 1:
+        # Another calibration, another target, and another drift each time.
+        found = []
+        for seed in range(options.seed, options.seed + options.seeds):
+            if seed != options.seed:
+                pair = calibrations(scope, seed + 1, quick=options.quick)
+                cases = cases_of(scope, *pair)
+            varied = replace(task, seed=seed, specimen="rough_target")
+            found.append({run.name: summary(run) for run in run_cases(varied, cases)})
+            print(f"seed {seed} ({time.monotonic() - began:.0f} s)", flush=True)
+        show_seeds(found)
+        (options.output / "seeds.json").write_text(json.dumps(found, indent=1))
+        return 0
+    runs = run_cases(task, cases)
     print(f"servoed {len(runs)} times ({time.monotonic() - began:.0f} s)", flush=True)
     results = {run.name: summary(run) for run in runs}
     place = np.array([[GOAL.x_m, GOAL.y_m, 0.0]])

@@ -47,6 +47,7 @@ class Task:
     schedule: Sequence[tuple[float, int]]
     drift: str = "slow"
     seed: int = 0
+    specimen: str = "target"
     settings: ServoSettings = field(default_factory=ServoSettings)
     stage: ActuatorFaults = field(default_factory=ActuatorFaults)
     #: What the detector makes of an image: a body in front of the target, a reversed contrast.
@@ -105,7 +106,7 @@ def servo_run(task: Task, case: Case) -> Run:
     scope, run = task.microscope, Run(case.name)
     scene = LiveScene(
         scope,
-        "target",
+        task.specimen,
         magnification=task.schedule[0][0],
         pose=task.start,
         drift=drift_preset(task.drift),

@@ -157,8 +157,8 @@ class LiveScene:
     microscope
         The microscope.
     kind
-        "grid", "gold" or "flat". On the grid, the view is of the region whose squares suit the
-        magnification.
+        One of :data:`~semcal_ros.synthetic.plans.SPECIMEN_KINDS`. On the grid, the view is of the
+        region whose squares suit the magnification.
     magnification
         Magnification to begin with.
     pose

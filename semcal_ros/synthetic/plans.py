@@ -25,7 +25,7 @@ from semcal_ros.synthetic.specimens.grid import (
     Specimen,
     square_for,
 )
-from semcal_ros.synthetic.specimens.target import TargetSpecimen
+from semcal_ros.synthetic.specimens.target import TargetSpecimen, random_target
 from semcal_ros.synthetic.stage import (
     SimulatedStage,
     StagePosition,
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 
-SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target")
+SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target", "rough_target")
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
@@ -82,6 +82,8 @@ def specimen_for(
         return FlatSpecimen(), None
     if kind == "target":
         return TargetSpecimen(), None
+    if kind == "rough_target":
+        return random_target(seed), None
     raise InvalidValueError(f"specimen '{kind}'", expected=f"one of {', '.join(SPECIMEN_KINDS)}")
 
 

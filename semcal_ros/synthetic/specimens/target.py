@@ -11,8 +11,10 @@ import numpy as np
 
 from semcal_ros.applications.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
 from semcal_ros.core.arrays import Array, Image
+from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
+from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
-__all__ = ["TargetSpecimen"]
+__all__ = ["TargetSpecimen", "random_target"]
 
 
 # Texels per cell: seven for each square of a marker, and nine for the white on either side.
@@ -30,11 +32,20 @@ class TargetSpecimen:
         The target.
     white, black
         Reflectivity of border and surroundings, and of the markers.
+    ground
+        What lies under and around the target; None: surroundings as white as its border.
+    roughness
+        Share of the texture of the ground that shows through the target, a film on it.
+    charging
+        What charge does to its brightness.
     """
 
     target: NestedTarget = field(default_factory=NestedTarget)
     white: float = 0.85
     black: float = 0.15
+    ground: Substrate | None = None
+    roughness: float = 0.0
+    charging: Charging = NO_CHARGING
 
     @property
     def supersampling(self) -> int:
@@ -55,7 +66,38 @@ class TargetSpecimen:
             _paint(seen, self.target, level, x_m / cell_m, y_m / cell_m, box_m / cell_m)
         seen *= np.float32(self.white - self.black)
         seen += np.float32(self.black)
-        return seen
+        if self.ground is not None:
+            ground = self.ground.reflectivity(x_m, y_m, footprint_m)
+            half_m = 0.5 * RATIO * self.target.cell_m(0)
+            film = (np.abs(x_m) < half_m) & (np.abs(y_m) < half_m)
+            rough = seen + np.float32(self.roughness) * (ground - np.float32(self.ground.level))
+            seen = np.where(film, rough, ground)
+        if self.charging.gradient_per_m != (0.0, 0.0):
+            seen = seen * self.charging.shade(x_m, y_m)
+        return np.asarray(np.clip(seen, 0.0, None), dtype=np.float32)
+
+
+def random_target(seed: int) -> TargetSpecimen:
+    """Draw a target on ground of any kind, as a rough film that charges."""
+    rng = np.random.default_rng([seed, 11])
+    ground = Substrate(
+        kind=SUBSTRATES[int(rng.integers(len(SUBSTRATES)))],  # type: ignore[arg-type]
+        level=float(rng.uniform(0.2, 0.7)),
+        contrast=float(rng.uniform(0.05, 0.2)),
+        # From a tenth of a pixel's worth of grain to half of a marker, at 1000x.
+        size_m=float(10.0 ** rng.uniform(-6.3, -5.0)),
+        seed=int(rng.integers(2**31)),
+    )
+    towards = rng.uniform(0.0, 2.0 * math.pi)
+    # A field of 240 um at 500x is up to a third darker on one side than on the other.
+    slope = rng.uniform(0.0, 1.4e3)
+    return TargetSpecimen(
+        white=float(rng.uniform(0.6, 0.95)),
+        black=float(rng.uniform(0.05, 0.3)),
+        ground=ground,
+        roughness=float(rng.uniform(0.2, 0.8)),
+        charging=Charging((slope * math.cos(towards), slope * math.sin(towards))),
+    )
 
 
 def _paint(seen: Image, target: NestedTarget, level: int, x: Array, y: Array, box: Array) -> None:
