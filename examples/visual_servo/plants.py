@@ -17,8 +17,8 @@ from semcal_ros.synthetic.actuator import ActuatorFaults
 FRAMES = 40
 LAST = 5
 MAGNIFICATION = 1000.0
-# The optical axis, which the controller has to learn, and the motion within a frame are worth some px.
-KNOWN_PX = 5.0
+# The optical axis, which the controller has to learn, and the motion within a frame are worth some px of 0.47 um.
+KNOWN_M = 2.5e-6
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,9 @@ def judge(run: Run) -> Outcome:
     target = NestedTarget()
     blind = sum(
         bool(np.any(twist))
-        and not abs(own - true) < KNOWN_PX
+        and not abs(own - true) < KNOWN_M
         and not find_target(raw, target).accepted
-        for raw, twist, own, true in zip(run.raw, run.twist, run.own_px, run.true_px, strict=True)
+        for raw, twist, own, true in zip(run.raw, run.twist, run.own_m, run.true_m(), strict=True)
     )
     return Outcome(all(run.converged[-LAST:]), final_px, blind, tuple(filter(None, run.reason)))
 
