@@ -18,7 +18,7 @@ from semcal_ros.applications.servoing import (
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import NOISE_FREE, Detector, LiveScene, Pose, preset, render_frame
-from semcal_ros.synthetic.specimens.target import TargetSpecimen
+from semcal_ros.synthetic.specimens.target import TargetSpecimen, random_target
 
 TARGET = NestedTarget()
 SCOPE = replace(preset("jsm820"), timing=ScanTiming(0.1))
@@ -113,3 +113,20 @@ def test_what_is_no_target_is_refused() -> None:
 def test_the_live_scene_shows_it() -> None:
     scene = LiveScene(SCOPE, "target", magnification=1000.0, pose=Pose.flat((5e-6, 0.0, 0.0)))
     assert find_target(scene.frame(0.0).image, TARGET).accepted
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_rough_target_on_any_ground_is_found_where_it_is(seed: int) -> None:
+    scope, g = SCOPE.with_image_size(256, 256), 1000.0
+    pose = PlanePose(7e-6, -5e-6, 0.3)
+    flat = Pose.flat((pose.x_m, pose.y_m, 0.0), pose.angle_rad)
+    camera = scope.camera_at(g)
+    images = [
+        render_frame(scope, specimen, flat, g, detector=Detector(), seed=3)
+        for specimen in (random_target(seed), TargetSpecimen())
+    ]
+    assert np.std(images[0].astype(float) - images[1]) > 5.0
+    view = find_target(Rectifier("cubic").rectify(images[0], camera), TARGET)
+    error = fit_pose(view, PlaneCamera.from_camera(camera)).pose.minus(pose)
+    # A fifth of a pixel: the texture of the ground pulls the sides of the markers.
+    assert np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2])) < 0.2

@@ -71,10 +71,10 @@ class TargetSpecimen:
             half_m = 0.5 * RATIO * self.target.cell_m(0)
             film = (np.abs(x_m) < half_m) & (np.abs(y_m) < half_m)
             rough = seen + np.float32(self.roughness) * (ground - np.float32(self.ground.level))
-            seen = np.where(film, rough, ground)
+            seen[...] = np.where(film, rough, ground)
         if self.charging.gradient_per_m != (0.0, 0.0):
-            seen = seen * self.charging.shade(x_m, y_m)
-        return np.asarray(np.clip(seen, 0.0, None), dtype=np.float32)
+            seen *= np.asarray(self.charging.shade(x_m, y_m), dtype=np.float32)
+        return np.asarray(np.maximum(seen, 0.0), dtype=np.float32)
 
 
 def random_target(seed: int) -> TargetSpecimen:
