@@ -47,13 +47,13 @@ class Task:
     schedule: Sequence[tuple[float, int]]
     drift: str = "slow"
     seed: int = 0
-    specimen: str = "target"
     settings: ServoSettings = field(default_factory=ServoSettings)
     stage: ActuatorFaults = field(default_factory=ActuatorFaults)
     #: What the detector makes of an image: a body in front of the target, a reversed contrast.
     seen: Callable[[np.ndarray], np.ndarray] = lambda image: image
     #: Largest fraction of the interval by which a frame is late.
     late: float = 0.0
+    specimen: str = "target"
 
 
 @dataclass
