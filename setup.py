@@ -60,6 +60,10 @@ class Distribution(setuptools.Distribution):
         if self.in_workspace:
             self.entry_points["console_scripts"] += self.entry_points["semcal_ros.nodes"]
             self.install_requires = []
+            # The setuptools of Ubuntu 24.04 keeps requirements with a condition here.
+            self.extras_require = {
+                name: needed for name, needed in self.extras_require.items() if name[:1] != ":"
+            }
         return parsed
 
     def run_commands(self) -> None:

@@ -12,6 +12,8 @@ from email.parser import HeaderParser
 from pathlib import Path
 
 import pytest
+import setuptools
+from packaging.version import Version
 
 import semcal_ros
 from tests.helpers.project import NODES, PYPROJECT, ROOT
@@ -64,6 +66,10 @@ def _entry_points(text: str) -> configparser.ConfigParser:
     return parser
 
 
+@pytest.mark.skipif(
+    Version(setuptools.__version__) < Version("70.1"),
+    reason="pip would fetch the setuptools that pyproject.toml asks for",
+)
 def test_a_wheel_holds_everything(source: Path, tmp_path: Path) -> None:
     pip = ("-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation")
     _run(source, *pip, "--disable-pip-version-check", "--wheel-dir", str(tmp_path), ".")
