@@ -1,3 +1,17 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """JEOL: a text file beside the image with lines such as ``$CM_MAG 50``.
 
 ``$CM_STAGE_POSITION`` of newer programs names its axes (``X=37.1, Y=44.9, R=355.0, Z=16.9, T=0.0``; mm and
