@@ -30,6 +30,7 @@ drift        registration beside phase correlation, ECC, scikit-image, imreg_dft
 rectify      rectification beside a bare cv2.remap; its map beside the exact inverse
 ball         what makes a reconstructed ball too small, one cause at a time
 live         one frame through core and node, and the stream over DDS, beside a bare remap and copy
+start_up     commands and nodes before they do anything, beside the import of numpy
 ===========  =======================================================================================
 
 Not among these: ``python -m benchmarks.drift.soak``, 20 000 frames out and back.
@@ -65,6 +66,7 @@ PARTS = {
     "rectify": "benchmarks.rectification",
     "ball": "benchmarks.ball",
     "live": "benchmarks.live",
+    "start_up": "benchmarks.start_up",
 }
 
 
