@@ -54,7 +54,10 @@ class SourceWatch:
     def check(
         self, now_s: float, received: int, publishers: Sequence[str]
     ) -> tuple[list[str], list[str]]:
-        """Return new warnings and new good news, given the messages so far and the names of all publishers."""
+        """Return new warnings and new good news, given the messages so far and the names of all publishers.
+
+        The name of a publisher that is not known is empty.
+        """
         warnings, news = self._check_silence(now_s, received, len(publishers))
         before, self.rivals = self.rivals, self.describe_rivals(now_s, publishers)
         if self.rivals and not before:
@@ -84,10 +87,12 @@ class SourceWatch:
     def describe_rivals(self, now_s: float, publishers: Sequence[str]) -> str:
         """Return, in a few words, which publishers are one too many; empty if none is.
 
-        Two of one name count only after a while: one of them may be a process that was killed.
+        Two of one name count only after a while: one of them may be a process that was killed. So does one whose name
+        is empty, because it is not known yet: it may be the successor.
         """
-        names = sorted(set(publishers))
-        if len(publishers) <= len(names):
+        names = sorted(set(publishers) - {""})
+        count = len(publishers)
+        if count <= max(len(names), 1):
             self._namesakes_since_s = None
         elif self._namesakes_since_s is None:
             self._namesakes_since_s = now_s
@@ -95,7 +100,9 @@ class SourceWatch:
             self._namesakes_since_s is not None and now_s - self._namesakes_since_s >= _FORGOTTEN_S
         )
         if len(names) > 1 or lasting:
-            count = len(publishers)
-            listed = ", ".join(names if len(names) > 1 else [f"{names[0]} {count} times"])
+            if "" in publishers:
+                listed = ", ".join([*names, "without a name"])
+            else:
+                listed = ", ".join(names if len(names) > 1 else [f"{names[0]} {count} times"])
             return f"{count} publishers on {self._topic}: {listed}"
         return ""

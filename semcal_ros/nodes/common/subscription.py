@@ -36,6 +36,8 @@ Callback = Callable[[Any, MessageInfo], None]
 
 # The value reported by a middleware that does not number its messages.
 _NO_NUMBER = 2**64 - 1
+# The name that ROS gives a node of which it knows a publisher and not yet the name.
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 
 
 def published_ns(info: MessageInfo) -> int:
@@ -232,7 +234,7 @@ class AdaptiveSubscription:
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe()
             self._node.get_logger().warning(
-                f"a publisher on {self.topic} does not offer the requested {refused.name.lower()};"
+                f"a publisher on {self.full_topic} does not offer the requested {refused.name.lower()};"
                 f" subscribed again without it ({self.downgraded})"
             )
 
@@ -246,7 +248,7 @@ class AdaptiveSubscription:
         foreign = {p.topic_type for p in publishers} - {self._type_name}
         for type_name in foreign - self._foreign_types:
             self._node.get_logger().warning(
-                f"{type_name} is published on {self.topic}; expected {self._type_name}; correct the"
+                f"{type_name} is published on {self.full_topic}; expected {self._type_name}; correct the"
                 " configuration or the publisher"
             )
         self._foreign_types = foreign
@@ -264,13 +266,16 @@ class AdaptiveSubscription:
 
     def _sources(self, publishers: list[Any]) -> list[str]:
         return [
-            f"{p.node_namespace.rstrip('/')}/{p.node_name}"
+            "" if p.node_name == _UNKNOWN_NODE else f"{p.node_namespace.rstrip('/')}/{p.node_name}"
             for p in publishers
             if p.topic_type == self._type_name
         ]
 
     def publishers(self) -> list[str]:
-        """Return the full names of the nodes that publish on the topic at this moment, once for each publisher."""
+        """Return the full names of the nodes that publish on the topic at this moment, once for each publisher.
+
+        The name of a node that has been found just now may not be known yet, and is empty.
+        """
         found = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
         return self._sources(found)
 

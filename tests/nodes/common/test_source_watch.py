@@ -16,9 +16,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from semcal_ros.nodes.common.source_watch import SourceWatch
+from semcal_ros.nodes.common.subscription import AdaptiveSubscription
 
 SEM, BAG = "/sem/virtual_sem", "/sem/bag_player"
 NOTHING: tuple[list[str], list[str]] = ([], [])
@@ -71,3 +75,29 @@ def test_the_successor_of_a_killed_one_is_no_rival_but_a_lasting_namesake_is(
     image.check(50.0, 3, [SEM])
     image.check(51.0, 4, [SEM, SEM])
     assert image.rivals == ""
+
+
+def test_a_publisher_whose_name_is_not_known_yet_may_be_the_successor_of_a_killed_one() -> None:
+    image = watch()
+    assert image.check(1.0, 1, [""]) == NOTHING
+    assert image.check(2.0, 2, [SEM, ""]) == NOTHING
+    assert image.rivals == ""
+    # With its name it is a rival at once, and without one after a while.
+    assert image.describe_rivals(3.0, [SEM, BAG]).endswith(f"{BAG}, {SEM}")
+    image.check(10.0, 3, [SEM, ""])
+    image.check(41.0, 4, [SEM, ""])
+    assert image.rivals == f"2 publishers on /sem/image_raw: {SEM}, without a name"
+
+
+def test_ros_says_that_a_name_is_not_known_by_a_name() -> None:
+    def publisher(name: str, namespace: str, kind: str = "std_msgs/msg/String") -> Any:
+        return SimpleNamespace(node_name=name, node_namespace=namespace, topic_type=kind)
+
+    subscription: Any = SimpleNamespace(_type_name="std_msgs/msg/String")
+    found = [
+        publisher("_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"),
+        publisher("driver", "/"),
+        publisher("virtual_sem", "/sem"),
+        publisher("other", "/sem", "std_msgs/msg/Int8"),
+    ]
+    assert AdaptiveSubscription._sources(subscription, found) == ["", "/driver", SEM]
