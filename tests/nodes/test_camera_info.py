@@ -47,13 +47,17 @@ def test_what_belongs_to_an_image_follows_its_remap(peer: Peer, calibration_file
     }
     infos = {key: peer.collect(CameraInfo, name, LATCHED) for key, name in topics.items()}
     compressed = peer.collect(CompressedImage, "/out/rect/compressed")
+    matrices = peer.collect(Image, "/out/projection_stamped")
     remap = ("-r", "image_rect:=/out/rect")
     with running("rectifier", {"calibration": calibration_file}, *remap):
-        peer.wait_heard(NODE, *topics, "image_rect/compressed")
+        peer.wait_heard(NODE, *topics, "image_rect/compressed", "projection_stamped")
         peer.wait_for(lambda: image.get_subscription_count() == 1, "the subscription")
         magnification.publish(magnification_message(2000.0))
         image.publish(image_message(texture()))
-        peer.wait_for(lambda: compressed and all(infos.values()), "the image and its cameras")
+        peer.wait_for(
+            lambda: compressed and matrices and all(infos.values()), "the image and its cameras"
+        )
+    assert matrices[0].header == infos["camera_info"][0].header
     rect = CAMERA.rectified.K.ravel()
     for key in ("camera_info", "image_rect/camera_info"):
         np.testing.assert_allclose(infos[key][0].k, rect, rtol=1e-12)

@@ -97,6 +97,7 @@ class RectifiedOutput:
         self._databar_rows = config.image.databar_rows
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
         beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
+        matrix = "projection_stamped"
         info, projection = CameraInfo(), Image()
         self._outputs = [
             (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
@@ -106,7 +107,10 @@ class RectifiedOutput:
                 ),
                 info,
             ),
-            (endpoints.stream_publisher(Image, "projection_stamped"), projection),
+            (
+                endpoints.stream_publisher(Image, matrix, endpoints.beside(matrix, "image_rect")),
+                projection,
+            ),
         ]
         self._messages = info, projection
         raw = config.image.topic
