@@ -274,8 +274,9 @@ class StreamNode(SemNode):
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(name, (_MIXED, *declarations))
         self.frames: FrameInput | None = None
+        self._without_magnification = 0
+        # Of them, those since the last frame that had one.
         self._waiting = 0
-        self._is_waiting = False
 
     def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
         """Start receiving frames, at the end of the constructor; ``options`` are those of :class:`FrameInput`."""
@@ -285,17 +286,21 @@ class StreamNode(SemNode):
 
     def known_magnification(self, frame: StreamFrame) -> float | None:
         """Return the magnification of a frame; count a frame without one."""
-        self._is_waiting = frame.magnification is None
         if frame.magnification is None:
             self._waiting += 1
-            self.reporter.note("frames_without_magnification", self._waiting)
-            self.reporter.warn_seldom(
-                f"frames without a magnification are not used: none has come on {self.config.magnification.topic} yet"
+            self._without_magnification += 1
+            self.reporter.note("frames_without_magnification", self._without_magnification)
+        elif self._waiting:
+            # Not a warning: where nodes have just met, the first image often comes before the magnification. The watch
+            # over that topic warns if none comes.
+            self.reporter.info(
+                f"not used: {self._waiting} images that came while the magnification was not known"
             )
+            self._waiting = 0
         return frame.magnification
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report a missing magnification and images too large for the transport."""
-        waiting = ["waiting for magnification"] if self._is_waiting else []
+        waiting = ["waiting for magnification"] if self._waiting else []
         transport = [] if self.frames is None else self.frames.conditions()
         return super().conditions() + waiting + transport

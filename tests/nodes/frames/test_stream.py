@@ -17,13 +17,14 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, is_late
+from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode, is_late
 from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import image_message, magnification_message, texture
 
@@ -180,3 +181,13 @@ def test_images_or_magnifications_of_two_publishers_are_refused_where_they_would
     # A stream goes on all the same.
     bench.receive(1.0)
     assert bench.stamps_s == [1.0]
+
+
+def test_images_before_their_magnification_are_counted_and_told_once_it_has_come() -> None:
+    reporter, log = fake_reporter()
+    node: Any = SimpleNamespace(reporter=reporter, _waiting=0, _without_magnification=0)
+    for g in (None, None, 1000.0, 1000.0, None):
+        frame: Any = SimpleNamespace(magnification=g)
+        assert StreamNode.known_magnification(node, frame) == g
+    assert log == ["not used: 2 images that came while the magnification was not known"]
+    assert notes(reporter)["frames_without_magnification"] == "3"
