@@ -296,7 +296,7 @@ class BagPlayer(SemNode):
         if outputs:
             self.reporter.warn(
                 f"the recording holds what nodes of the suite publish: {', '.join(outputs)}. If they run, it comes"
-                " twice, and a recorded calibration replaces theirs; topics:=inputs leaves it out"
+                " twice, and a recorded calibration is used where none is in force; topics:=inputs leaves it out"
             )
 
     # -- control -----------------------------------------------------------------------------------

@@ -16,7 +16,12 @@
 
 from __future__ import annotations
 
-from semcal_ros.nodes.common.subscription import MessageCounter
+from typing import Any
+
+from std_msgs.msg import String
+
+from semcal_ros.nodes.common.qos import image_input
+from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageCounter
 
 
 def counted(*messages: tuple[int | None, int]) -> tuple[int, int]:
@@ -69,3 +74,34 @@ def test_after_a_reset_the_next_message_follows_none() -> None:
     counter.reset()
     counter.count(9, 2)
     assert (counter.lost, counter.restarts) == (0, 0)
+
+
+class Middleware:
+    """What a subscription uses of its node; one publisher until another number is set."""
+
+    publishers = 1
+    topic_name = "/sem/image_raw"
+
+    def create_guard_condition(self, *_args: Any, **_options: Any) -> None:
+        return None
+
+    def create_subscription(self, *_args: Any, **_options: Any) -> Middleware:
+        return self
+
+    def get_publisher_count(self) -> int:
+        return self.publishers
+
+
+def test_a_subscription_counts_what_it_hands_on() -> None:
+    node: Any = Middleware()
+    received: list[int] = []
+    images = AdaptiveSubscription(
+        node, String, "image_raw", lambda message, _info: received.append(message), image_input()
+    )
+    for number in (1, 2, 5):
+        images._on_message(number, {"publication_sequence_number": number})
+    assert (received, images.lost, images.restarts) == ([1, 2, 5], 2, 0)
+    # A successor that begins before the killed one is forgotten.
+    node.publishers = 2
+    images._on_message(9, {"publication_sequence_number": 9})
+    assert (images.lost, images.restarts) == (2, 1)
