@@ -36,6 +36,7 @@ from semcal_ros.files.bags.topics import topic_matches
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.publisher import PatientPublisher
 from semcal_ros.nodes.common.qos import overridable, service_queue, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
 
@@ -266,7 +267,11 @@ class BagPlayer(SemNode):
             self._latched.add(topic.name)
         profile = value_input(1) if is_latched else stream_output(_DEPTH)
         return self.create_publisher(
-            message_type, topic.name, profile, qos_overriding_options=overridable()
+            message_type,
+            topic.name,
+            profile,
+            qos_overriding_options=overridable(),
+            publisher_class=PatientPublisher,
         )
 
     def _find_frames(self) -> set[str]:

@@ -25,6 +25,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
+from semcal_ros.nodes.common.publisher import PatientPublisher
 from semcal_ros.nodes.common.qos import (
     camera_output,
     latched,
@@ -119,7 +120,11 @@ class Endpoints:
         self, message_type: Any, topic: str, profile: QoSProfile, name: str | None = None
     ) -> Any:
         publisher = self._node.create_publisher(
-            message_type, name or topic, profile, qos_overriding_options=overridable()
+            message_type,
+            name or topic,
+            profile,
+            qos_overriding_options=overridable(),
+            publisher_class=PatientPublisher,
         )
         self._publishers[topic] = publisher
         return publisher

@@ -1,0 +1,60 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What happens to a message that the middleware refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.publisher import Publisher
+
+from semcal_ros.nodes.common.publisher import PatientPublisher
+
+
+class Middleware:
+    """Refuses so many messages, then takes the others."""
+
+    def __init__(self, refusals: int, monkeypatch: pytest.MonkeyPatch, *, up: bool = True) -> None:
+        self.refusals = refusals
+        self.calls = 0
+        self.taken: list[str] = []
+        self.publisher: Any = object.__new__(PatientPublisher)
+        monkeypatch.setattr(Publisher, "publish", lambda _self, message: self.take(message))
+        monkeypatch.setattr("rclpy.utilities.ok", lambda: up)
+
+    def take(self, message: str) -> None:
+        self.calls += 1
+        if self.calls <= self.refusals:
+            raise RCLError("Failed to publish: cannot publish data")
+        self.taken.append(message)
+
+
+def test_a_refused_message_is_published_once_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    middleware = Middleware(3, monkeypatch)
+    middleware.publisher.publish("first")
+    middleware.publisher.publish("second")
+    assert middleware.taken == ["first", "second"]
+
+
+@pytest.mark.parametrize(("up", "calls"), [(True, 10), (False, 1)])
+def test_a_refusal_that_lasts_or_comes_with_the_end_is_raised(
+    monkeypatch: pytest.MonkeyPatch, up: bool, calls: int
+) -> None:
+    middleware = Middleware(1000, monkeypatch, up=up)
+    with pytest.raises(RCLError, match="cannot publish data"):
+        middleware.publisher.publish("lost")
+    assert middleware.calls == calls
