@@ -183,7 +183,7 @@ def test_semcal_is_a_command_of_the_environment() -> None:
     assert "0." in done.stdout
 
 
-@pytest.mark.parametrize("part", ["package.xml", "launch", "msg_configs", "dds"])
+@pytest.mark.parametrize("part", ["package.xml", "launch", "config", "msg_configs", "dds"])
 def test_share_holds_what_a_workspace_would(part: str) -> None:
     share = Path(get_package_share_directory("semcal_ros"))
     source = Path(__file__).resolve().parents[2] / part
