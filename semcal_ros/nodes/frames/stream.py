@@ -294,7 +294,7 @@ class StreamNode(SemNode):
             # Not a warning: where nodes have just met, the first image often comes before the magnification. The watch
             # over that topic warns if none comes.
             self.reporter.info(
-                f"not used: {self._waiting} images that came while the magnification was not known"
+                f"images not used because their magnification was not known: {self._waiting}"
             )
             self._waiting = 0
         return frame.magnification

@@ -189,5 +189,5 @@ def test_images_before_their_magnification_are_counted_and_told_once_it_has_come
     for g in (None, None, 1000.0, 1000.0, None):
         frame: Any = SimpleNamespace(magnification=g)
         assert StreamNode.known_magnification(node, frame) == g
-    assert log == ["not used: 2 images that came while the magnification was not known"]
+    assert log == ["images not used because their magnification was not known: 2"]
     assert notes(reporter)["frames_without_magnification"] == "3"
