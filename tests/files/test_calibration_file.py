@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -23,6 +25,7 @@ import yaml
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -60,6 +63,47 @@ def test_loading_gives_back_every_bit(calibration, tmp_path):
     assert loaded.dumps() == calibration.dumps()
 
 
+_ORIGIN = Provenance(
+    "2026-01-02 03:04:05",
+    ("2026-01-01 10:00:00", "2026-01-01 11:00:00"),
+    "0.1.0",
+    "grid",
+    "0" * 64,
+    "jsm820",
+    "1" * 64,
+    ("frame 0", "frame 2"),
+    {"maker": ("tescan",), "working_distance_m": (0.009, 0.0091)},
+)
+
+
+def test_provenance_comes_back(calibration):
+    known = replace(calibration, provenance=_ORIGIN)
+    assert Calibration.loads(known.dumps()).provenance == _ORIGIN
+
+
+def test_a_file_of_version_1_is_read_without_provenance(calibration):
+    text = replace(calibration, provenance=Provenance()).dumps()
+    assert "provenance" not in text
+    old = text.replace("\nversion: 2\n", "\nversion: 1\n")
+    assert old != text
+    loaded = Calibration.loads(old)
+    assert loaded.provenance == Provenance()
+    np.testing.assert_array_equal(loaded.at(777.7).parameters, calibration.at(777.7).parameters)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"recording_sha256": "abc"},
+        {"operator": "x"},
+        {"conditions": {"working_distance_m": [0.01, float("inf")]}},
+    ],
+)
+def test_wrong_provenance_is_refused(calibration, wrong):
+    with pytest.raises(CalibrationFileError):
+        Calibration.loads(_broken(calibration, lambda d: d.update(provenance=wrong)))
+
+
 def _broken(calibration, edit):
     data = yaml.safe_load(calibration.dumps())
     edit(data)
@@ -70,7 +114,7 @@ def _broken(calibration, edit):
     ("edit", "message"),
     [
         (lambda d: d.update(format="other"), "not a calibration file"),
-        (lambda d: d.update(version=2), "update semcal_ros"),
+        (lambda d: d.update(version=3), "update semcal_ros"),
         (lambda d: d.update(version=0), "calibrate again"),
         (lambda d: d.update(version="1"), "file version"),
         (lambda d: d.pop("functions"), "functions"),

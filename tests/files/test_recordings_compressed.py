@@ -190,3 +190,19 @@ def test_commands_read_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     told = capsys.readouterr()
     assert "1 x 30 x 20 mono16" in told.out
     assert COMPRESSED_IMAGE_TYPE in told.err
+
+
+@pytest.mark.parametrize("codec", ["png", "jpeg"])
+def test_an_outline_needs_no_decoding(tmp_path: Path, codec: str) -> None:
+    """Size, encoding and stamp come from the header; equal bytes have the same digest."""
+    images = [picture("mono8", seed) for seed in (0, 1, 1)]
+    made = [message(image, "mono8", T0 + k, codec) for k, image in enumerate(images, 1)]
+    path = recorded(tmp_path / "bag", *(("/sem/image_raw/compressed", one) for one in made))
+    with open_recording(path, COMPRESSED) as opened:
+        outlines, frames = list(opened.outlines({0})), list(opened.frames())
+    assert [o.image is None for o in outlines] == [False, True, True]
+    assert [o.size_px for o in outlines] == [(30, 20)] * 3
+    assert [(o.stamp_ns, o.encoding, o.magnification) for o in outlines] == [
+        (f.stamp_ns, f.encoding, f.magnification) for f in frames
+    ]
+    assert outlines[0].digest != outlines[1].digest == outlines[2].digest

@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.video import open_video
+from semcal_ros.files.video import open_video, shade
 
 WIDTH, HEIGHT = 160, 120
 TEXT_ROWS = 40  # at the bottom
@@ -45,10 +45,10 @@ def pictures(count: int) -> list[np.ndarray]:
 
 def write(path: Path, frames: list[np.ndarray], expected: int | None = None) -> None:
     count = len(frames) if expected is None else expected
-    with open_video(path, (WIDTH, HEIGHT), count, 12.5, (BLACK, WHITE)) as video:
+    with open_video(path, (WIDTH, HEIGHT), count, 12.5) as video:
         assert video is not None
         for number, frame in enumerate(frames):
-            video.write(frame, f"frame {number}")
+            video.write(shade(frame, (BLACK, WHITE)), f"frame {number}")
 
 
 def read(path: Path) -> list[np.ndarray]:

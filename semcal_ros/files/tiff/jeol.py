@@ -44,22 +44,11 @@ JEOL states magnifications for a photograph of 128 mm x 96 mm, which is 0.1 mm p
 in the file decides where it contradicts.
 """
 
-_MAX_SIDECAR_BYTES = 1_000_000  # the text files have a few kB
 
-
-def _decode(data: bytes) -> str:
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16", errors="replace")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
-
-
-def jeol_pairs(data: bytes) -> dict[str, str]:
+def jeol_pairs(text: str) -> dict[str, str]:
     """Settings by name, without their dollar signs; empty if this is not a JEOL text file."""
     pairs: dict[str, str] = {}
-    for line in _decode(data[:_MAX_SIDECAR_BYTES]).splitlines():
+    for line in text.splitlines():
         if line.startswith("$"):
             key, _, value = line.strip().partition(" ")
             pairs.setdefault(key.lstrip("$"), value.strip())
@@ -152,9 +141,11 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
     distance_mm = plain_number(pairs.get("SM_WD", ""))
     rotation = plain_number(pairs.get("SM_SCAN_ROTATION", ""))
     tilt, turn, left_out = _stage_angles(pairs)
+    voltage_kv = plain_number(pairs.get("CM_ACCEL_VOLT", pairs.get("CM_ACCEL_VOLTAGE", "")))
     stamp = f"{pairs.get('CM_DATE', '')} {pairs.get('CM_TIME', '')}"
     return VendorSettings(
-        vendor="jeol",
+        maker="jeol",
+        beam="electron",
         pixel_size_m=pixel_m,
         pixel_size_y_m=pixel_m,
         displayed_magnification=positive(plain_number(pairs.get("CM_MAG", ""))),
@@ -164,7 +155,8 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
         stage_tilt_rad=tilt,
         stage_rotation_rad=turn,
         detector=pairs.get("CM_DETECTOR_NAME") or pairs.get("CM_DETECTOR", ""),
-        instrument=pairs.get("CM_INSTRUMENT", ""),
+        model=pairs.get("CM_INSTRUMENT", ""),
+        acceleration_voltage_v=None if voltage_kv is None else 1e3 * abs(voltage_kv),
         time=first_date([(stamp, "%Y/%m/%d %H:%M:%S"), (stamp, "%Y/%m/%d %I:%M:%S %p")]),
         display_width_assumed=assumed,
         notes=(*notes, *left_out),

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.codec_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
 from semcal_ros.core.errors import TiffError
 
-__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_counts", "grey_image", "page_size"]
+__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_directories", "grey_image", "page_size"]
 
 # These limits bound the memory that a damaged header can request.
 MAX_SIDE_PX = 65_536
@@ -42,31 +42,54 @@ _MAX_PACKING = 4096
 _SINGLE = frozenset({256, 257, 259, 262, 266, 274, 277, 278, 284, 317, 322, 323})
 # Offset of the first directory, number of its entries, and an entry's code, type, count and value.
 _LAYOUTS = {42: (4, "I", "H", "HHI4x"), 43: (8, "Q", "Q", "HHQ8x")}
+# OpenCV decodes other kinds, too, but shows damaged parts as black, without a word.
+_DECODED_HERE = (
+    tifffile.COMPRESSION.NONE,
+    tifffile.COMPRESSION.ADOBE_DEFLATE,
+    tifffile.COMPRESSION.DEFLATE,
+)
 _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 
 
-def check_counts(path: Path) -> None:
-    """Refuse a first directory with several values in a single-value tag: the parser would multiply them.
+def check_directories(path: Path, *, pages: int = 1) -> int:
+    """Return the number of directories, of ``pages`` at most, after a check that they can be parsed.
 
-    Other damage is left to the parser, ``struct.error`` and ``OSError`` included.
+    Refused are several values in a single-value tag, which the parser would multiply, and directories in a loop, of
+    which it would drop all but the first. Other damage is left to the parser, ``struct.error`` and ``OSError``
+    included.
     """
     with path.open("rb") as file:
         head = file.read(16)
         order = {b"II": "<", b"MM": ">"}.get(head[:2])
         layout = _LAYOUTS.get(struct.unpack_from(order + "H", head, 2)[0]) if order else None
         if order is None or layout is None:
-            return
+            return pages
         place, offset_code, number_code, entry_code = layout
-        file.seek(struct.unpack_from(order + offset_code, head, place)[0])
-        number_size = struct.calcsize(order + number_code)
-        (number,) = struct.unpack(order + number_code, file.read(number_size))
-        size = struct.calcsize(order + entry_code)
-        entries = file.read(min(number, 2**16) * size)
-    for code, _, count in struct.iter_unpack(
-        order + entry_code, entries[: len(entries) // size * size]
-    ):
-        if code in _SINGLE and count != 1:
-            raise TiffError(f"{path.name} has {count} values in tag {code}", expected="one")
+        (offset,) = struct.unpack_from(order + offset_code, head, place)
+        number_size, size = (struct.calcsize(order + code) for code in (number_code, entry_code))
+        seen: set[int] = set()
+        while offset and len(seen) < pages:
+            if offset in seen:
+                raise TiffError(
+                    f"{path.name} has {len(seen)} directories in a loop",
+                    expected="a last one",
+                    do="copy it again from the microscope",
+                )
+            seen.add(offset)
+            file.seek(offset)
+            (number,) = struct.unpack(order + number_code, file.read(number_size))
+            entries = file.read(min(number, 2**16) * size)
+            for code, _, count in struct.iter_unpack(
+                order + entry_code, entries[: len(entries) // size * size]
+            ):
+                if code in _SINGLE and count != 1:
+                    raise TiffError(f"{path.name} has {count} values in tag {code}", expected="one")
+            if len(seen) < pages:
+                file.seek(offset + number_size + number * size)
+                (offset,) = struct.unpack(
+                    order + offset_code, file.read(struct.calcsize(order + offset_code))
+                )
+    return len(seen)
 
 
 def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
@@ -88,7 +111,11 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
         )
     bits = page.bitspersample
     if bits not in (8, 16) or page.imagedepth != 1:
-        raise TiffError(f"{path.name} has {bits} bits per sample", expected="8 or 16")
+        raise TiffError(
+            f"{path.name} has {bits} bits per sample",
+            expected="8 or 16",
+            do="save it with 16 bits, in ImageJ by Image > Type > 16-bit",
+        )
     samples = int(page.samplesperpixel)
     if not 1 <= samples <= _MAX_SAMPLES:
         raise TiffError(
@@ -124,10 +151,14 @@ def _to_grey(image: NDArray[Any], page: tifffile.TiffPage) -> NDArray[Any]:
     return image
 
 
-def _decode_by_opencv(path: Path) -> NDArray[Any]:
+def _decode_by_opencv(path: Path, index: int) -> NDArray[Any]:
     """Decode a grey image with OpenCV's TIFF decoder, which needs no further packages for LZW."""
-    data = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    if index == 0:
+        image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), flags)
+    else:
+        _, images = cv2.imreadmulti(str(path), index, 1, flags=flags)
+        image = images[0] if images else None
     if image is None:
         raise ValueError("the compressed image cannot be decoded")
     return np.asarray(image)
@@ -142,10 +173,10 @@ def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
         The pixel data are truncated or damaged.
     """
     size = (int(page.imagelength), int(page.imagewidth))
-    if page.compression in (tifffile.COMPRESSION.NONE, tifffile.COMPRESSION.ADOBE_DEFLATE):
+    if page.compression in _DECODED_HERE:
         image = _to_grey(np.asarray(page.asarray()), page)
     else:
-        image = _decode_by_opencv(path)
+        image = _decode_by_opencv(path, page.index)
     if image.shape != size or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"the decoded image is {image.dtype} {image.shape}")
     return np.ascontiguousarray(image)

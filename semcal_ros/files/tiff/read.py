@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Read an SEM image of any known maker."""
+"""Read SEM images of any known maker: one page of a TIFF, or all of them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,32 @@ import tifffile
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff import tescan, thermo_fisher, zeiss
-from semcal_ros.files.tiff.jeol import jeol_pairs, jeol_settings
-from semcal_ros.files.tiff.pixels import check_counts, grey_image, page_size
+from semcal_ros.files.tiff import hitachi, jeol, phenom, tescan, thermo_fisher, xml_tag, zeiss
+from semcal_ros.files.tiff.imagej import (
+    imagej_channels,
+    imagej_entries,
+    imagej_images,
+    imagej_info,
+    imagej_settings,
+)
+from semcal_ros.files.tiff.pixels import check_directories, grey_image, page_size
 from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
+from semcal_ros.files.tiff.side_file import decode_text, find_side_file, read_side_file
 
-__all__ = ["is_tiff", "read_sem_settings", "read_sem_tiff"]
+__all__ = [
+    "is_tiff",
+    "open_tiff",
+    "read_page_settings",
+    "read_sem_pages",
+    "read_sem_settings",
+    "read_sem_tiff",
+    "side_file_settings",
+]
 
 SUFFIXES = (".tif", ".tiff")
+# Bounds what a damaged chain of directories can request; a series of this length fills a day at 1 Hz.
+_MAX_PAGES = 100_000
+_REDUCED = 1  # bit of NewSubfileType that marks a preview
 # What the TIFF parser raises on damaged bytes; caught only around calls of it.
 _PARSER_ERRORS: tuple[type[Exception], ...] = (
     tifffile.TiffFileError,
@@ -77,40 +96,114 @@ def _quiet() -> Iterator[None]:
         _OPENCV_LOG.setLogLevel(opencv)
 
 
-def _sidecar(path: Path, endings: tuple[str, ...]) -> Path | None:
-    """The file beside ``path`` whose name is its stem and one of the endings, in either case."""
-    names = [path.stem + form for ending in endings for form in (ending, ending.upper())]
-    return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
-
-
-def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> VendorSettings:
-    """Read the settings from the metadata of the file's maker."""
+def _tag_settings(
+    path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]
+) -> VendorSettings | None:
+    """Read the settings from the tags of the file's maker; None without them."""
     tags = page.tags
     if zeiss.TAG in tags and isinstance(tags[zeiss.TAG].value, dict):
-        return zeiss.zeiss_settings(path, tags[zeiss.TAG].value)
+        return zeiss.zeiss_settings(path, tags[zeiss.TAG].value, size_px)
     for code in thermo_fisher.TAGS:
-        if code in tags and isinstance(tags[code].value, dict):
-            return thermo_fisher.thermo_fisher_settings(path, tags[code].value, size_px)
+        value = tags[code].value if code in tags else None
+        # Tag 34680 of newer programs holds something else, which has no sections.
+        if isinstance(value, dict) and value:
+            return thermo_fisher.thermo_fisher_settings(path, value, size_px)
+    if xml_tag.TAG in tags:
+        return _xml_settings(path, tags[xml_tag.TAG].value, size_px)
     if tescan.TAG in tags:
         value = tags[tescan.TAG].value
         data = value if isinstance(value, bytes) else str(value).encode()
         return tescan.tescan_settings(path, data, size_px)
-    return _sidecar_settings(path, size_px)
+    return None
 
 
-def _sidecar_settings(path: Path, size_px: tuple[int, int]) -> VendorSettings:
-    text = _sidecar(path, (".txt",))
+def _xml_settings(path: Path, document: Any, size_px: tuple[int, int]) -> VendorSettings:
+    root = xml_tag.parse_xml(path, document if isinstance(document, bytes) else str(document))
+    if root.tag == phenom.ROOT:
+        return phenom.phenom_settings(path, root, size_px)
+    if root.tag == thermo_fisher.ROOT:
+        return thermo_fisher.thermo_fisher_xml_settings(path, root, size_px)
+    raise TiffError(
+        f"{path.name}: tag {xml_tag.TAG} holds XML with the root {str(root.tag)[:40]!r}",
+        expected=f"{thermo_fisher.ROOT} (Thermo Fisher) or {phenom.ROOT} (Phenom)",
+        do="export the image again with its metadata",
+    )
+
+
+def _text_settings(path: Path, text: str, size_px: tuple[int, int]) -> VendorSettings | None:
+    """Read the settings from a maker's text in a side file or in what another program kept; None without them."""
+    pairs = jeol.jeol_pairs(text)
+    if pairs:
+        return jeol.jeol_settings(path, pairs, size_px)
+    pairs = hitachi.hitachi_pairs(text)
+    if pairs:
+        return hitachi.hitachi_settings(path, pairs, size_px)
+    return None
+
+
+def side_file_settings(path: str | Path, size_px: tuple[int, int]) -> VendorSettings | None:
+    """Read the settings from the text file that JEOL, Hitachi or TESCAN wrote beside an image of any format.
+
+    Parameters
+    ----------
+    path
+        The image.
+    size_px
+        (width, height) of the stored image, databar included.
+
+    Returns
+    -------
+    VendorSettings or None
+        None if there is no such file.
+
+    Raises
+    ------
+    TiffError
+        The file contradicts the image or has no usable pixel size.
+    """
+    path = Path(path)
+    text = find_side_file(path, (".txt",))
     if text is not None:
-        pairs = jeol_pairs(text.read_bytes())
-        if pairs:
-            return jeol_settings(path, pairs, size_px)
-    header = _sidecar(path, (".hdr", f"-{path.suffix[1:]}.hdr"))
+        settings = _text_settings(path, decode_text(read_side_file(text)), size_px)
+        if settings is not None:
+            return settings
+    header = find_side_file(path, (".hdr", f"-{path.suffix[1:]}.hdr"))
     if header is not None:
-        return tescan.tescan_settings(path, header.read_bytes(), size_px)
+        return tescan.tescan_settings(path, read_side_file(header), size_px, header.name)
+    return None
+
+
+def _kept_text_settings(path: Path, info: str, size_px: tuple[int, int]) -> VendorSettings | None:
+    """Read the settings from a maker's text in the ``Info`` of ImageJ; None without one that fits the image."""
+    try:
+        if "AP_" in info and (entries := zeiss.zeiss_entries(info)):
+            return zeiss.zeiss_settings(path, entries, size_px)
+        if "[Scan]" in info or "[EScan]" in info:
+            sections = thermo_fisher.thermo_fisher_sections(info)
+            return thermo_fisher.thermo_fisher_settings(path, sections, size_px)
+        if info.lstrip().startswith("<"):
+            return _xml_settings(path, info, size_px)
+        return _text_settings(path, info, size_px) or side_file_settings(path, size_px)
+    except TiffError:
+        # The copy may be cropped or scaled; what the original said of itself does not hold for it then.
+        return None
+
+
+def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> VendorSettings:
+    """Read the settings from the metadata of the file's maker."""
+    settings = _tag_settings(path, page, size_px)
+    if settings is not None:
+        return settings
+    if imagej_entries(page):
+        kept = _kept_text_settings(path, imagej_info(page), size_px)
+        return imagej_settings(path, page, kept)
+    settings = side_file_settings(path, size_px)
+    if settings is not None:
+        return settings
     raise TiffError(
         f"{path.name} has no metadata of a known SEM",
-        expected="tag 34118 (Zeiss), 34680 or 34682 (Thermo Fisher), 50431 (TESCAN), "
-        "or a JEOL .txt beside it",
+        expected="tag 34118 (Zeiss), 34680, 34682 or 34683 (Thermo Fisher, Phenom), 50431 (TESCAN), the scale of "
+        "ImageJ, or a .txt (JEOL, Hitachi) or .hdr (TESCAN) file beside it",
         do="use the microscope's original file, not a converted copy",
     )
 
@@ -133,38 +226,146 @@ def _parsing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[tifffile.TiffFile]:
+def open_tiff(path: Path, *, pages: int = 1) -> Iterator[tifffile.TiffFile]:
+    """Open a TIFF; its first ``pages`` directories are checked, and the parser raises only TiffErrors."""
     with _parsing(path):
-        check_counts(path)
+        check_directories(path, pages=pages)
         with tifffile.TiffFile(path) as file:
             yield file
 
 
-def _first_page(file: tifffile.TiffFile, path: Path) -> tifffile.TiffPage:
-    page = file.pages.first
+def _page(file: tifffile.TiffFile, path: Path, index: int) -> tifffile.TiffPage:
+    page = file.pages.first if index == 0 else file.pages[index]
     if not isinstance(page, tifffile.TiffPage):
         raise TiffError(f"{path.name} has no image", expected="an SEM image")
     return page
 
 
-def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
-    """Read the settings and the stored (width, height) without decoding pixels; raises as :func:`read_sem_tiff`."""
-    path = Path(path)
-    with _open(path) as file:
-        page = _first_page(file, path)
+def _list_pages(
+    file: tifffile.TiffFile, path: Path, directories: int
+) -> list[tuple[tifffile.TiffPage, VendorSettings, tuple[int, int]]]:
+    """All images of a file but previews, with their settings: their own, or those of the first of the same size.
+
+    The channels of ImageJ are detectors: they are no time series.
+    """
+    first = _page(file, path, 0)
+    images, number = imagej_images(imagej_entries(first)), len(file.pages)
+    if number < directories:
+        raise TiffError(
+            f"{path.name} has {directories} directories, of which only {number} can be read",
+            expected="an intact TIFF of an SEM",
+            do="copy it again from the microscope",
+        )
+    if images > number:
+        raise TiffError(
+            f"{path.name} declares {images} images in {number} directories, as ImageJ writes files above 4 GB",
+            expected="one directory for each image",
+            do="save the images from ImageJ by File > Save As > Image Sequence",
+        )
+    listed: list[tuple[tifffile.TiffPage, VendorSettings, tuple[int, int]]] = []
+    for index in range(min(number, _MAX_PAGES)):
+        page = _page(file, path, index)
+        if index and int(page.subfiletype) & _REDUCED:
+            continue
         size_px = page_size(path, page)
-        return _settings(path, page, size_px), size_px
+        own = _tag_settings(path, page, size_px) if index else _settings(path, page, size_px)
+        if own is None:
+            _check_size_of_first(path, index, size_px, listed[0][2])
+            own = listed[0][1]
+        listed.append((page, own, size_px))
+    return [(page, _of_channel(own, first, page.index), size) for page, own, size in listed]
 
 
-def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemImage:
+def _check_size_of_first(
+    path: Path, index: int, size_px: tuple[int, int], first_px: tuple[int, int]
+) -> None:
+    """Refuse an image that has neither metadata of its own nor the size of the first, whose scale it would get."""
+    if size_px != first_px:
+        raise TiffError(
+            f"image {index + 1} in {path.name} is {size_px[0]} x {size_px[1]} pixels without metadata",
+            expected=f"{first_px[0]} x {first_px[1]} pixels as the first, or metadata of its own",
+            do="save the images of one size in a file of their own",
+        )
+
+
+def _of_channel(settings: VendorSettings, first: tifffile.TiffPage, index: int) -> VendorSettings:
+    """Name the detector by the channel if ImageJ wrote several, one after the other for each slice."""
+    channels = imagej_channels(imagej_entries(first))
+    if channels == 1:
+        return settings
+    name = f"{settings.detector} channel {1 + index % channels}".strip()
+    return replace(settings, detector=name)
+
+
+def _sem_image(
+    path: Path, page: tifffile.TiffPage, settings: VendorSettings, databar_rows: int | None
+) -> SemImage:
+    image: NDArray[Any] = grey_image(path, page)
+    rows = settings.databar_rows if databar_rows is None else databar_rows
+    height, width = image.shape
+    if not 0 <= rows < height:
+        raise TiffError(f"{rows} rows of databar in {path.name}", expected=f"0 to {height - 1}")
+    return SemImage(path, image[: height - rows], (width, height), rows, settings, page.index)
+
+
+def read_sem_settings(path: str | Path) -> tuple[VendorSettings, tuple[int, int]]:
+    """Read the settings and the stored (width, height) of the first image without decoding pixels.
+
+    Raises as :func:`read_sem_tiff`.
+    """
+    path = Path(path)
+    with open_tiff(path) as file:
+        page = _page(file, path, 0)
+        size_px = page_size(path, page)
+        return _of_channel(_settings(path, page, size_px), page, 0), size_px
+
+
+def read_page_settings(
+    path: str | Path,
+) -> tuple[tuple[int, VendorSettings, tuple[int, int]], ...]:
+    """Read the page index, settings and stored (width, height) of all images of a file without decoding pixels.
+
+    Previews are left out. A page without metadata of its own has those of the first.
+
+    Raises
+    ------
+    TiffError
+        As :func:`read_sem_tiff`, for any of the images.
+    """
+    path = Path(path)
+    with _parsing(path):
+        directories = check_directories(path, pages=_MAX_PAGES)
+        with tifffile.TiffFile(path) as file:
+            listed = _list_pages(file, path, directories)
+    return tuple((page.index, own, size_px) for page, own, size_px in listed)
+
+
+def read_sem_pages(path: str | Path, *, databar_rows: int | None = None) -> Iterator[SemImage]:
+    """Yield all images of a file, which is opened once; parameters and errors as :func:`read_sem_tiff`."""
+    path = Path(path)
+    with _parsing(path):
+        directories = check_directories(path, pages=_MAX_PAGES)
+        opened = tifffile.TiffFile(path)
+    with opened as file:
+        with _parsing(path):
+            listed = _list_pages(file, path, directories)
+        for page, settings, _ in listed:
+            with _parsing(path):  # not around the yield: it silences loggers
+                image = _sem_image(path, page, settings, databar_rows)
+            yield image
+
+
+def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None, page: int = 0) -> SemImage:
     """Read an SEM image and its settings; its tags or the text file beside it say who made the microscope.
 
     Parameters
     ----------
     path
-        A TIFF file of Zeiss, Thermo Fisher (FEI), TESCAN or JEOL.
+        A TIFF file of Zeiss, Thermo Fisher (FEI), TESCAN, JEOL, Hitachi or Phenom, or a copy of one that ImageJ saved.
     databar_rows
         Rows to cut off at the bottom, instead of those that the metadata give.
+    page
+        Index of the image in a file of several, as of :func:`read_page_settings`.
 
     Raises
     ------
@@ -172,12 +373,12 @@ def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None) -> SemIm
         The file is missing, truncated or not a TIFF, or has no known metadata, no usable pixel size, or an absurd size.
     """
     path = Path(path)
-    with _open(path) as file:
-        page = _first_page(file, path)
-        settings = _settings(path, page, page_size(path, page))
-        image: NDArray[Any] = grey_image(path, page)
-    rows = settings.databar_rows if databar_rows is None else databar_rows
-    height, width = image.shape
-    if not 0 <= rows < height:
-        raise TiffError(f"{rows} rows of databar in {path.name}", expected=f"0 to {height - 1}")
-    return SemImage(path, image[: height - rows], (width, height), rows, settings)
+    with open_tiff(path, pages=page + 1) as file:
+        own, first = _page(file, path, page), _page(file, path, 0)
+        size_px = page_size(path, own)
+        settings = _tag_settings(path, own, size_px) if page else None
+        if settings is None:
+            first_px = page_size(path, first)
+            _check_size_of_first(path, page, size_px, first_px)
+            settings = _settings(path, first, first_px)
+        return _sem_image(path, own, _of_channel(settings, first, page), databar_rows)

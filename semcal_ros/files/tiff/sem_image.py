@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -25,17 +25,67 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SemImage", "VendorSettings"]
+__all__ = ["Conditions", "SemImage", "VendorSettings"]
 
 
-@dataclass(frozen=True)
-class VendorSettings:
-    """Settings from a maker's metadata in SI units; None where a file does not have one.
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """How an image was taken, in SI units; None, or an empty text, where a file does not say it.
 
     Parameters
     ----------
-    vendor
-        ``zeiss``, ``thermo_fisher``, ``tescan`` or ``jeol``.
+    maker
+        ``zeiss``, ``thermo_fisher``, ``tescan``, ``jeol``, ``hitachi``, ``phenom`` or, for a copy that ImageJ saved
+        without the maker's metadata, ``imagej``.
+    model, serial_number
+        Name and serial number of the microscope.
+    detector
+        Detector or signal.
+    beam
+        ``electron`` or ``ion``.
+    acceleration_voltage_v
+        Acceleration voltage, without its sign.
+    working_distance_m
+        Working distance.
+    scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
+        Angles in the maker's sense of rotation.
+    dwell_s
+        Time on each pixel in one pass.
+    frame_time_s
+        Time of one pass over the frame.
+    frame_interval_s
+        Time from one page of the file to the next.
+    time
+        Local time of the recording, without a time zone.
+    """
+
+    maker: str = ""
+    model: str = ""
+    serial_number: str = ""
+    detector: str = ""
+    beam: str = ""
+    acceleration_voltage_v: float | None = None
+    working_distance_m: float | None = None
+    scan_rotation_rad: float | None = None
+    stage_tilt_rad: float | None = None
+    stage_rotation_rad: float | None = None
+    dwell_s: float | None = None
+    frame_time_s: float | None = None
+    frame_interval_s: float | None = None
+    time: datetime | None = None
+
+    def conditions(self) -> dict[str, Any]:
+        """All conditions by name as plain values for JSON."""
+        values = {item.name: getattr(self, item.name) for item in fields(Conditions)}
+        return {**values, "time": None if self.time is None else self.time.isoformat()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VendorSettings(Conditions):
+    """Conditions and scale from a maker's metadata in SI units; None where a file does not have one.
+
+    Parameters
+    ----------
     pixel_size_m
         Width of a pixel of the stored image on the specimen.
     pixel_size_y_m
@@ -44,8 +94,6 @@ class VendorSettings:
         The magnification that the microscope showed, which depends on its display width.
     databar_rows
         Rows at the bottom of the file that are not part of the scan.
-    scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
-        Angles in the maker's sense of rotation.
     display_width_assumed
         Whether the pixel size rests on the maker's usual display width, not on a value in the
         file.
@@ -53,20 +101,10 @@ class VendorSettings:
         Remarks on these values for the user.
     """
 
-    vendor: str
     pixel_size_m: float
     pixel_size_y_m: float
     displayed_magnification: float | None = None
     databar_rows: int = 0
-    working_distance_m: float | None = None
-    scan_rotation_rad: float | None = None
-    stage_tilt_rad: float | None = None
-    stage_rotation_rad: float | None = None
-    dwell_s: float | None = None
-    frame_time_s: float | None = None
-    detector: str = ""
-    instrument: str = ""
-    time: datetime | None = None
     display_width_assumed: bool = False
     notes: tuple[str, ...] = ()
 
@@ -87,6 +125,8 @@ class SemImage:
         Rows that were cut off at the bottom.
     settings
         The maker's metadata.
+    page
+        Index of the image in a file of several.
     """
 
     path: Path
@@ -94,11 +134,12 @@ class SemImage:
     full_size_px: tuple[int, int]
     databar_rows: int
     settings: VendorSettings = field(repr=False)
+    page: int = 0
 
     @property
-    def vendor(self) -> str:
-        """``zeiss``, ``thermo_fisher``, ``tescan`` or ``jeol``."""
-        return self.settings.vendor
+    def maker(self) -> str:
+        """The maker; see :class:`Conditions`."""
+        return self.settings.maker
 
     @property
     def pixel_size_m(self) -> float:
@@ -181,7 +222,7 @@ class SemImage:
         s = self.settings
         return {
             "file": self.path.name,
-            "vendor": s.vendor,
+            "page": self.page,
             "full_size_px": list(self.full_size_px),
             "databar_rows": self.databar_rows,
             "pixel_size_m": s.pixel_size_m,
@@ -190,15 +231,7 @@ class SemImage:
             "displayed_magnification": s.displayed_magnification,
             "display_width_m": self.display_width_m,
             "display_width_assumed": s.display_width_assumed,
-            "working_distance_m": s.working_distance_m,
-            "scan_rotation_rad": s.scan_rotation_rad,
-            "stage_tilt_rad": s.stage_tilt_rad,
-            "stage_rotation_rad": s.stage_rotation_rad,
-            "dwell_s": s.dwell_s,
-            "frame_time_s": s.frame_time_s,
-            "detector": s.detector,
-            "instrument": s.instrument,
-            "time": None if s.time is None else s.time.isoformat(),
+            **s.conditions(),
             "bits": int(8 * np.dtype(self.image.dtype).itemsize),
             "notes": list(s.notes),
         }

@@ -26,7 +26,14 @@ from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_number, positive
+from semcal_ros.files.tiff.side_file import decode_text
+from semcal_ros.files.tiff.values import (
+    check_pixel_size,
+    first_date,
+    plain_number,
+    positive,
+    tilt_correction_note,
+)
 
 __all__ = ["TAG", "tescan_pairs", "tescan_settings"]
 
@@ -52,7 +59,7 @@ def _text_records(data: bytes) -> list[str]:
     return texts
 
 
-def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
+def tescan_pairs(path: Path, data: bytes, where: str = "tag 50431") -> dict[str, str]:
     """Return all ``key=value`` pairs of the tag's bytes or of a ``.hdr`` file's text.
 
     Raises
@@ -60,7 +67,7 @@ def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
     TiffError
         There are no pairs, or the pixel size is missing: the tag is damaged.
     """
-    texts = _text_records(data) or [data.decode("utf-8", errors="replace")]
+    texts = _text_records(data) or [decode_text(data)]
     pairs: dict[str, str] = {}
     for line in "\n".join(texts).replace("\x00", "\n").splitlines():
         key, equals, value = line.partition("=")
@@ -68,22 +75,24 @@ def tescan_pairs(path: Path, data: bytes) -> dict[str, str]:
             pairs.setdefault(key.strip(), value.strip())
     if "PixelSizeX" not in pairs:
         raise TiffError(
-            f"{path.name}: tag 50431 holds {len(pairs)} settings and no PixelSizeX",
+            f"{path.name}: {where} holds {len(pairs)} settings and no PixelSizeX",
             expected="the key=value lines of TESCAN",
             do="export the image again with its metadata",
         )
     return pairs
 
 
-def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> VendorSettings:
-    """Read the settings from the raw bytes of the tag (lengths in metres, angles in degrees).
+def tescan_settings(
+    path: Path, data: bytes, size_px: tuple[int, int], where: str = "tag 50431"
+) -> VendorSettings:
+    """Read the settings from the raw bytes of the tag or file (lengths in metres, angles in degrees).
 
     Raises
     ------
     TiffError
         The pixel size is missing or unusable, or the databar is higher than the image.
     """
-    pairs = tescan_pairs(path, data)
+    pairs = tescan_pairs(path, data, where)
 
     def number(key: str) -> float | None:
         return plain_number(pairs.get(key, ""))
@@ -103,9 +112,13 @@ def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> Vendor
         value = number(key)
         return None if value is None else math.radians(value)
 
+    voltage = number("HV")
+    correction = number("TiltCorrection")
+    notes = (tilt_correction_note(math.radians(correction)),) if correction else ()
     stamp = f"{pairs.get('Date', '')} {pairs.get('Time', '')}"
     return VendorSettings(
-        vendor="tescan",
+        maker="tescan",
+        beam="electron",
         pixel_size_m=pixel_m,
         pixel_size_y_m=pixel_y_m,
         displayed_magnification=positive(number("Magnification")),
@@ -115,7 +128,10 @@ def tescan_settings(path: Path, data: bytes, size_px: tuple[int, int]) -> Vendor
         stage_tilt_rad=angle("StageTilt"),
         stage_rotation_rad=angle("StageRotation"),
         dwell_s=positive(number("DwellTime")),
-        detector=pairs.get("Detector", ""),
-        instrument=pairs.get("Device", ""),
+        detector=pairs.get("Detector") or pairs.get("Detector0", ""),
+        model=pairs.get("DeviceModel") or pairs.get("Device", ""),
+        serial_number=pairs.get("SerialNumber", ""),
+        acceleration_voltage_v=None if voltage is None else abs(voltage),
         time=first_date([(stamp, "%Y-%m-%d %H:%M:%S")]),
+        notes=notes,
     )

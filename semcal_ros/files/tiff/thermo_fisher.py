@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections.
+"""Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections, and XML in tag 34683.
 
-The tags are in SI units throughout: ``StageT`` and ``StageR`` of ``[Stage]`` and ``ScanRotation`` of the
-beam are in rad.
+All of them are in SI units throughout: ``StageT`` and ``StageR`` of ``[Stage]`` and ``ScanRotation`` of the
+beam are in rad, and so are ``Tilt/Alpha``, ``Rotation`` and ``ScanRotation`` of the XML, whose root is ``Metadata``.
 """
 
 from __future__ import annotations
@@ -23,17 +23,46 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import check_pixel_size, first_date, plain_number, positive
+from semcal_ros.files.tiff.values import (
+    check_pixel_size,
+    first_date,
+    plain_number,
+    positive,
+    tilt_correction_note,
+)
+from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
 
-__all__ = ["TAGS", "thermo_fisher_settings"]
+__all__ = [
+    "ROOT",
+    "TAGS",
+    "thermo_fisher_sections",
+    "thermo_fisher_settings",
+    "thermo_fisher_xml_settings",
+]
 
 # Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)
+ROOT = "Metadata"
+_BEAMS = {"EBeam": "electron", "IBeam": "ion", "Electron": "electron", "Ion": "ion"}
 # Beyond it a note says that pixels are not square; both sizes are used unchanged in any case.
 _SQUARE_TOLERANCE = 1e-3
+
+
+def thermo_fisher_sections(text: str) -> dict[str, dict[str, str]]:
+    """Sections of the tag's text, as a copy by another program may keep it, in the form of the decoded tag."""
+    sections: dict[str, dict[str, str]] = {}
+    section: dict[str, str] = {}
+    for line in text.splitlines():
+        key, equals, value = line.strip().partition("=")
+        if key.startswith("[") and key.endswith("]"):
+            section = sections.setdefault(key[1:-1], {})
+        elif equals:
+            section[key.strip()] = value.strip()
+    return sections
 
 
 def _section(tag: Mapping[str, Any], name: object) -> Mapping[str, Any]:
@@ -46,10 +75,11 @@ def _active(tag: Mapping[str, Any], kind: str, fallback: str) -> Mapping[str, An
     return _section(tag, _section(tag, "Beam").get(kind, fallback)) or _section(tag, fallback)
 
 
-def _databar_rows(path: Path, image: Mapping[str, Any], size_px: tuple[int, int]) -> int:
+def _databar_rows(
+    path: Path, columns: float | None, rows: float | None, size_px: tuple[int, int]
+) -> int:
     """Rows below the scanned ones; the tag's DatabarHeight is 0 even where there is a bar."""
     width, height = size_px
-    columns, rows = plain_number(image.get("ResolutionX")), plain_number(image.get("ResolutionY"))
     if columns is None or rows is None:
         return 0
     if int(columns) != width or not 0 < rows <= height:
@@ -75,6 +105,26 @@ def _magnification(tag: Mapping[str, Any], field_width_m: float) -> tuple[float 
     return (None if width is None else positive(width / field_width_m)), notes
 
 
+def _check_is_a_scan(
+    path: Path, tag: Mapping[str, Any], beam: Mapping[str, Any], pixel_width: object
+) -> None:
+    """Refuse pictures of the chamber's cameras and channeling patterns, whose pixels are not on the specimen."""
+    name = str(_section(tag, "Beam").get("Beam", "EBeam"))
+    if name not in _BEAMS and pixel_width is None:
+        detector = _section(tag, "Detectors").get("Name", name)
+        raise TiffError(
+            f"{path.name} is a picture of a camera ({detector}), not of a scanned beam",
+            expected="an image of the electron or the ion beam",
+            do="take the images of the beam only",
+        )
+    if str(beam.get("ElectronChannelingPatternIsOn", "")).lower() in ("on", "yes", "true"):
+        raise TiffError(
+            f"{path.name} is an electron channeling pattern, whose pixels are angles",
+            expected="an image of the specimen",
+            do="take the image without the channeling pattern mode",
+        )
+
+
 def thermo_fisher_settings(
     path: Path, tag: Mapping[str, Any], size_px: tuple[int, int]
 ) -> VendorSettings:
@@ -89,6 +139,7 @@ def thermo_fisher_settings(
     beam, scan = _active(tag, "Beam", "EBeam"), _active(tag, "Scan", "EScan")
     common = _section(tag, "Scan")
     seen = scan.get("PixelWidth", common.get("PixelWidth"))
+    _check_is_a_scan(path, tag, beam, seen)
     pixel_m = check_pixel_size(
         path, plain_number(seen), "PixelWidth in tag 34682 (FEI_HELIOS) or 34680 (FEI_SFEG)", seen
     )
@@ -97,13 +148,25 @@ def thermo_fisher_settings(
     magnification, notes = _magnification(tag, pixel_m * size_px[0])
     if abs(pixel_y_m / pixel_m - 1.0) > _SQUARE_TOLERANCE:
         notes.append(f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high")
+    image, voltage = _section(tag, "Image"), plain_number(beam.get("HV"))
+    if str(beam.get("TiltCorrectionIsOn", "")).lower() in ("yes", "true", "on"):
+        notes.append(tilt_correction_note(plain_number(beam.get("TiltCorrectionAngle"))))
     created = str(_section(tag, "PrivateFei").get("TimeOfCreation", ""))
     return VendorSettings(
-        vendor="thermo_fisher",
+        maker="thermo_fisher",
+        beam=_BEAMS.get(str(_section(tag, "Beam").get("Beam", "EBeam")), ""),
+        model=str(_section(tag, "System").get("SystemType", "")),
+        serial_number=str(_section(tag, "System").get("Dnumber", "")),
+        acceleration_voltage_v=None if voltage is None else abs(voltage),
         pixel_size_m=pixel_m,
         pixel_size_y_m=pixel_y_m,
         displayed_magnification=magnification,
-        databar_rows=_databar_rows(path, _section(tag, "Image"), size_px),
+        databar_rows=_databar_rows(
+            path,
+            plain_number(image.get("ResolutionX")),
+            plain_number(image.get("ResolutionY")),
+            size_px,
+        ),
         working_distance_m=plain_number(beam.get("WD")),
         scan_rotation_rad=plain_number(beam.get("ScanRotation")),
         stage_tilt_rad=plain_number(stage.get("StageT")),
@@ -111,7 +174,53 @@ def thermo_fisher_settings(
         dwell_s=positive(plain_number(scan.get("Dwell", common.get("Dwelltime")))),
         frame_time_s=positive(plain_number(scan.get("FrameTime", common.get("FrameTime")))),
         detector=str(_section(tag, "Detectors").get("Name", "")),
-        instrument=str(_section(tag, "System").get("SystemType", "")),
         time=first_date([(created, "%d.%m.%Y %H:%M:%S")]),
+        notes=tuple(notes),
+    )
+
+
+def thermo_fisher_xml_settings(
+    path: Path, root: ElementTree.Element, size_px: tuple[int, int]
+) -> VendorSettings:
+    """Read the settings from the root of the XML.
+
+    Raises
+    ------
+    TiffError
+        The pixel size is missing or unusable, or the size of the file contradicts the XML.
+    """
+    result, scan = "BinaryResult", "ScanSettings"
+    x, y = f"{result}/PixelSize/X", f"{result}/PixelSize/Y"
+    pixel_m = check_pixel_size(path, quantity_of(root, x, "m"), x, root.findtext(x))
+    pixel_y_m = quantity_of(root, y, "m") or pixel_m
+    check_pixel_size(path, pixel_y_m, y, root.findtext(y))
+    notes = []
+    if abs(pixel_y_m / pixel_m - 1.0) > _SQUARE_TOLERANCE:
+        notes.append(f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high")
+    if text_of(root, "Optics/SampleTiltCorrectionOn").lower() == "true":
+        notes.append(tilt_correction_note(number_of(root, "Optics/SampleTiltCorrectionAngle")))
+    voltage_v = number_of(root, "Optics/AccelerationVoltage")
+    size = f"{result}/ImageSize"
+    return VendorSettings(
+        maker="thermo_fisher",
+        beam=_BEAMS.get(text_of(root, "Acquisition/BeamType"), ""),
+        model=text_of(root, "Instrument/InstrumentModel")
+        or text_of(root, "Instrument/InstrumentClass"),
+        serial_number=text_of(root, "Instrument/InstrumentID"),
+        pixel_size_m=pixel_m,
+        pixel_size_y_m=pixel_y_m,
+        databar_rows=_databar_rows(
+            path, number_of(root, f"{size}/X"), number_of(root, f"{size}/Y"), size_px
+        ),
+        acceleration_voltage_v=None if voltage_v is None else abs(voltage_v),
+        working_distance_m=number_of(root, "Optics/WorkingDistance"),
+        scan_rotation_rad=number_of(root, f"{scan}/ScanRotation"),
+        stage_tilt_rad=number_of(root, "StageSettings/StagePosition/Tilt/Alpha"),
+        stage_rotation_rad=number_of(root, "StageSettings/StagePosition/Rotation"),
+        dwell_s=positive(number_of(root, f"{scan}/DwellTime")),
+        frame_time_s=positive(number_of(root, f"{scan}/FrameTime")),
+        detector=text_of(root, "Detectors/ScanningDetector/DetectorName")
+        or text_of(root, f"{result}/Detector"),
+        time=date_of(root, "Acquisition/AcquisitionDatetime"),
         notes=tuple(notes),
     )

@@ -27,10 +27,13 @@ __all__ = [
     "PIXEL_SIZE_RANGE_M",
     "angle_in_degrees",
     "check_pixel_size",
+    "duration",
     "first_date",
     "plain_number",
     "positive",
     "quantity",
+    "rounding",
+    "tilt_correction_note",
 ]
 
 # A tenth of a picometre lies far below the size of an atom, a millimetre above any field of an SEM
@@ -39,6 +42,7 @@ PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)
 _YEARS = (1971, 2037)  # what the 32-bit seconds of a ROS stamp hold
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_DURATIONS_S = {"sec": 1.0, "secs": 1.0, "min": 60.0, "mins": 60.0, "hour": 3600.0, "hours": 3600.0}
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
 
 
@@ -82,6 +86,23 @@ def quantity(text: object, base: str, *, default_unit: str = "") -> float | None
     if scale is None or not math.isfinite(value * scale):
         return None
     return value * scale
+
+
+def duration(text: object) -> float | None:
+    """Time in s of a text such as ``752.76 ms``, ``40.5 Secs`` or ``1.9 Mins``; None if it is none."""
+    parts = _split(text)
+    scale = None if parts is None else _DURATIONS_S.get(parts[1].strip().lower())
+    return quantity(text, "s") if parts is None or scale is None else parts[0] * scale
+
+
+def rounding(text: object) -> float | None:
+    """Half a unit of the last digit of a text's number, relative to the number; None without one or for zero."""
+    match = _NUMBER.match(str(text).strip())
+    if match is None or not float(match.group()):
+        return None
+    digits = re.split(r"[eE]", match.group().lstrip("+-"))[0]
+    decimals = len(digits.partition(".")[2])
+    return 0.5 * 10.0**-decimals / float(digits)
 
 
 def plain_number(text: object) -> float | None:
@@ -139,3 +160,12 @@ def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
         if _YEARS[0] <= found.year <= _YEARS[1]:
             return found
     return None
+
+
+def tilt_correction_note(angle_rad: float | None) -> str:
+    """Remark on an image whose rows the microscope stretched for a tilted surface."""
+    angle = "" if angle_rad is None else f" for {math.degrees(angle_rad):g} degrees"
+    return (
+        f"tilt correction was on{angle}: the rows are spaced for a surface tilted so, and a surface at another "
+        "angle is stretched along y"
+    )

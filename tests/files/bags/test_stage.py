@@ -209,7 +209,7 @@ def test_joints_that_come_and_go_are_named(tmp_path: Path) -> None:
     messages = [stage_at(0.0, tilt=0.1), image_at(1.0), stage_at(20.0, z=1e-3), image_at(21.0)]
     frames, notes = read(tmp_path / "bag", messages)
     assert tilts(frames) == [0.1, None]
-    assert notes == "1 of 2 messages on /sem/stage lack the joint tilt"
+    assert notes == "1 of 2 messages on /sem/stage without the joint tilt"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -226,7 +226,7 @@ def test_a_value_that_is_not_finite_ends_the_reading_before(tmp_path: Path, valu
         ],
     )
     assert tilts(frames) == [0.1, None, 0.2]
-    assert notes.startswith("1 messages on /sem/stage are ignored, the first: a stage with tilt ")
+    assert notes.startswith("1 message on /sem/stage ignored: a stage with tilt ")
 
 
 @pytest.mark.parametrize(
@@ -276,4 +276,4 @@ def test_a_stage_that_moves_during_a_frame_tells_nothing_about_it(tmp_path: Path
         config,
     )
     assert tilts(frames) == [None, 0.2]
-    assert notes == "the stage moved during 1 images: its readings are not used for them"
+    assert notes == "the stage moved during 1 image: its readings are not used there"

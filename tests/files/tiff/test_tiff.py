@@ -37,13 +37,17 @@ PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 def zeiss_text(
     pixel: str = "593.3 nm",
     mag: str = "188 X",
-    head: tuple[str, str] = ("5.932882e-07", "188.19"),
+    head: tuple[str, str] = ("1.854025625e-08", "188.19"),
     tilt: str = "2.0 \u00b0",
+    changes: dict[str, str] | None = None,
 ) -> bytes:
-    """CZ_SEM tag: unnamed numbers, then keys in capitals, each followed by name = value unit."""
+    """CZ_SEM tag: unnamed numbers, then keys in capitals, each followed by name = value unit.
+
+    The image has 32 columns and the screen 1024, so a pixel of the screen is 1/32 of one of the image.
+    """
     lines = ["0", "0", "0", *head, "6", "5.0e+03", "2.27", "2.0e-10", "5.243416e-03", "829"]
     named = {
-        "AP_PIXEL_SIZE": "Pixel Size = 1.187 \u00b5m",
+        "AP_PIXEL_SIZE": "Pixel Size = 18.54 nm",
         "AP_IMAGE_PIXEL_SIZE": f"Image Pixel Size = {pixel}",
         "AP_MAG": f"Mag = {mag}",
         "AP_WD": "WD = 5.2 mm",
@@ -52,23 +56,28 @@ def zeiss_text(
         "AP_STAGE_AT_T": f"Stage at T = {tilt}",
         "AP_STAGE_AT_R": "Stage at R = 233.5 \u00b0",
         "DP_DWELL_TIME": "Dwell Time = 50 ns",
+        "DP_SCANRATE": "Scan Speed = 4",
+        "AP_LINE_TIME": "Line Time = 949 \u00b5s",
         "AP_FRAME_TIME": "Cycle Time = 752.76 ms",
+        "AP_ACTUALKV": "EHT = 5.00 kV",
+        "DP_SEM": "Sem = Auriga 60",
+        "SV_SERIAL_NUMBER": "Serial No. = Auriga 60-46-17",
         "DP_DETECTOR_CHANNEL": "Signal A = InLens",
         "AP_DATE": "Date :11 Apr 2023",
         "AP_TIME": "Time :8:40:47",
     }
-    for key, value in named.items():
-        lines += [key, value]
+    for key, value in {**named, **(changes or {})}.items():
+        lines += [key, value] if value else []
     return "\r\n".join(lines).encode("cp1252") + b"\x00"
 
 
 def fei_text(pixel: str = "2.69792e-07", rows: int = 16, columns: int = 32) -> bytes:
     return "\r\n".join(
         [
-            "[System]", "SystemType=Scios", "DisplayWidth=0.518",
+            "[System]", "SystemType=Scios", "Dnumber=9923184", "DisplayWidth=0.518",
             "[Beam]", "Beam=IBeam", "Scan=IScan",
             "[EBeam]", "WD=0.1", "ScanRotation=0",
-            "[IBeam]", "WD=0.00681643", "ScanRotation=0.5",
+            "[IBeam]", "HV=30000", "WD=0.00681643", "ScanRotation=0.5",
             "[EScan]", "PixelWidth=1e-3", "PixelHeight=1e-3",
             "[IScan]", "Dwell=1e-06", f"PixelWidth={pixel}", f"PixelHeight={pixel}",
             "FrameTime=1.75685",
@@ -89,8 +98,8 @@ def tescan_bytes(pixel: str = "2.5012e-6", strip: str = "4") -> bytes:
     main = (
         f"Date=2016-05-16\r\nImageStripSize={strip}\r\nMagnification=108.08\r\nPixelSizeX={pixel}"
     )
-    main += f"\r\nPixelSizeY={pixel}\r\nTime=16:03:27\r\n"
-    sem = "Detector=SE\r\nDwellTime=3.2000e-6\r\nScanRotation=90.0\r\n"
+    main += f"\r\nPixelSizeY={pixel}\r\nTime=16:03:27\r\nDevice=MIRA3 XMU\r\nSerialNumber=MI32\r\n"
+    sem = "HV=10.0e3\r\nDetector=SE\r\nDwellTime=3.2000e-6\r\nScanRotation=90.0\r\n"
     sem += "StageTilt=-5.0\r\nStageRotation=180.0\r\nWD=13.250e-3\r\n"
     return b"".join(
         [
@@ -112,6 +121,8 @@ def jeol_text(**changes: str) -> str:
         "$CM_DATE": "2025/11/20",
         "$CM_TIME": "13:42:14",
         "$CM_DETECTOR_NAME": "LED",
+        "$CM_ACCEL_VOLT": "5.00",
+        "$CM_INSTRUMENT": "4700F",
     }
     named = {("$$" if k.startswith("SM_") else "$") + k: v for k, v in changes.items()}
     return "\r\n".join(f"{k} {v}" for k, v in {**values, **named}.items() if v != "-")
@@ -131,9 +142,9 @@ def write_jeol(path: Path, text: str, encoding: str = "utf-8") -> Path:
 
 def test_zeiss(tmp_path: Path) -> None:
     sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text()))
-    assert sem.vendor == "zeiss"
+    assert sem.maker == "zeiss"
     # The head of the tag has more digits than the named value and rounds to it.
-    assert sem.pixel_size_m == 5.932882e-07
+    assert sem.pixel_size_m == pytest.approx(5.932882e-07, rel=1e-12, abs=0)
     assert sem.displayed_magnification == 188.19
     assert sem.display_width_m == pytest.approx(5.932882e-07 * 32 * 188.19, rel=1e-12, abs=0)
     assert sem.working_distance_m == pytest.approx(5.243416e-3, rel=1e-12, abs=0)
@@ -141,8 +152,11 @@ def test_zeiss(tmp_path: Path) -> None:
     assert sem.stage_tilt_rad == pytest.approx(math.radians(2.0))
     assert sem.stage_rotation_rad == pytest.approx(math.radians(233.5))
     assert sem.metadata()["stage_tilt_rad"] == sem.stage_tilt_rad
-    assert sem.dwell_s == pytest.approx(50e-9, rel=1e-12, abs=0)
+    # 100 ns x 2^(4 - 1): DP_DWELL_TIME is not the time on a pixel.
+    assert sem.dwell_s == pytest.approx(0.8e-6, rel=1e-12, abs=0)
     assert sem.frame_time_s == pytest.approx(0.75276)
+    assert sem.settings.acceleration_voltage_v == pytest.approx(5000.0)
+    assert (sem.settings.model, sem.settings.serial_number) == ("Auriga 60", "Auriga 60-46-17")
     assert sem.detector == "InLens"
     assert sem.time == datetime(2023, 4, 11, 8, 40, 47)
     assert np.array_equal(sem.image, PIXELS)
@@ -182,9 +196,115 @@ def test_zeiss_magnification_in_thousands(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "expected_s", "noted"),
+    [
+        ("752.76 ms", 0.75276, False),
+        ("40.5 Secs", 40.5, False),
+        ("1.9 Mins", 114.0, True),
+        ("2 Hours", 7200.0, True),
+        ("12", None, False),
+    ],
+)
+def test_zeiss_frame_times(
+    tmp_path: Path, text: str, expected_s: float | None, noted: bool
+) -> None:
+    data = zeiss_text(changes={"AP_FRAME_TIME": f"Cycle Time = {text}"})
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data))
+    assert sem.frame_time_s == (None if expected_s is None else pytest.approx(expected_s))
+    # Half of the last digit is 0.12 % of 40.5 and 2.6 % of 1.9.
+    assert noted == any("the frame time is given as" in note for note in sem.notes)
+
+
+@pytest.mark.parametrize(
+    ("width", "screen", "head", "expected_m", "source"),
+    [
+        # A real file: 5.965 um, 5.825 nm of 1024 columns, and 5.824988e-09 at the head.
+        ("18.99 \u00b5m", "18.54 nm", "1.854025625e-08", 5.932882e-07, "AP_WIDTH"),
+        ("18.99 \u00b5m", "18.54 nm", "4e-05", 18.99e-6 / 32, "AP_WIDTH"),
+        ("18.99 \u00b5m", "", "4e-05", 18.99e-6 / 32, "AP_WIDTH"),
+        ("", "18.54 nm", "1.854025625e-08", 5.932882e-07, "1024 columns of the screen"),
+        ("", "18.54 nm", "4e-05", 18.54e-9 * 32, "1024 columns of the screen"),
+    ],
+)
+def test_zeiss_without_the_pixel_size_of_the_image(
+    tmp_path: Path, width: str, screen: str, head: str, expected_m: float, source: str
+) -> None:
+    """Older programs write the width of the field, and the pixel size of the screen, which has 1024 columns."""
+    changes = {
+        "AP_IMAGE_PIXEL_SIZE": "",
+        "AP_PIXEL_SIZE": screen and f"Pixel Size = {screen}",
+        "AP_WIDTH": width and f"Width = {width}",
+    }
+    data = zeiss_text(head=(head, "188.19"), changes=changes)
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data))
+    assert sem.pixel_size_m == pytest.approx(expected_m, rel=1e-12, abs=0)
+    (note,) = [note for note in sem.notes if "no AP_IMAGE_PIXEL_SIZE" in note]
+    assert source in note
+
+
+@pytest.mark.parametrize("bad", ["0 nm", "12", "inf m", "9 m"])
+def test_zeiss_without_any_usable_size(tmp_path: Path, bad: str) -> None:
+    changes = {"AP_IMAGE_PIXEL_SIZE": "", "AP_PIXEL_SIZE": f"Pixel Size = {bad}"}
+    with pytest.raises(TiffError, match="PIXEL_SIZE"):
+        read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(changes=changes)))
+
+
+def test_zeiss_sizes_that_do_not_fit_the_columns_are_noted(tmp_path: Path) -> None:
+    wide = np.tile(PIXELS, (1, 2))
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(), wide))
+    assert any("resized or cropped copy" in note for note in sem.notes)
+    width = {"AP_PIXEL_SIZE": "", "AP_WIDTH": "Width = 30.00 \u00b5m"}
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(changes=width)))
+    assert any("resized or cropped copy" in note for note in sem.notes)
+    sem = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text()))
+    assert not any("resized or cropped copy" in note for note in sem.notes)
+
+
+def test_zeiss_dwell_that_does_not_fit_the_line_is_left_out(tmp_path: Path) -> None:
+    data = zeiss_text(changes={"AP_LINE_TIME": "Line Time = 25 \u00b5s"})
+    # 32 columns of 0.8 us are 25.6 us; the rounding of the stated 25 us reaches 25.5 us.
+    assert read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data)).dwell_s is None
+    data = zeiss_text(changes={"AP_LINE_TIME": "", "DP_SCANRATE": ""})
+    assert read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, data)).dwell_s is None
+
+
+def test_tilt_correction_is_noted(tmp_path: Path) -> None:
+    on = {"DP_TILT_CORRECTION": "Tilt Corrn. = On", "AP_TILT_ANGLE": "Tilt Angle = -37.0 \u00b0"}
+    zeiss = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(changes=on)))
+    assert any("tilt correction was on for -37 degrees" in note for note in zeiss.notes)
+    off = {**on, "DP_TILT_CORRECTION": "Tilt Corrn. = Off"}
+    zeiss = read_sem_tiff(write_tagged(tmp_path / "z.tif", 34118, zeiss_text(changes=off)))
+    assert not any("tilt correction" in note for note in zeiss.notes)
+    text = fei_text().replace(
+        b"[IBeam]", b"[IBeam]\r\nTiltCorrectionIsOn=yes\r\nTiltCorrectionAngle=0.5"
+    )
+    fei = read_sem_tiff(write_tagged(tmp_path / "f.tif", 34682, text))
+    assert any("tilt correction was on for 28.6479 degrees" in note for note in fei.notes)
+    tifffile.imwrite(tmp_path / "t.tif", PIXELS)
+    (tmp_path / "t.hdr").write_text("PixelSizeX=1e-9\nTiltCorrection=20\n")
+    tescan = read_sem_tiff(tmp_path / "t.tif")
+    assert any("tilt correction was on for 20 degrees" in note for note in tescan.notes)
+
+
+def test_thermo_fisher_pictures_that_are_no_scans_are_refused(tmp_path: Path) -> None:
+    camera = (
+        fei_text()
+        .replace(b"Beam=IBeam", b"Beam=IRBeam")
+        .replace(b"Scan=IScan", b"Scan=")
+        .replace(b"PixelWidth", b"Width")
+        .replace(b"Name=ETD", b"Name=Nav-Cam")
+    )
+    with pytest.raises(TiffError, match=r"picture of a camera \(Nav-Cam\)"):
+        read_sem_tiff(write_tagged(tmp_path / "c.tif", 34682, camera))
+    angles = fei_text().replace(b"[IBeam]", b"[IBeam]\r\nElectronChannelingPatternIsOn=On")
+    with pytest.raises(TiffError, match="channeling pattern"):
+        read_sem_tiff(write_tagged(tmp_path / "e.tif", 34682, angles))
+
+
 def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path) -> None:
     sem = read_sem_tiff(write_tagged(tmp_path / "f.tif", 34682, fei_text(rows=16)))
-    assert sem.vendor == "thermo_fisher"
+    assert sem.maker == "thermo_fisher"
     assert sem.pixel_size_m == 2.69792e-07
     assert sem.databar_rows == 4
     assert np.array_equal(sem.image, PIXELS[:16])
@@ -196,6 +316,9 @@ def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path
     assert sem.frame_time_s == 1.75685
     assert sem.time == datetime(2023, 11, 10, 14, 9, 15)
     assert any("two magnifications" in note for note in sem.notes)
+    assert sem.settings.acceleration_voltage_v == 30e3
+    assert (sem.settings.beam, sem.settings.model) == ("ion", "Scios")
+    assert sem.settings.serial_number == "9923184"
     other = read_sem_tiff(write_tagged(tmp_path / "g.tif", 34680, fei_text(rows=16)))
     assert other.pixel_size_m == sem.pixel_size_m
 
@@ -209,7 +332,7 @@ def test_thermo_fisher_refuses_a_resized_copy(tmp_path: Path) -> None:
 def test_tescan_in_sixteen_bits(tmp_path: Path) -> None:
     wide = PIXELS.astype(np.uint16) * 257
     sem = read_sem_tiff(write_tagged(tmp_path / "t.tif", 50431, tescan_bytes(), wide))
-    assert sem.vendor == "tescan"
+    assert sem.maker == "tescan"
     assert sem.pixel_size_m == 2.5012e-6
     assert sem.databar_rows == 4
     assert sem.image.dtype == np.uint16
@@ -220,6 +343,8 @@ def test_tescan_in_sixteen_bits(tmp_path: Path) -> None:
     assert sem.stage_tilt_rad == pytest.approx(math.radians(-5.0))
     assert sem.stage_rotation_rad == pytest.approx(math.pi)
     assert sem.working_distance_m == 0.01325
+    assert sem.settings.acceleration_voltage_v == 10e3
+    assert (sem.settings.model, sem.settings.serial_number) == ("MIRA3 XMU", "MI32")
 
 
 def test_tescan_header_file(tmp_path: Path) -> None:
@@ -243,13 +368,15 @@ def test_jeol_stage_by_name_only(tmp_path: Path) -> None:
 
 def test_jeol_with_assumed_display_width(tmp_path: Path) -> None:
     sem = read_sem_tiff(write_jeol(tmp_path / "j.tif", jeol_text()))
-    assert sem.vendor == "jeol"
+    assert sem.maker == "jeol"
     assert sem.pixel_size_m == pytest.approx(0.128 / 50 / 32, rel=1e-12, abs=0)
     assert sem.settings.display_width_assumed
     assert any("assumed" in note for note in sem.notes)
     assert sem.working_distance_m == pytest.approx(9.07e-3)
     assert sem.time == datetime(2025, 11, 20, 13, 42, 14)
     assert sem.detector == "LED"
+    assert sem.settings.acceleration_voltage_v == 5000.0
+    assert sem.settings.model == "4700F"
 
 
 @pytest.mark.parametrize(
@@ -417,12 +544,16 @@ def test_real_files_agree_with_the_truth_table(reference_data: Path, name: str, 
     assert sem.databar_rows == rows
     assert sem.working_distance_m == pytest.approx(float(truth["WD_mm"]) * 1e-3, rel=1e-4)
     assert sem.scan_rotation_rad == 0.0
-    if sem.vendor != "thermo_fisher":  # its shown magnification is only in the image
+    if sem.maker != "thermo_fisher":  # its shown magnification is only in the image
         assert sem.displayed_magnification == pytest.approx(
             float(truth["displayed_mag"].split()[0]), rel=1e-5
         )
         width_mm = float(truth["W_display_mm_implied(px*N*mag)"].split()[0])
         assert sem.display_width_m == pytest.approx(width_mm * 1e-3, rel=1e-5)
+    # The table copies Zeiss's DP_DWELL_TIME, 50 ns, at which 1024 columns take 51 us; AP_LINE_TIME says 949 us.
+    if sem.maker == "zeiss":
+        assert sem.dwell_s == pytest.approx(0.8e-6, rel=1e-12, abs=0)
+        truth["dwell_us"] = ""
     for key, value in (("dwell_us", sem.dwell_s), ("frame_time_s", sem.frame_time_s)):
         if truth[key]:
             scale = 1e-6 if key == "dwell_us" else 1.0

@@ -28,10 +28,10 @@ import tifffile
 
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.errors import BagError, TiffError
+from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.reader import open_bag
+from semcal_ros.files.images.to_bag import SIDECAR, import_images
 from semcal_ros.files.recordings import open_recording
-from semcal_ros.files.tiff.to_bag import SIDECAR, import_folder
 
 
 def write_tescan(
@@ -64,12 +64,12 @@ def make_folder(folder: Path) -> Path:
 
 def test_pixel_sizes_order_and_sizes_survive(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "tiffs")
-    calls: list[int] = []
-    summary = import_folder(folder, tmp_path / "bag", on_progress=calls.append)
+    calls: list[tuple[int, int]] = []
+    summary = import_images(folder, tmp_path / "bag", on_progress=lambda *a: calls.append(a))
     assert summary.imported == 3
     assert sorted(s.name for s in summary.skipped) == ["broken.tif", "photo.jpg"]
-    assert calls == [1, 1, 1]
-    assert any("skipped photo.jpg" in line for line in summary.lines())
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert any("photo.jpg is skipped" in line for line in summary.lines())
     with open_recording(tmp_path / "bag") as recording:
         frames = list(recording.frames())
         width_m = recording.config.display_width_m
@@ -84,7 +84,7 @@ def test_pixel_sizes_order_and_sizes_survive(tmp_path: Path) -> None:
 
 
 def test_metadata_topic_and_sidecar(tmp_path: Path) -> None:
-    import_folder(make_folder(tmp_path / "tiffs"), tmp_path / "bag")
+    import_images(make_folder(tmp_path / "tiffs"), tmp_path / "bag")
     with open_bag(tmp_path / "bag") as bag:
         texts = [json.loads(m.message.data) for m in bag.messages(["/sem/metadata"])]
     assert [t["file"] for t in texts] == ["img_10.tif", "img_2.tif", "img_9.tif"]
@@ -109,7 +109,7 @@ def test_every_quantity_reads_back(tmp_path: Path, source: MagnificationConfig) 
     folder.mkdir()
     write_tescan(folder / "a.tif", 3.1e-7, (16, 24))
     config = MicroscopeConfig(name="x", display_width_m=0.2, magnification=source)
-    import_folder(folder, tmp_path / "bag", config=config)
+    import_images(folder, tmp_path / "bag", config=config)
     with open_recording(tmp_path / "bag", config) as recording:
         (frame,) = recording.frames()
     assert frame.magnification == pytest.approx(0.2 / (3.1e-7 * 24), rel=1e-12, abs=0)
@@ -117,7 +117,7 @@ def test_every_quantity_reads_back(tmp_path: Path, source: MagnificationConfig) 
 
 def test_folder_is_read_directly_as_it_would_be_imported(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "tiffs")
-    import_folder(folder, tmp_path / "bag")
+    import_images(folder, tmp_path / "bag")
     with open_recording(folder) as direct, open_recording(tmp_path / "bag") as imported:
         pairs = list(zip(direct.frames(), imported.frames(), strict=True))
         assert direct.frame_count == 3
@@ -136,7 +136,7 @@ def _stages(folder: Path, bag: Path, *angles: str) -> tuple[list[StageReading | 
     with open_recording(folder) as recording:
         stages = [frame.stage for frame in recording.frames()]
         notes = " | ".join(recording.notes)
-    import_folder(folder, bag)
+    import_images(folder, bag)
     nothing = (None, StageReading())
     with open_recording(bag) as imported:
         for stage, frame in zip(stages, imported.frames(), strict=True):
@@ -173,7 +173,7 @@ def test_rotations_of_unknown_sense_are_left_out(tmp_path: Path) -> None:
     assert stages == [StageReading(np.radians(10.0)), StageReading(np.radians(10.0)), None, None]
     assert "the stage of 3.tif is not used: tilt 1.74533 rad" in notes
     assert "the rotation of the stage is not used" in notes
-    assert "the stage is not used for 1 files with a rotated scan" in notes
+    assert "the stage is not used for 1 file with a rotated scan" in notes
 
 
 def test_files_without_time_are_one_second_apart(tmp_path: Path) -> None:
@@ -194,28 +194,28 @@ def test_damaged_pixels_are_skipped_and_nothing_is_left_if_all_are(tmp_path: Pat
     write_tescan(folder / "b.tif", 1e-8, (16, 16))
     whole = (folder / "a.tif").read_bytes()
     (folder / "a.tif").write_bytes(whole[:-50])
-    summary = import_folder(folder, tmp_path / "bag")
+    summary = import_images(folder, tmp_path / "bag")
     assert summary.imported == 1
     assert [s.name for s in summary.skipped] == ["a.tif"]
     (folder / "b.tif").write_bytes(whole[:-50])
-    with pytest.raises(TiffError, match="can be decoded"):
-        import_folder(folder, tmp_path / "other")
+    with pytest.raises(BagError, match="can be decoded"):
+        import_images(folder, tmp_path / "other")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bag", "tiffs"]
 
 
 def test_refusals(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "tiffs")
-    with pytest.raises(TiffError, match="does not exist"):
-        import_folder(tmp_path / "missing", tmp_path / "bag")
+    with pytest.raises(BagError, match="does not exist"):
+        import_images(tmp_path / "missing", tmp_path / "bag")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(TiffError, match="0 image files"):
-        import_folder(tmp_path / "empty", tmp_path / "bag")
-    import_folder(folder, tmp_path / "bag")
+    with pytest.raises(BagError, match="has no image file"):
+        import_images(tmp_path / "empty", tmp_path / "bag")
+    import_images(folder, tmp_path / "bag")
     with pytest.raises(BagError, match="exists"):
-        import_folder(folder, tmp_path / "bag")
-    assert import_folder(folder, tmp_path / "bag", overwrite=True).imported == 3
+        import_images(folder, tmp_path / "bag")
+    assert import_images(folder, tmp_path / "bag", overwrite=True).imported == 3
     with pytest.raises(BagError, match="not replaced"):
-        import_folder(folder, folder, overwrite=True)
+        import_images(folder, folder, overwrite=True)
     odd = dataclasses.replace(
         load_config("generic"),
         magnification=MagnificationConfig(
@@ -223,4 +223,4 @@ def test_refusals(tmp_path: Path) -> None:
         ),
     )
     with pytest.raises(BagError, match="--config generic"):
-        import_folder(folder, tmp_path / "bag2", config=odd)
+        import_images(folder, tmp_path / "bag2", config=odd)

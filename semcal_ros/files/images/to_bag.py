@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Turns a folder of SEM TIFFs into a recording."""
+"""Turns image files into a bag."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from numpy.typing import NDArray
 
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
@@ -33,19 +35,21 @@ from semcal_ros.config.config import (
     load_config,
 )
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.errors import BagError, SemcalError, TiffError
+from semcal_ros.core.errors import BagError, SemcalError
+from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
-from semcal_ros.files.tiff.folder import (
+from semcal_ros.files.images.image_series import (
     MIN_SPACING_NS,
+    ImageSeries,
+    SeriesImage,
     Skipped,
-    TiffEntry,
-    TiffFolder,
-    scan_tiff_folder,
+    group_skipped,
 )
+from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
 from semcal_ros.files.tiff.sem_image import SemImage
 
-__all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_folder"]
+__all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_images"]
 
 METADATA_TOPIC = "metadata"
 """Topic with the settings of each image as JSON text (std_msgs/String)."""
@@ -73,7 +77,9 @@ class ImportSummary:
     skipped
         Files that could not be used, with reasons.
     notes
-        Notes for the user about the values.
+        Notes for the user about the values and the skipped files.
+    damaged
+        Those of the skipped files whose images turned out to be damaged.
     """
 
     path: Path
@@ -81,13 +87,14 @@ class ImportSummary:
     display_width_m: float
     skipped: tuple[Skipped, ...]
     notes: tuple[str, ...]
+    damaged: tuple[Skipped, ...] = ()
 
     def lines(self) -> list[str]:
         """The summary for the user, one fact per line."""
         return [
-            f"{self.imported} images in {self.path}",
+            f"{counted(self.imported, 'image')} in {self.path}",
             *(f"note: {note}" for note in self.notes),
-            *(f"skipped {skipped.name}: {skipped.reason}" for skipped in self.skipped),
+            *(f"note: {text}" for text in group_skipped(self.damaged)),
         ]
 
 
@@ -112,15 +119,31 @@ def _check_config(config: MicroscopeConfig) -> None:
         )
 
 
-def _published_number(config: MicroscopeConfig, image: SemImage) -> float:
+def _published_number(config: MicroscopeConfig, image: SeriesImage, width_px: int) -> float:
     """Return the number from which a reader with this configuration computes the image's field width."""
     source = config.magnification
+    field_width_m = config.display_width_m / image.magnification
     if source.quantity == "magnification":
-        return image.magnification(source.display_width_m or config.display_width_m)
+        return (source.display_width_m or config.display_width_m) / field_width_m
     if source.quantity == "field_width":
-        return image.field_width_m / source.si_per_unit
-    columns = source.image_width_px or image.full_size_px[0]
-    return image.field_width_m / columns / source.si_per_unit
+        return field_width_m / source.si_per_unit
+    return field_width_m / (source.image_width_px or width_px) / source.si_per_unit
+
+
+def _describe(image: SeriesImage, pixels: NDArray[Any]) -> dict[str, Any]:
+    """What is known of an image, as plain values for JSON (SI units)."""
+    settings, rows = image.page.settings, image.databar_rows
+    if settings is not None:
+        sem = SemImage(image.file.path, pixels, image.page.size_px, rows, settings)
+        return sem.metadata()
+    return {
+        "file": image.name,
+        "full_size_px": list(image.page.size_px),
+        "databar_rows": rows,
+        "pixel_size_m": image.page.pixel_size_m,
+        "bits": int(8 * pixels.dtype.itemsize),
+        "notes": [],
+    }
 
 
 def _text_message(text: str) -> Any:
@@ -147,12 +170,12 @@ def _stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: 
 def _write_image(
     writer: BagWriter,
     config: MicroscopeConfig,
-    entry: TiffEntry,
-    image: SemImage,
+    entry: SeriesImage,
+    pixels: NDArray[Any],
     stage: StageConfig | None,
 ) -> dict[str, Any]:
     number = blank_message(config.magnification.type)
-    number.data = _published_number(config, image)
+    number.data = _published_number(config, entry, pixels.shape[1])
     # A player that keeps the recording's order then announces the magnification before its image.
     before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
     writer.write(_topic(config.magnification.topic), before_ns, number)
@@ -162,9 +185,9 @@ def _write_image(
     message = blank_message(IMAGE_TYPE)
     header = blank_message("std_msgs/msg/Header")
     fill_header(header, entry.stamp_ns, config.frame_id)
-    fill_image(message, image.image, "mono8" if image.image.itemsize == 1 else "mono16", header)
+    fill_image(message, pixels, ENCODINGS[pixels.dtype.name], header)
     writer.write(_topic(config.image.topic), entry.stamp_ns, message)
-    settings = {"stamp_ns": entry.stamp_ns, "published": number.data, **image.metadata()}
+    settings = {"stamp_ns": entry.stamp_ns, "published": number.data, **_describe(entry, pixels)}
     text = json.dumps(settings, sort_keys=True, allow_nan=False)
     writer.write(_topic(METADATA_TOPIC), entry.stamp_ns, _text_message(text))
     return settings
@@ -173,83 +196,78 @@ def _write_image(
 def _write_all(
     writer: BagWriter,
     config: MicroscopeConfig,
-    folder: TiffFolder,
-    on_progress: Callable[[int], object] | None,
+    series: ImageSeries,
+    on_progress: Callable[[int, int], object] | None,
 ) -> tuple[list[dict[str, Any]], list[Skipped]]:
     written, skipped = [], []
-    stage = config.stage if any(entry.stage is not None for entry in folder.entries) else None
-    for entry in folder.entries:
+    stage = config.stage if any(image.stage is not None for image in series.images) else None
+    for number, (image, pixels) in enumerate(series.read(), 1):
         if on_progress is not None:
-            on_progress(1)
-        try:
-            image = entry.load()
-        except SemcalError as error:
-            skipped.append(Skipped(entry.path.name, str(error)))
+            on_progress(number, len(series.images))
+        if isinstance(pixels, SemcalError):
+            skipped.append(Skipped(image.name, str(pixels)))
             continue
-        written.append(_write_image(writer, config, entry, image, stage))
+        written.append(_write_image(writer, config, image, pixels, stage))
     if not written:
-        raise TiffError(
-            f"none of {len(folder.entries)} images in {folder.path} can be decoded, "
-            f"the first: {skipped[0].reason}",
-            expected="at least one intact SEM TIFF",
+        raise BagError(
+            f"{counted(len(series.images), 'image')}, none of which can be decoded, the first: {skipped[0].reason}",
+            expected="at least one intact image",
         )
     return written, skipped
 
 
-def import_folder(
-    folder: str | Path,
+def import_images(
+    source: str | os.PathLike[str] | RecordedFiles,
     out_bag: str | Path,
     *,
     config: MicroscopeConfig | None = None,
-    databar_rows: int | None = None,
     overwrite: bool = False,
-    on_progress: Callable[[int], object] | None = None,
+    on_progress: Callable[[int, int], object] | None = None,
 ) -> ImportSummary:
-    """Write a recording with the images of a folder, their magnification and all their settings.
+    """Write a bag with images, their magnification and all that their files say.
 
     Parameters
     ----------
-    folder
-        Folder with SEM TIFFs (not searched below), or one such file. Sizes and makers may differ.
+    source
+        Image files: one, a folder (not searched below) or a pattern. Sizes and makers may differ.
     out_bag
         Recording to make.
     config
         Topics, and the display width that all magnifications refer to; ``generic`` by default. Read
         the recording with the same configuration: the field widths, and with them the pixel sizes,
         are then exactly those of the files.
-    databar_rows
-        Rows to cut off at the bottom of every image, instead of those that the files give; by default the
-        configuration's, if they are not 0.
     overwrite
         Replace an existing recording.
     on_progress
-        Called with 1 for every image.
+        Called with the number of images done, and that of all images.
 
     Raises
     ------
-    TiffError
-        No file is usable.
     BagError
-        The recording cannot be written, or exists.
+        No file is usable, or their scale is not known; the recording cannot be written, or exists.
     """
     used = load_config("generic") if config is None else config
     _check_config(used)
     check_replaceable(Path(os.path.abspath(out_bag)), overwrite)
-    source = scan_tiff_folder(
-        Path(folder),
-        display_width_m=used.display_width_m,
-        databar_rows=databar_rows if databar_rows is not None else used.image.databar_rows or None,
-        stage=used.stage is not None,
-    )
+    given = source if isinstance(source, RecordedFiles) else RecordedFiles(source)
+    if given.roi is not None:
+        raise BagError(
+            "a region of the images for an import",
+            expected="whole images",
+            do="give --roi to the command that reads the bag",
+        )
+    series = open_image_series(given, used)
     with BagWriter(out_bag, overwrite=overwrite) as writer:
-        written, damaged = _write_all(writer, used, source, on_progress)
-        skipped = (*source.skipped, *damaged)
+        written, damaged = _write_all(writer, used, series, on_progress)
+        skipped = (*series.skipped, *damaged)
         report = {
             "display_width_m": used.display_width_m,
             "configuration": used.name,
-            "notes": list(source.notes),
+            "notes": list(series.notes),
             "skipped": [{"file": s.name, "reason": s.reason} for s in skipped],
             "images": written,
         }
         writer.write_text(SIDECAR, json.dumps(report, indent=2, allow_nan=False) + "\n")
-    return ImportSummary(writer.path, len(written), used.display_width_m, skipped, source.notes)
+    return ImportSummary(
+        writer.path, len(written), used.display_width_m, skipped, series.notes, tuple(damaged)
+    )

@@ -1,0 +1,211 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""An image file of any kind, and what it says about each of its images."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from semcal_ros.core.errors import SemcalError, TiffError
+from semcal_ros.files.images.plain import PLAIN_IMAGES, describe_plain_image, read_plain_image
+from semcal_ros.files.images.tiff_stack import list_tiff_stack, read_tiff_stack
+from semcal_ros.files.images.video_frames import VIDEO_SUFFIXES, describe_video, read_video
+from semcal_ros.files.tiff.read import (
+    is_tiff,
+    read_page_settings,
+    read_sem_pages,
+    side_file_settings,
+)
+from semcal_ros.files.tiff.sem_image import VendorSettings
+
+__all__ = ["ImageFile", "ImagePage", "describe_image_file", "is_image_file"]
+
+
+@dataclass(frozen=True)
+class ImagePage:
+    """What a file says about one of its images.
+
+    Attributes
+    ----------
+    size_px
+        (width, height) as stored, databar included.
+    databar_rows
+        Rows at the bottom that are not part of the scan.
+    pixel_size_m
+        Pixel size on the specimen, or None where the file does not say it.
+    offset_s
+        Time from the first image of the file, or None.
+    settings
+        The settings of the microscope, or None.
+    """
+
+    size_px: tuple[int, int]
+    databar_rows: int = 0
+    pixel_size_m: float | None = None
+    offset_s: float | None = None
+    settings: VendorSettings | None = None
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """A readable file and its images, in the order of time.
+
+    Attributes
+    ----------
+    path
+        The file.
+    pages
+        At least one.
+    read
+        Yields the stored images of the pages, (h, w) grey levels with the databar.
+    time
+        Local time of the first image, or None.
+    notes
+        Notes for the user, which do not name the file.
+    no_scale
+        Why the file has no pixel size, where it has none.
+    """
+
+    path: Path
+    pages: tuple[ImagePage, ...]
+    read: Callable[[], Iterator[NDArray[Any]]]
+    time: datetime | None = None
+    notes: tuple[str, ...] = ()
+    no_scale: str = ""
+
+    @property
+    def pixel_size_m(self) -> float | None:
+        """Pixel size of the first image."""
+        return self.pages[0].pixel_size_m
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether the name is that of an image, a stack of them, or a video."""
+    suffix = path.suffix.lower()
+    return is_tiff(path) or suffix in PLAIN_IMAGES or suffix in VIDEO_SUFFIXES
+
+
+def describe_image_file(path: Path) -> ImageFile:
+    """Read what a file says about its images, without decoding them.
+
+    Raises
+    ------
+    BagError, TiffError
+        The file is missing or damaged, or none of the known formats.
+    """
+    if is_tiff(path):
+        return _describe_tiff(path)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _describe_video(path)
+    return _describe_plain(path)
+
+
+def _describe_tiff(path: Path) -> ImageFile:
+    try:
+        return _describe_sem(path)
+    except TiffError as error:
+        reason = str(error)
+    stack = list_tiff_stack(path)
+    pages = tuple(
+        ImagePage(
+            size,
+            stack.databar_rows if stack.databar_rows < size[1] else 0,
+            stack.pixel_size_m,
+            None if stack.offsets_s is None else stack.offsets_s[k],
+        )
+        for k, size in enumerate(stack.sizes_px)
+    )
+    return ImageFile(
+        path,
+        pages,
+        lambda: read_tiff_stack(path, stack.pages),
+        stack.taken,
+        stack.notes,
+        no_scale="" if stack.pixel_size_m else reason,
+    )
+
+
+def _describe_sem(path: Path) -> ImageFile:
+    listed, channel_notes = _first_detector(read_page_settings(path))
+    pages = tuple(
+        _page_of(settings, size, k * interval if (interval := _interval_s(settings)) else None)
+        for k, (_, settings, size) in enumerate(listed)
+    )
+    first = listed[0][1]
+    notes = tuple(dict.fromkeys(note for _, settings, _ in listed for note in settings.notes))
+    wanted = frozenset(index for index, _, _ in listed)
+    return ImageFile(
+        path, pages, lambda: _read_sem(path, wanted), first.time, (*notes, *channel_notes)
+    )
+
+
+_Listed = tuple[int, VendorSettings, tuple[int, int]]
+
+
+def _first_detector(listed: tuple[_Listed, ...]) -> tuple[list[_Listed], tuple[str, ...]]:
+    """Images of the first of several detectors that a file has equally many images of, and a note."""
+    count = Counter(settings.detector for _, settings, _ in listed)
+    if len(count) == 1 or len(set(count.values())) > 1:
+        return list(listed), ()
+    first = listed[0][1].detector
+    note = f"the first of {len(count)} channels is used" + (f" ({first})" if first else "")
+    return [one for one in listed if one[1].detector == first], (note,)
+
+
+def _page_of(
+    settings: VendorSettings, size_px: tuple[int, int], offset_s: float | None = None
+) -> ImagePage:
+    return ImagePage(size_px, settings.databar_rows, settings.pixel_size_m, offset_s, settings)
+
+
+def _interval_s(settings: VendorSettings) -> float | None:
+    return settings.frame_interval_s or settings.frame_time_s
+
+
+def _read_sem(path: Path, wanted: frozenset[int]) -> Iterator[NDArray[Any]]:
+    pages = read_sem_pages(path, databar_rows=0)
+    return (page.image for page in pages if page.page in wanted)
+
+
+def _describe_video(path: Path) -> ImageFile:
+    video = describe_video(path)
+    pages = tuple(ImagePage(video.size_px, offset_s=time_s) for time_s in video.times_s)
+    return ImageFile(path, pages, lambda: read_video(path), no_scale="a video does not contain it")
+
+
+def _describe_plain(path: Path) -> ImageFile:
+    size, taken = describe_plain_image(path)
+    why = f"{path.suffix[1:].upper()} files do not contain it"
+    settings = None
+    try:
+        settings = side_file_settings(path, size)
+    except SemcalError as error:
+        why = str(error)
+    page = ImagePage(size) if settings is None else _page_of(settings, size)
+    return ImageFile(
+        path,
+        (page,),
+        lambda: iter([read_plain_image(path)]),
+        taken if settings is None else settings.time,
+        () if settings is None else settings.notes,
+        "" if page.pixel_size_m else why,
+    )

@@ -1,0 +1,527 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Image files as a sequence of frames in time with one magnification scale."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timezone
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.stage import doubt_unit
+from semcal_ros.config.config import StageConfig
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.errors import BagError, SemcalError, UnknownScaleError
+from semcal_ros.core.wording import counted, omit_numbers
+from semcal_ros.files.images.image_file import (
+    ImageFile,
+    ImagePage,
+    describe_image_file,
+    is_image_file,
+)
+from semcal_ros.files.tiff.same_scan import group_by_scan
+from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.text_files import name_similar_file
+
+__all__ = [
+    "MIN_SPACING_NS",
+    "ImageSeries",
+    "SeriesImage",
+    "Skipped",
+    "find_image_files",
+    "group_skipped",
+    "list_image_series",
+]
+
+_SECOND_NS = 1_000_000_000
+_SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
+MIN_SPACING_NS = 1_000_000
+"""Least time between two images, whose files have whole seconds: 1000 images fit into one."""
+# What a maker's file and a user say about a pixel may differ in their last digits.
+_SAME_SCALE = 5e-3
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A file that could not be used, and the reason."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class SeriesImage:
+    """One image of a series.
+
+    Parameters
+    ----------
+    file
+        The file that it comes from.
+    page
+        What the file says about it.
+    stamp_ns
+        Time of the image in ns since 1970: the file's local time taken as UTC, or as the user says.
+    magnification
+        On the common display width: width of the stored image = display width / magnification exactly.
+    databar_rows
+        Rows to cut off at the bottom.
+    stage
+        Where the stage was, or None where the file does not say it.
+    """
+
+    file: ImageFile
+    page: ImagePage
+    stamp_ns: int
+    magnification: float
+    databar_rows: int
+    stage: StageReading | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return self.file.path.name
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """How it was taken, where the file says it."""
+        return self.page.settings
+
+    def cut(self, stored: NDArray[Any]) -> NDArray[Any]:
+        """Cut the databar off.
+
+        Raises
+        ------
+        BagError
+            If the image is of another size than the file said, or all of it is databar.
+        """
+        if stored.shape != self.page.size_px[::-1]:
+            raise BagError(
+                f"{self.name}: an image of {stored.shape[1]} x {stored.shape[0]} px",
+                expected=f"{self.page.size_px[0]} x {self.page.size_px[1]} px, as the file says",
+            )
+        rows = stored.shape[0] - self.databar_rows
+        if rows <= 0:
+            raise BagError(
+                f"{self.databar_rows} rows of databar in {self.name}",
+                expected=f"0 to {stored.shape[0] - 1}",
+                do="correct --databar-rows",
+            )
+        return stored[:rows]
+
+
+@dataclass(frozen=True)
+class ImageSeries:
+    """Images in the order of their stamps.
+
+    Parameters
+    ----------
+    images
+        At least one; those of one file follow each other.
+    display_width_m
+        The display width that all magnifications refer to.
+    skipped
+        Files that look like images and cannot be used.
+    notes
+        Notes for the user: where stamps, scale and display width come from.
+    """
+
+    images: tuple[SeriesImage, ...]
+    display_width_m: float
+    skipped: tuple[Skipped, ...]
+    notes: tuple[str, ...]
+
+    def read(
+        self, images: Sequence[SeriesImage] | None = None
+    ) -> Iterator[tuple[SeriesImage, NDArray[Any] | SemcalError]]:
+        """Yield each image with its pixels, or with the reason why it has none; files are opened once.
+
+        Parameters
+        ----------
+        images
+            Those to read, in their order and without gaps in a file; by default all.
+        """
+        chosen = self.images if images is None else images
+        for _, own in groupby(chosen, key=lambda image: id(image.file)):
+            images = list(own)
+            pixels = images[0].file.read()
+            for number, image in enumerate(images):
+                try:
+                    stored = next(pixels)
+                    yield image, image.cut(stored)
+                except StopIteration:  # noqa: PERF203  # each image may fail
+                    missing = len(images) - number
+                    reason = BagError(
+                        f"{image.name} ends {counted(missing, 'image')} early",
+                        expected="an intact file",
+                    )
+                    yield from ((lost, reason) for lost in images[number:])
+                    break
+                except SemcalError as error:
+                    yield image, error
+
+
+@dataclass(frozen=True)
+class _Image:
+    file: ImageFile
+    page: ImagePage
+    stamp_ns: int
+
+
+def _settings_of(image: _Image) -> Conditions:
+    return image.page.settings or Conditions()
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that puts ``image_9`` before ``image_10``."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def find_image_files(path: Path) -> list[Path]:
+    """Image files in a folder, of a pattern such as ``scans/*.tif``, or the one file; images in natural order.
+
+    Raises
+    ------
+    BagError
+        There are none.
+    """
+    if path.is_dir():
+        listed = [p for p in path.iterdir() if p.is_file() and is_image_file(p)]
+        what = f"{path} has no image file"
+    elif path.exists():
+        listed = [path] if is_image_file(path) else []
+        what = f"{path} does not have the name of an image or a video"
+    elif glob.has_magic(str(path)):
+        found = (Path(name) for name in glob.glob(str(path), recursive=True))
+        listed = [p for p in found if p.is_file() and is_image_file(p)]
+        what = f"no image file is called {path}"
+    else:
+        listed, what = [], f"{path} does not exist"
+    if not listed:
+        raise BagError(
+            what,
+            expected="a rosbag2 folder, an image (TIFF, PNG, JPEG, BMP), a video, or a folder or pattern of them",
+            do=("" if path.exists() else name_similar_file(path)) or "check the path",
+        )
+    return sorted(listed, key=_natural)
+
+
+def _collect(paths: Sequence[Path]) -> tuple[list[ImageFile], list[Skipped]]:
+    found, skipped = [], []
+    for path in paths:
+        try:
+            found.append(describe_image_file(path))
+        except SemcalError as error:  # noqa: PERF203  # each file may fail
+            skipped.append(Skipped(path.name, str(error)))
+    return found, skipped
+
+
+def _local_ns(file: ImageFile) -> int | None:
+    if file.time is None:
+        return None
+    # Microsoft's and others' epochs before 1970 would be negative.
+    return max(0, round(file.time.replace(tzinfo=timezone.utc).timestamp() * 1e3) * 1_000_000)
+
+
+def _stamp(
+    files: Sequence[ImageFile], frame_interval_s: float | None
+) -> tuple[list[_Image], list[str]]:
+    """Order images by time with strictly increasing stamps; also say where the stamps come from."""
+    begins = [_local_ns(file) for file in files]
+    if frame_interval_s is not None:
+        known = [begin for begin in begins if begin is not None]
+        start_ns = min(known) if len(known) == len(files) else _SYNTHETIC_START_NS
+        pages = [(file, page) for file in _in_time(files, begins) for page in file.pages]
+        step_ns = 1e9 * frame_interval_s
+        return [
+            _Image(file, page, start_ns + round(k * step_ns))
+            for k, (file, page) in enumerate(pages)
+        ], [f"stamps are {frame_interval_s:g} s apart, as given"]
+    several = sum(len(file.pages) for file in files) > 1
+    without = any(begin is None for begin in begins)
+    unspaced = any(page.offset_s is None for file in files for page in file.pages[1:])
+    notes = []
+    if without and several and (unspaced or len(files) > 1):
+        notes.append(
+            f"{'not all files have a time' if any(begins) else 'the files have no times'}: stamps are 1 s apart, "
+            "in the order of names; --frame-interval states the true interval"
+        )
+    elif unspaced:
+        notes.append(
+            "the images of one file are taken to be 1 s apart; --frame-interval states the true interval"
+        )
+    elif without:
+        notes.append("stamps are the times from the first image of the file" if several else "")
+    else:
+        notes.append("stamps are the files' local times taken as UTC")
+    images: list[_Image] = []
+    latest_ns = None
+    for file in files if without else _in_time(files, begins):
+        begin_ns = None if without else _local_ns(file)
+        if begin_ns is None:
+            begin_ns = _SYNTHETIC_START_NS if latest_ns is None else latest_ns + _SECOND_NS
+        for number, page in enumerate(file.pages):
+            offset_s = float(number) if page.offset_s is None else page.offset_s
+            stamp_ns = begin_ns + round(1e9 * offset_s)
+            if latest_ns is not None:
+                # Files have whole seconds; images of the same second stay in the order of their names.
+                stamp_ns = max(stamp_ns, latest_ns + MIN_SPACING_NS)
+            images.append(_Image(file, page, stamp_ns))
+            latest_ns = stamp_ns
+    return images, [note for note in notes if note]
+
+
+def _in_time(files: Sequence[ImageFile], begins: Sequence[int | None]) -> list[ImageFile]:
+    if any(begin is None for begin in begins):
+        return list(files)
+    order = sorted(range(len(files)), key=lambda k: begins[k] or 0)
+    return [files[k] for k in order]
+
+
+# A stage that turns back comes back to a fraction of this, rad.
+_TURNED_RAD = 1e-3
+
+
+def _stages(found: Sequence[_Image]) -> tuple[list[StageReading | None], list[str]]:
+    """Return what the files say about the stage, as far as its meaning is known, and notes.
+
+    Makers do not say in which sense they count a rotation. One that is the same in all files only adds
+    to the unknown direction of the grid; one that changes is left out. With a scan rotation, the
+    direction of the tilt axis in the image is not known, so the whole reading is left out.
+    """
+    turns = [_settings_of(image).stage_rotation_rad for image in found]
+    known = [turn for turn in turns if turn is not None]
+    turned = bool(known) and max(known) - min(known) > _TURNED_RAD
+    readings: list[StageReading | None] = []
+    doubts: dict[str, list[str]] = {}
+    scan_rotated = 0
+    for item, turn in zip(found, turns, strict=True):
+        settings = _settings_of(item)
+        rotated = abs(settings.scan_rotation_rad or 0.0) > _TURNED_RAD
+        scan_rotated += rotated and settings.stage_tilt_rad is not None
+        usable = settings.stage_tilt_rad is not None and not rotated
+        own = StageReading(settings.stage_tilt_rad, None if turned else turn) if usable else None
+        if own is not None and (doubt := doubt_unit(own, StageConfig())):
+            doubts.setdefault(doubt, []).append(item.file.path.name)
+            own = None
+        readings.append(own)
+    notes = [
+        f"the stage of {_some(names, 'image')} is not used: {doubt}"
+        for doubt, names in doubts.items()
+    ]
+    if turned and any(readings):
+        notes.append(
+            "the rotation of the stage is not used: the files do not say in which sense it counts"
+        )
+    if scan_rotated:
+        notes.append(
+            f"the stage is not used for {counted(scan_rotated, 'file')} with a rotated scan: it is not known in "
+            "which sense it counts"
+        )
+    tilted = any(r is not None and abs(r.tilt_rad or 0.0) > _TURNED_RAD for r in readings)
+    if tilted:
+        notes.append(
+            "the tilts of the stage are as the files state them; stage.tilt_axis_deg of the configuration "
+            "says about which axis and in which sense"
+        )
+    return readings, notes
+
+
+def _one_detector(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[str]]:
+    """Files without those of further detectors that saw the same scan, and a note about them."""
+    known = [file for file in files if file.pages[0].settings is not None]
+    first = [(file.pages[0].settings, file.pages[0].size_px) for file in known]
+    groups = group_by_scan([(own, size) for own, size in first if own is not None])
+    shared = [[known[k] for k in group] for group in groups if len(group) > 1]
+    if not shared:
+        return list(files), []
+    count = Counter(_detector(file) for group in shared for file in group)
+    used = max(count, key=lambda name: count[name])
+    left_out = set()
+    for group in shared:
+        kept = next((file for file in group if _detector(file) == used), group[0])
+        left_out |= {file.path for file in group if file is not kept}
+    others = sorted({_detector(file) for file in known if file.path in left_out})
+    note = (
+        f"several detectors saw the same scan: of {counted(len(shared), 'scan')} the image of {used} is used; "
+        f"{counted(len(left_out), 'image')} of {', '.join(others)} left out"
+    )
+    return [file for file in files if file.path not in left_out], [note]
+
+
+def _detector(file: ImageFile) -> str:
+    settings = file.pages[0].settings
+    return "" if settings is None else settings.detector
+
+
+def _some(names: Sequence[str], kind: str) -> str:
+    """One name, or how many there are with the first."""
+    return names[0] if len(names) == 1 else f"{counted(len(names), kind)} such as {names[0]}"
+
+
+def _group_notes(files: Sequence[ImageFile]) -> list[str]:
+    """The notes of files, each kind once: with the numbers of the first file."""
+    kinds: dict[str, dict[str, str]] = {}
+    for file in files:
+        for note in file.notes:
+            kinds.setdefault(omit_numbers(note), {}).setdefault(file.path.name, note)
+    return [f"{_some(list(kind), 'file')}: {next(iter(kind.values()))}" for kind in kinds.values()]
+
+
+def group_skipped(skipped: Sequence[Skipped]) -> list[str]:
+    """Why files are skipped, each kind of reason once; a reason may name the file."""
+    kinds: dict[str, list[Skipped]] = {}
+    for item in skipped:
+        kinds.setdefault(omit_numbers(item.reason.replace(item.name, "")), []).append(item)
+    return [
+        f"{_some([item.name for item in kind], 'file')} {'is' if len(kind) == 1 else 'are'} skipped: {kind[0].reason}"
+        for kind in kinds.values()
+    ]
+
+
+def _scale(
+    files: Sequence[ImageFile],
+    display_width_m: float,
+    pixel_size_m: float | None,
+    magnification: float | None,
+) -> tuple[list[ImageFile], list[Skipped], list[str]]:
+    """Files whose scale is known, the others, and notes."""
+    stated = [file for file in files if file.pixel_size_m is not None]
+    if magnification is not None and stated:
+        raise BagError(
+            f"a magnification stated for {_some([file.path.name for file in stated], 'file')}, which "
+            f"{'contains its own' if len(stated) == 1 else 'contain theirs'}",
+            expected="--magnification only for images without a pixel size",
+            do="leave it out; --pixel-size replaces what files say",
+        )
+    if pixel_size_m is not None:
+        other = [
+            file.pixel_size_m
+            for file in stated
+            if file.pixel_size_m and abs(file.pixel_size_m / pixel_size_m - 1.0) > _SAME_SCALE
+        ]
+        said = f"the pixel size is {1e9 * pixel_size_m:g} nm, as given"
+        contradicted = (
+            f", instead of {1e9 * other[0]:g} nm, which {counted(len(other), 'file says', 'files say')}"
+            if other
+            else ""
+        )
+        return list(files), [], [said + contradicted]
+    if magnification is not None:
+        return list(files), [], []
+    unknown = [file for file in files if file.pixel_size_m is None]
+    if not stated:
+        first = unknown[0]
+        raise UnknownScaleError(
+            f"{_some([file.path.name for file in unknown], 'image file')} without a pixel size: {first.no_scale}",
+            expected="the microscope's own files, or the scale",
+            do="state it with --pixel-size such as 43.9nm, or with --magnification (which refers to a display width "
+            f"of {1e3 * display_width_m:g} mm; --display-width states another)",
+        )
+    skipped = [
+        Skipped(file.path.name, f"no pixel size, which others have: {file.no_scale}")
+        for file in unknown
+    ]
+    return stated, skipped, []
+
+
+def list_image_series(
+    paths: Sequence[Path],
+    *,
+    display_width_m: float,
+    databar_rows: int | None = None,
+    pixel_size_m: float | None = None,
+    magnification: float | None = None,
+    frame_interval_s: float | None = None,
+    stage: bool = True,
+) -> ImageSeries:
+    """Collect image files as one series; only what they say about themselves is read.
+
+    Parameters
+    ----------
+    paths
+        Image files, such as those of :func:`find_image_files`.
+    display_width_m
+        Display width that all magnifications are to refer to.
+    databar_rows
+        Rows to cut off at the bottom of every image, instead of those that the metadata give.
+    pixel_size_m
+        Pixel size of all images, instead of what files say.
+    magnification
+        Magnification of all images, of which no file gives the pixel size.
+    frame_interval_s
+        Time from one image to the next, instead of what files say.
+    stage
+        Whether to read where the stage was.
+
+    Raises
+    ------
+    BagError
+        No file is usable, or their scale is not known, or known twice.
+    """
+    found, skipped = _collect(paths)
+    if not found:
+        raise BagError(
+            f"{counted(len(paths), 'image file')}, none usable, the first "
+            f"({skipped[0].name}): {skipped[0].reason}",
+            expected="at least one intact image",
+        )
+    files, unscaled, scale_notes = _scale(found, display_width_m, pixel_size_m, magnification)
+    files, detector_notes = _one_detector(files)
+    stamped, stamp_notes = _stamp(files, frame_interval_s)
+    readings, stage_notes = _stages(stamped)
+    if not stage:
+        readings, stage_notes = [None] * len(stamped), []
+    if magnification is None and pixel_size_m is None:
+        scale_notes.append(f"magnifications refer to a display width of {display_width_m:g} m")
+
+    def magnify(page: ImagePage) -> float:
+        if magnification is not None:
+            return magnification
+        return display_width_m / ((pixel_size_m or page.pixel_size_m or 0.0) * page.size_px[0])
+
+    images = tuple(
+        SeriesImage(
+            item.file,
+            item.page,
+            item.stamp_ns,
+            magnify(item.page),
+            item.page.databar_rows if databar_rows is None else databar_rows,
+            reading,
+        )
+        for item, reading in zip(stamped, readings, strict=True)
+    )
+    left_out = (*skipped, *unscaled)
+    return ImageSeries(
+        images,
+        display_width_m,
+        left_out,
+        (
+            *scale_notes,
+            *stamp_notes,
+            *detector_notes,
+            *stage_notes,
+            *_group_notes(files),
+            *group_skipped(left_out),
+        ),
+    )
