@@ -12,10 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Automatic detection of the corners of an endless chess board."""
+"""Automatic detection of endless grids: chess boards, dots, holes and crossed lines."""
 
 from __future__ import annotations
 
 from semcal_ros.core.corners.detection import LatticeDetection, LatticeStatus, find_lattice
+from semcal_ros.core.corners.pattern import PATTERN_NAMES, PATTERNS, check_pattern
 
-__all__ = ["LatticeDetection", "LatticeStatus", "find_lattice"]
+__all__ = [
+    "PATTERNS",
+    "PATTERN_NAMES",
+    "LatticeDetection",
+    "LatticeStatus",
+    "check_pattern",
+    "find_lattice",
+]

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import ndimage
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Array32, Indices, Mask
-from semcal_ros.core.corners.corner_fit import CornerFit
+from semcal_ros.core.corners.corner_fit import CornerFit, PositionFit
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.window import PixelWindows
 
@@ -47,14 +47,13 @@ LEVERAGE_MAX = 25.0
 PART_MIN = 4
 
 
-def select_connected(fitted: FittedCorners, keep: Mask) -> Mask:
+def select_connected(cells: Indices, maps: LocalMaps, fit: PositionFit, keep: Mask) -> Mask:
     """Select the largest part of the lattice and the parts that continue it; (n,) true for these.
 
     Where two boards meet, a lattice grows from one into the other, but no corner in between agrees
     with its neighbours. Debris also divides a board, but then the maps of one part predict the
     other.
     """
-    cells = fitted.cells
     low = cells[keep].min(axis=0)
     grid = np.zeros(cells[keep].max(axis=0) - low + 1, dtype=np.bool_)
     grid[tuple((cells[keep] - low).T)] = True
@@ -69,22 +68,24 @@ def select_connected(fitted: FittedCorners, keep: Mask) -> Mask:
     waiting = [p for p in order[1:] if size[p] >= PART_MIN]
     # A part may continue the lattice only across another one.
     while True:
-        continuing = [p for p in waiting if _continues(fitted, joined, part == p)]
+        continuing = [p for p in waiting if _continues(cells, maps, fit, joined, part == p)]
         if not continuing:
             return joined
         joined |= np.isin(part, continuing)
         waiting = [p for p in waiting if p not in continuing]
 
 
-def _continues(fitted: FittedCorners, joined: Mask, other: Mask) -> bool:
+def _continues(
+    cells: Indices, cell_maps: LocalMaps, fit: PositionFit, joined: Mask, other: Mask
+) -> bool:
     """Return whether the corners of a part lie where the joined ones predict them."""
-    cells, xy = fitted.cells, fitted.fit.xy
+    xy = fit.xy
     maps = fit_local_maps(cells[other], cells[joined], xy[joined])
     near = maps.usable & (maps.leverage < LEVERAGE_MAX)
     if not np.any(near):
         return False
-    spacing = np.linalg.norm(fitted.maps.axes[other][near], axis=2).min(axis=1)
-    variance = 0.5 * np.trace(fitted.fit.covariance[other][near], axis1=1, axis2=2)
+    spacing = np.linalg.norm(cell_maps.axes[other][near], axis=2).min(axis=1)
+    variance = 0.5 * np.trace(fit.covariance[other][near], axis1=1, axis2=2)
     miss = np.linalg.norm(xy[other][near] - maps.xy[near], axis=1)
     allowed = CONTINUED * spacing + 3.0 * np.sqrt(variance * (1.0 + maps.leverage[near]))
     return bool(np.median(miss / allowed) < 1.0)
@@ -224,7 +225,7 @@ def _alike(fit: CornerFit, good: Mask, pooled: float) -> Mask:
     return ~uneven & (pull < BLUR_SIGMAS * typical)
 
 
-def inflate_variance(fit: CornerFit, keep: Mask) -> Array:
+def inflate_variance(fit: PositionFit, keep: Mask) -> Array:
     """Return (n,) factors on the covariances: the pooled misfit, or a corner's far larger one."""
     pooled = float(np.median(fit.chi2[keep]))
     significant = pooled * (1.0 + 3.0 * np.sqrt(2.0 / fit.freedom))

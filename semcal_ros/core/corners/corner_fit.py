@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,7 +37,20 @@ from semcal_ros.core.corners.priors import Prior
 from semcal_ros.core.corners.symmetry_test import compare_opposite_squares
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = ["CornerFit", "NoiseModel", "band_px", "fit_corners", "fit_noise", "rough_start"]
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = [
+    "CornerFit",
+    "NoiseModel",
+    "PositionFit",
+    "band_px",
+    "fit_corners",
+    "fit_noise",
+    "normal_equations",
+    "rough_start",
+    "split_statistics",
+]
 
 
 # A pixel averages over its own width, which alone is a blur of 1 / sqrt(12) = 0.289 px: no edge is
@@ -80,8 +94,8 @@ class NoiseModel:
 
 
 @dataclass(frozen=True)
-class CornerFit:
-    """Fitted corners.
+class PositionFit:
+    """Positions fitted to the pixels around them.
 
     Attributes
     ----------
@@ -90,22 +104,49 @@ class CornerFit:
     covariance
         (n, 2, 2) covariance of the positions, px^2, for the noise model given (unit noise without
         one).
+    chi2
+        (n,) weighted squared residuals per degree of freedom.
+    freedom
+        (n,) degrees of freedom.
+    level, variance
+        (n, 2) mean grey value and mean squared residual of the pixels darker and of the pixels
+        brighter than the middle.
+    shift_px
+        (n,) size of the last step, px; large where the fit has not converged.
+    coverage
+        (n,) part of the window that lies in the image.
+    """
+
+    xy: Array
+    covariance: Array
+    chi2: Array
+    freedom: Array
+    level: Array
+    variance: Array
+    shift_px: Array
+    coverage: Array
+
+    def select(self, keep: Mask) -> Self:
+        """Return the fits of the points where ``keep`` is true."""
+        return type(self)(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Concatenate the fits of several sets."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+
+@dataclass(frozen=True)
+class CornerFit(PositionFit):
+    """Fitted corners.
+
+    Attributes
+    ----------
     nonlinear, linear
         (n, 7) and (n, 8) parameters of :mod:`semcal_ros.core.corners.edge_model`, positions
         relative to the window.
     normal
         (n, 15, 15) normal matrices, including the prior.
-    chi2
-        (n,) weighted squared residuals per degree of freedom.
-    freedom
-        (n,) degrees of freedom.
-    shift_px
-        (n,) size of the last step, px; large where the fit has not converged.
-    coverage
-        (n,) part of the window that lies in the image.
-    level, variance
-        (n, 2) mean grey value and mean squared residual of the pixels darker and of the pixels
-        brighter than the middle.
     imbalance, unlike
         (n,) score test of a difference in grey value between opposite squares, a chi-square with
         two degrees of freedom in units of ``chi2``, and the difference as a part of the contrast;
@@ -114,36 +155,17 @@ class CornerFit:
         (n,) distance of the blur from its prior, in standard deviations.
     """
 
-    xy: Array
-    covariance: Array
     nonlinear: Array
     linear: Array
     normal: Array
-    chi2: Array
-    freedom: Array
-    shift_px: Array
-    coverage: Array
-    level: Array
-    variance: Array
     imbalance: Array
     unlike: Array
     blur_pull: Array
-
-    def select(self, keep: Mask) -> CornerFit:
-        """Return the fits of the corners where ``keep`` is true."""
-        return CornerFit(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @property
     def parameters(self) -> Array:
         """(n, 15) nonlinear and linear parameters."""
         return np.column_stack([self.nonlinear, self.linear])
-
-    @staticmethod
-    def join(parts: Sequence[CornerFit]) -> CornerFit:
-        """Concatenate the fits of several sets."""
-        return CornerFit(
-            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CornerFit))
-        )
 
     @property
     def angles(self) -> Array:
@@ -252,7 +274,7 @@ def _fit_block(
         jacobian, model = evaluate(windows, geometry, nonlinear, linear)
         weight = windows.valid if noise is None else windows.valid / noise.variance(model)
         residual = windows.value - model
-        normal, right = _normal_equations(jacobian, residual, weight)
+        normal, right = normal_equations(jacobian, residual, weight)
         np.einsum("nii->ni", normal)[...] += known
         pull = known * (prior.mean - np.column_stack([nonlinear, linear]))
         right += pull
@@ -272,7 +294,7 @@ def _fit_block(
     # The last step changes chi2 as the normal equations predict without the prior.
     change = np.einsum("na,na->n", step, right - 2.0 * pull + known * step)
     chi2 = np.maximum(chi2 - change, 0.5 * chi2) / freedom
-    level, variance = _statistics(windows, residual, model, freedom)
+    level, variance = split_statistics(windows, residual, model, freedom)
     balance = (
         compare_opposite_squares(windows, nonlinear, jacobian, residual, weight, normal, step)
         if judged
@@ -281,15 +303,15 @@ def _fit_block(
     return CornerFit(
         windows.origin + nonlinear[:, :2],
         solution[:, :2, 1:3],
+        chi2,
+        freedom,
+        level,
+        variance,
+        np.linalg.norm(step[:, :2], axis=1),
+        windows.coverage,
         nonlinear,
         linear,
         normal,
-        chi2,
-        freedom,
-        np.linalg.norm(step[:, :2], axis=1),
-        windows.coverage,
-        level,
-        variance,
         balance[0],
         balance[1] / np.maximum(np.abs(linear[:, CONTRAST - NONLINEAR]), 1e-9),
         _pull(nonlinear[:, LOG_BLUR], solution[:, LOG_BLUR, 3], prior),
@@ -304,7 +326,7 @@ def _pull(log_blur: Array, variance: Array, prior: Prior) -> Array:
     return (log_blur - prior.mean[:, LOG_BLUR]) / np.sqrt(spread)
 
 
-def fit_noise(fit: CornerFit) -> NoiseModel:
+def fit_noise(fit: PositionFit) -> NoiseModel:
     """Fit the noise as a function of the grey value to the residuals of unweighted fits.
 
     The model is a line through the noise of the dark pixels and that of the bright ones. Medians
@@ -321,7 +343,7 @@ def fit_noise(fit: CornerFit) -> NoiseModel:
     return NoiseModel(low, (high - low) / spread, dark)
 
 
-def _statistics(
+def split_statistics(
     windows: PixelWindows, residual: Array32, model: Array32, freedom: Array
 ) -> tuple[Array, Array]:
     """Return (n, 2) levels and variances of the pixels darker and brighter than the middle."""
@@ -338,7 +360,16 @@ def _statistics(
     return level, variance
 
 
-def _normal_equations(jacobian: Array32, residual: Array32, weight: Array32) -> tuple[Array, Array]:
+def normal_equations(jacobian: Array32, residual: Array32, weight: Array32) -> tuple[Array, Array]:
+    """Return (n, a, a) normal matrices and (n, a) right-hand sides of weighted least squares.
+
+    The diagonal is raised by a trifle, so that undetermined parameters do not make it singular.
+
+    Parameters
+    ----------
+    jacobian, residual, weight
+        (n, a, p) derivatives, (n, p) residuals and weights.
+    """
     weighted = jacobian * weight[:, None, :]
     normal = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
     right = (weighted @ residual[:, :, None])[:, :, 0].astype(np.float64)
@@ -352,7 +383,7 @@ def _solve_linear(
     windows: PixelWindows, geometry: EdgeGeometry, nonlinear: Array, prior: Prior
 ) -> Array:
     jacobian, _ = evaluate(windows, geometry, nonlinear, None)
-    normal, right = _normal_equations(jacobian, windows.value, windows.valid)
+    normal, right = normal_equations(jacobian, windows.value, windows.valid)
     known = ASSUMED_VARIANCE / prior.deviation[:, NONLINEAR:] ** 2
     np.einsum("nii->ni", normal)[...] += known
     right += known * prior.mean[:, NONLINEAR:]

@@ -134,18 +134,19 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
     if len(grown.ij) < CORNERS_MIN:
         return None
     few = np.arange(len(grown.ij)) < SAMPLE
-    first = _first_fit(image, grown.ij[few], maps.select(few))
+    start = _start(maps, grown.xy, FIRST_BLUR_PX)
+    first = _first_fit(image, grown.ij[few], maps.select(few), start[few])
     if first.good.sum() < CORNERS_MIN:
         return None
     part = _quality(first, image)
     if part < HOPELESS:
         return _result(first, first.good, part, first.maps.xy[~first.good])
     knowledge = _learn(first)
-    maps = _better_maps(grown, first)
-    grown, maps = grown.select(maps.usable), maps.select(maps.usable)
+    maps, start = _better_maps(grown, first, knowledge.blur_px)
+    grown, maps, start = grown.select(maps.usable), maps.select(maps.usable), start[maps.usable]
     if len(grown.ij) < CORNERS_MIN:
         return None
-    second = _fit(image, grown.ij, maps, knowledge, iterations=2)
+    second = _fit(image, grown.ij, maps, start, knowledge, iterations=2)
     part = _quality(second, image)
     if second.good.sum() < CORNERS_MIN:
         return None
@@ -154,10 +155,10 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
     if last is None:
         return None
     keep = last.good & find_undisturbed(last)
-    keep &= find_consistent(replace(last, good=keep))
+    keep = find_consistent(last.cells, last.maps, last.fit, keep)
     if keep.sum() < CORNERS_MIN:
         return None
-    agreeing, keep = int(keep.sum()), select_connected(last, keep)
+    agreeing, keep = int(keep.sum()), select_connected(last.cells, last.maps, last.fit, keep)
     passed = last.cells[keep]
     doubtful = np.concatenate([second.cells[~second.good], last.cells[~keep]])
     expected = np.concatenate([second.maps.xy[~second.good], last.maps.xy[~keep]])
@@ -173,12 +174,27 @@ def _quality(fitted: FittedCorners, image: Array32) -> float:
     return float(fitted.good[expected].mean()) if np.any(expected) else 0.0
 
 
-def _better_maps(grown: Lattice, first: FittedCorners) -> LocalMaps:
-    """Fit local maps through the fitted positions in place of the saddle points."""
+def _better_maps(grown: Lattice, first: FittedCorners, blur_px: float) -> tuple[LocalMaps, Array]:
+    """Fit local maps through the fitted positions in place of the saddle points.
+
+    Also returns the (n, 2) positions from which to start.
+    """
     count = len(first.cells)
-    xy = np.concatenate([first.fit.xy, grown.xy[count:]])
+    xy = grown.xy.copy()
+    xy[:count][first.good] = first.fit.xy[first.good]
     known = np.concatenate([first.good, np.ones(len(xy) - count, dtype=bool)])
-    return fit_local_maps(grown.ij, grown.ij[known], xy[known], leave_out_self=False)
+    maps = fit_local_maps(grown.ij, grown.ij[known], xy[known], leave_out_self=False)
+    return maps, _start(maps, xy, blur_px)
+
+
+def _start(maps: LocalMaps, xy: Array, blur_px: float) -> Array:
+    """Return (n, 2) positions from which to start: of the maps, or as found if these are far off.
+
+    Maps average the errors of saddle points, a few tenths of a pixel. But through large squares they
+    miss strong distortions by pixels, and a fit does not return from farther than the blur.
+    """
+    missed = np.linalg.norm(maps.xy - xy, axis=1) > blur_px
+    return np.where(missed[:, None], xy, maps.xy)
 
 
 def _shuffle(lattice: Lattice) -> Lattice:
@@ -220,9 +236,9 @@ def _plausible(lattice: Lattice) -> Lattice:
     return lattice.select(keep)
 
 
-def _first_fit(image: Array32, cells: Indices, maps: LocalMaps) -> FittedCorners:
-    """Fit with equal weights and loose priors."""
-    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
+def _first_fit(image: Array32, cells: Indices, maps: LocalMaps, start: Array) -> FittedCorners:
+    """Fit with equal weights and loose priors, from (n, 2) positions ``start``."""
+    windows = gather_windows(image, start, maps.axes, maps.bend, band_px(FIRST_BLUR_PX))
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
     prior = loose_prior(maps, geometry, FIRST_BLUR_PX)
     fit = fit_corners(windows, geometry, None, prior, noise=None, iterations=3)
@@ -254,11 +270,17 @@ def _relearn(known: FittedCorners, knowledge: _Knowledge) -> _Knowledge:
 
 
 def _fit(
-    image: Array32, cells: Indices, maps: LocalMaps, knowledge: _Knowledge, *, iterations: int
+    image: Array32,
+    cells: Indices,
+    maps: LocalMaps,
+    start_xy: Array,
+    knowledge: _Knowledge,
+    *,
+    iterations: int,
 ) -> FittedCorners:
-    """Fit all cells from their local maps and judge each fit on its own."""
+    """Fit all cells from (n, 2) positions and their local maps, and judge each fit on its own."""
     band = band_px(knowledge.blur_px)
-    windows = gather_windows(image, maps.xy, maps.axes, maps.bend, band)
+    windows = gather_windows(image, start_xy, maps.axes, maps.bend, band)
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)
     prior = knowledge.learnt.prior(maps, geometry)
     start = rough_start(windows, prior, knowledge.sign * contrast_signs(cells))
@@ -302,11 +324,11 @@ def _fill(image: Array32, known: FittedCorners, knowledge: _Knowledge) -> Fitted
         maps = fit_local_maps(near, known.cells, known.fit.xy)
         inside = np.all((maps.xy >= MARGIN_PX) & (maps.xy <= limit), axis=1)
         inside &= maps.usable
-        near = near[inside]
+        near, maps = near[inside], maps.select(inside)
         if not len(near):
             break
         tried = np.concatenate([tried, _keys(near)])
-        fitted = _fit(image, near, maps.select(inside), knowledge, iterations=4)
+        fitted = _fit(image, near, maps, maps.xy, knowledge, iterations=4)
         if not np.any(fitted.good):
             break
         known = FittedCorners.join(known, fitted.select(fitted.good))

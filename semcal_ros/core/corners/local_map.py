@@ -51,6 +51,8 @@ class LocalMaps:
         (n, 2, 2) first derivatives; ``axes[:, 0]`` along i, ``axes[:, 1]`` along j.
     bend
         (n, 2, 2) second derivatives along i (``bend[:, 0]``) and along j (``bend[:, 1]``).
+    twist
+        (n, 2) mixed second derivatives.
     support
         (n,) number of neighbours used.
     leverage
@@ -60,6 +62,7 @@ class LocalMaps:
     xy: Array
     axes: Array
     bend: Array
+    twist: Array
     support: Array
     leverage: Array
 
@@ -82,6 +85,7 @@ class LocalMaps:
             self.xy[keep],
             self.axes[keep],
             self.bend[keep],
+            self.twist[keep],
             self.support[keep],
             self.leverage[keep],
         )
@@ -138,6 +142,7 @@ def fit_local_maps(
         solution[:, 0],
         solution[:, 1:3],
         solution[:, [3, 5]],
+        solution[:, 4],
         (patterns > 0).sum(axis=1).astype(np.float64)[which],
         (solver[:, 0] ** 2).sum(axis=1)[which],
     )

@@ -19,8 +19,9 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, Mask
-from semcal_ros.core.corners.checks import CORNERS_MIN, FittedCorners, inflate_variance
-from semcal_ros.core.corners.local_map import SUPPORT_MIN, fit_local_maps
+from semcal_ros.core.corners.checks import CORNERS_MIN, inflate_variance
+from semcal_ros.core.corners.corner_fit import PositionFit
+from semcal_ros.core.corners.local_map import SUPPORT_MIN, LocalMaps, fit_local_maps
 from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
 
 __all__ = ["find_consistent"]
@@ -38,30 +39,32 @@ MAP_ERROR_RATIO = 4.0
 TREND_DEGREE = 5
 
 
-def find_consistent(fitted: FittedCorners) -> Mask:
-    """Select corners that agree with the predictions of their neighbours; (n,).
+def find_consistent(cells: Indices, maps: LocalMaps, fit: PositionFit, good: Mask) -> Mask:
+    """Select corners of the ``good`` ones that agree with the predictions of their neighbours; (n,).
 
     Later passes leave out the worst corners, which spoil the predictions of their neighbours.
     """
-    good = fitted.good
+    chosen = good
     for sigmas in MISS_SIGMAS:
-        if good.sum() < CORNERS_MIN:
+        if chosen.sum() < CORNERS_MIN:
             return np.zeros(len(good), dtype=np.bool_)
-        good = fitted.good & _agree_with_neighbours(fitted, good, sigmas)
-    return good
+        chosen = good & _agree_with_neighbours(cells, maps, fit, chosen, sigmas)
+    return chosen
 
 
-def _agree_with_neighbours(fitted: FittedCorners, good: Mask, sigmas: float) -> Mask:
+def _agree_with_neighbours(
+    cells: Indices, cell_maps: LocalMaps, fit: PositionFit, good: Mask, sigmas: float
+) -> Mask:
     """Select corners within ``sigmas`` of the predictions of the good corners around them; (n,)."""
-    cells, xy = fitted.cells, fitted.fit.xy
+    xy = fit.xy
     # Local maps extrapolate at the rim and are coarse in large squares. There only the residuals of
     # a smooth trend are small enough for them.
     rest = xy - _trend(cells, good, xy)
     maps = fit_local_maps(cells, cells[good], rest[good])
     # The neighbours are as uncertain as the corner itself.
     miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
-    covariance = fitted.fit.covariance * inflate_variance(fitted.fit, good)[:, None, None]
-    error = _map_error(fitted, good, covariance, _squared_mahalanobis(miss, covariance))
+    covariance = fit.covariance * inflate_variance(fit, good)[:, None, None]
+    error = _map_error(cell_maps, good, covariance, _squared_mahalanobis(miss, covariance))
     covariance = covariance + (error**2)[:, None, None] * np.eye(2)
     passed = _squared_mahalanobis(miss, covariance) < sigmas**2
     return passed & (maps.support >= SUPPORT_MIN)
@@ -74,7 +77,7 @@ def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:
     return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 
 
-def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Array) -> Array:
+def _map_error(maps: LocalMaps, good: Mask, covariance: Array, squared: Array) -> Array:
     """Estimate the (n,) errors of the maps besides noise, px, from the image as a whole.
 
     An uneven board is uneven everywhere; a distortion is too strong for the maps only in a part of
@@ -83,7 +86,7 @@ def _map_error(fitted: FittedCorners, good: Mask, covariance: Array, squared: Ar
     excess = max(float(np.median(squared[good])) / MEDIAN_CHI2_2 - 1.0, 0.0)
     variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
     seen = np.sqrt(excess * float(np.median(variance[good])))
-    spacing = np.linalg.norm(fitted.maps.axes, axis=2).min(axis=1)
+    spacing = np.linalg.norm(maps.axes, axis=2).min(axis=1)
     worst = MAP_ERROR_PX * (spacing / LARGE_SQUARE_PX) ** 3
     return np.maximum(seen, np.minimum(worst, MAP_ERROR_RATIO * seen))
 

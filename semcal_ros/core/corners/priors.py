@@ -59,8 +59,9 @@ GRADIENT_PRIOR = 0.15
 GRADIENT_LEAST = 0.003
 # Growth of the bright squares times contrast, px.
 GROWTH_PRIOR = 0.3
-# Spreads that are tried, relative to the loose ones above.
-SPREADS: Array = np.geomspace(0.02, 1.0, 14)
+# Spreads that are tried, relative to the loose ones above; those above 1 only where the corners show
+# more than the loose ones allow.
+SPREADS: Array = np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)])
 # Loss of log-likelihood against the best spread up to which a larger one is taken: one standard
 # deviation.
 LIKELIHOOD_LOSS = 0.5
@@ -181,7 +182,10 @@ def _largest_spread(score: Array, variance: Array) -> float:
     total = SPREADS[:, None] ** 2 + variance
     # Corners under debris count no more than others at three standard deviations.
     cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER)).sum(axis=1)
-    return float(SPREADS[np.nonzero(cost <= cost.min() + LIKELIHOOD_LOSS)[0][-1]])
+    plausible = cost <= cost.min() + LIKELIHOOD_LOSS
+    if SPREADS[np.argmin(cost)] <= 1.0:
+        plausible &= SPREADS <= 1.0
+    return float(SPREADS[np.nonzero(plausible)[0][-1]])
 
 
 def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) -> Prior:

@@ -49,6 +49,7 @@ class LatticeStatus(Enum):
     NO_LATTICE = "no chess lattice"
     TWO_BOARDS = "two boards"
     TOO_FEW_CORNERS = "too few corners"
+    OTHER_PATTERN = "another pattern"
 
 
 @dataclass(frozen=True)

@@ -264,6 +264,36 @@ def test_bounded_board_gives_its_inner_corners_and_no_others() -> None:
     assert np.abs(errors(board, detection)).max() < 0.2
 
 
+@pytest.mark.parametrize(
+    ("square", "distortion", "size"), [(70.0, -0.5, (512, 400)), (90.0, -0.4, (640, 480))]
+)
+def test_large_squares_under_the_distortion_of_a_wide_lens(
+    square: float, distortion: float, size: tuple[int, int]
+) -> None:
+    """A quadratic map through their neighbours misses such corners by pixels, and their edges' bends by tenths."""
+    board = Board(
+        square,
+        tilt_deg=25.0,
+        axis_deg=30.0,
+        turn_deg=8.0,
+        distortion=distortion,
+        perspective=0.5,
+        blur_px=0.7,
+        electrons=300.0,
+        width=size[0],
+        height=size[1],
+        bounds=(-4, -3, 4, 3),
+    )
+    detection = detected(board.render(np.random.default_rng(1)), pattern="chess")
+    _ij, truth = board.corners()
+    assert len(detection.xy) == len(truth) == 35
+    distance, nearest = cKDTree(truth).query(detection.xy)
+    assert distance.max() < 0.5
+    score = (detection.xy - truth[nearest]) / detection.sigma_px[:, None]
+    # 70 coordinates: 1 +- 0.08 for true sigmas. At the rim the edges are no parabolas any more.
+    assert np.sqrt(np.mean(score**2)) < 1.5
+
+
 @pytest.mark.parametrize("square", [15.0, 40.0, 90.0])
 def test_debris_and_missing_squares_do_not_make_false_corners(square: float) -> None:
     board = Board(square, turn_deg=25.0, electrons=100.0, tilt_deg=20.0)

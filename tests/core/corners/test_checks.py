@@ -22,11 +22,10 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.corners.checks import FittedCorners, inflate_variance
+from semcal_ros.core.corners.checks import inflate_variance
 from semcal_ros.core.corners.corner_fit import CornerFit
 from semcal_ros.core.corners.local_map import fit_local_maps
 from semcal_ros.core.corners.neighbour_consistency import find_consistent
-from semcal_ros.core.corners.window import gather_windows
 
 
 def fits(chi2: Array, freedom: float) -> CornerFit:
@@ -55,9 +54,7 @@ def test_a_corner_may_miss_its_neighbours_by_what_its_misfit_explains() -> None:
     chi2[noisy] = 9.0
     fit = replace(fits(chi2, 50.0), xy=xy, covariance=np.tile(0.02**2 * np.eye(2), (len(xy), 1, 1)))
     maps = fit_local_maps(cells, cells, xy)
-    windows = gather_windows(np.zeros((260, 260), np.float32), maps.xy, maps.axes, maps.bend, 4.0)
-    corners = FittedCorners(cells, maps, windows, fit, np.ones(len(cells), dtype=np.bool_))
-    consistent = find_consistent(corners)
+    consistent = find_consistent(cells, maps, fit, np.ones(len(cells), dtype=np.bool_))
     assert consistent[noisy]
     assert not consistent[shifted]
     # Noise alone exceeds the limits once in 900.

@@ -1,0 +1,357 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find grids of dots or holes, and gratings of crossed lines, at sub-pixel accuracy.
+
+Between the dots of a square lattice the grey value has saddle points, and so it has between the
+crossings of lines: smoothed to the spacing, all these patterns are the chess board that their
+strongest harmonics make, turned by 45 degrees. So the lattice is grown as that of a chess board, and
+its squares are the cells of the pattern.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
+from semcal_ros.core.corners.checks import (
+    CHI2_EXCESS,
+    CHI2_SIGMAS,
+    CONTRAST_MIN,
+    CORNERS_MIN,
+    MISFIT_MAX,
+    inflate_variance,
+    select_connected,
+)
+from semcal_ros.core.corners.corner_fit import NoiseModel, fit_noise
+from semcal_ros.core.corners.lattice import STEPS, Lattice, grow_best_lattice
+from semcal_ros.core.corners.lattice_refinement import RefinedCorners
+from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.neighbour_consistency import find_consistent
+from semcal_ros.core.corners.pattern import CellShape, CellShapes, fit_shapes
+from semcal_ros.core.corners.saddle import SaddlePoints, find_saddles
+from semcal_ros.core.corners.unit_cell import (
+    CellFit,
+    UnitCell,
+    average_cells,
+    bin_cells,
+    fit_cells,
+    gather_cells,
+)
+
+__all__ = ["bright_cells", "find_cell_lattices", "fit_lattice_shapes", "refine_cells"]
+
+
+# Scales of the search for saddle points, px, in steps of 1.7 as for chess boards; a quarter of
+# the distance between the saddle points, 0.7 spacings, is best. Dots far apart have no saddle
+# points at smaller scales, so the search goes on up to dots a third of the image apart.
+SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0)
+LARGEST_SCALE_PART = 0.06
+# The image is reduced for scales beyond twice this, px.
+SCALE_REDUCED_PX = 5.0
+# Cells that are averaged, and the pixels in them: a fifteenth of the noise remains.
+SAMPLE = 60
+SAMPLE_PIXELS = 400_000
+SAMPLE_MIN = 12
+# Cells for the classification, which needs less.
+SAMPLE_COARSE = 40
+# Rounds of mean and fit. Positions from saddle points, good to a twentieth of the spacing, smear
+# the first mean; the second has converged.
+MEAN_ROUNDS = 3
+# Rounds of maps through the fitted cells, and fits along these maps. On the rim, where a cell shows only
+# in part, an error of its axes shifts it, and the maps are one-sided there.
+LAST_ROUNDS = 3
+# Least part of the outline of a dot or crossing in the image, as squared gradient. With less, an error
+# of the local map or a gradient of the brightness is no longer told from a shift: crossings of which
+# half was in view were off by two sigmas.
+SHOWN_MIN = 0.9
+# Largest last step of a fit that has converged, px, besides a hundredth of the spacing.
+STEP_MAX_PX = 0.05
+
+
+def find_cell_lattices(image: Image) -> list[Lattice]:
+    """Return the lattices of bright places at all scales, those with most cells first."""
+    found = []
+    for scale in SCALES_PX:
+        if scale > LARGEST_SCALE_PART * min(image.shape) and scale > SCALES_PX[0]:
+            continue
+        lattice = _grow(image, scale)
+        cells = None if lattice is None else bright_cells(image, lattice)
+        if cells is not None and len(cells.ij) >= CORNERS_MIN:
+            found.append(cells)
+    return sorted(found, key=_regular_count, reverse=True)
+
+
+def _regular_count(cells: Lattice) -> float:
+    """Return the number of cells that lie where their neighbours predict them."""
+    maps = fit_local_maps(cells.ij, cells.ij, cells.xy)
+    miss = np.linalg.norm(maps.xy - cells.xy, axis=1)
+    spacing = np.linalg.norm(cells.axes, axis=2).min(axis=1)
+    # In units of area: a lattice through noise has many small cells.
+    area = np.abs(np.linalg.det(cells.axes))
+    return float(area[(miss < 0.1 * spacing) & maps.usable].sum())
+
+
+def _grow(image: Image, scale_px: float) -> Lattice | None:
+    factor = max(1, int(scale_px / SCALE_REDUCED_PX))
+    small = image
+    if factor > 1:
+        size = (image.shape[1] // factor, image.shape[0] // factor)
+        cropped = image[: size[1] * factor, : size[0] * factor]
+        small = cv2.resize(cropped, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    saddles = find_saddles(small, scale_px / factor)
+    # Pixel centres of the reduced image lie in the middle of the pixels that they replace.
+    moved = SaddlePoints(
+        factor * saddles.xy + 0.5 * (factor - 1), saddles.hessian, saddles.response
+    )
+    return grow_best_lattice(moved, (image.shape[1], image.shape[0]))
+
+
+def bright_cells(image: Image, lattice: Lattice) -> Lattice | None:
+    """Return the bright squares of a chess lattice, as a lattice of their own; None without any.
+
+    Parameters
+    ----------
+    image
+        (h, w) float32.
+    lattice
+        Corners of squares that alternate between bright and dark.
+    """
+    sets = [_squares(lattice, parity) for parity in (0, 1)]
+    levels = [_median_at(image, cells.xy) if len(cells.ij) else -np.inf for cells in sets]
+    brighter = sets[int(np.argmax(levels))]
+    return brighter if len(brighter.ij) else None
+
+
+def _squares(lattice: Lattice, parity: int) -> Lattice:
+    """Return the squares whose first corner has this parity of i + j, at their centres."""
+    low = lattice.ij.min(axis=0)
+    size = lattice.ij.max(axis=0) - low + 2
+    member = np.full(size, -1, dtype=np.intp)
+    member[tuple((lattice.ij - low).T)] = np.arange(len(lattice.ij))
+    i, j = (lattice.ij - low).T
+    corners = np.stack([member[i, j], member[i + 1, j], member[i, j + 1], member[i + 1, j + 1]])
+    keep = np.all(corners >= 0, axis=0) & (lattice.ij.sum(axis=1) % 2 == parity)
+    first = lattice.ij[keep] - np.array([parity, 0])
+    ij = np.stack([first.sum(axis=1) // 2, (first[:, 1] - first[:, 0]) // 2], axis=1)
+    xy = lattice.xy[corners[:, keep]].mean(axis=0)
+    # A step along the new i is one along both old axes; along the new j, back along i and on along j.
+    old = lattice.axes[keep]
+    axes = np.stack([old[:, 0] + old[:, 1], old[:, 1] - old[:, 0]], axis=1)
+    return Lattice(ij.astype(np.intp), xy, axes)
+
+
+def _median_at(image: Image, xy: Array) -> float:
+    column, row = np.rint(xy).astype(np.intp).T
+    height, width = image.shape
+    return float(np.median(image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]))
+
+
+def fit_lattice_shapes(image: Array32, cells: Lattice) -> CellShapes | None:
+    """Fit the patterns whose bright places are at ``cells``; None if too little of it is in view."""
+    few = np.random.default_rng(0).permutation(len(cells.ij))[:SAMPLE_COARSE]
+    count = len(few)
+    # Cells may be too few for local maps, and their axes are good enough.
+    flat = np.zeros((count, 2, 2))
+    maps = LocalMaps(
+        cells.xy[few], cells.axes[few], flat, flat[:, 0], np.full(count, 4.0), np.ones(count)
+    )
+    cell = bin_cells(gather_cells(image, maps), maps)
+    return None if cell is None else fit_shapes(cell)
+
+
+def _sample(image: Array32, maps: LocalMaps) -> Mask:
+    """Select some cells that lie in the image as a whole; (n,)."""
+    reach = 0.5 * np.abs(maps.axes).sum(axis=1) + 1.0
+    limit = np.array([image.shape[1], image.shape[0]]) - 1
+    inside = np.all((maps.xy >= reach) & (maps.xy <= limit - reach), axis=1) & maps.usable
+    chosen = np.flatnonzero(inside)
+    pixels = max(1.0, float(np.median(np.abs(maps.cell_px2))))
+    count = min(SAMPLE, max(SAMPLE_MIN, int(SAMPLE_PIXELS / pixels)))
+    picked = np.random.default_rng(0).permutation(chosen)[:count]
+    keep = np.zeros(len(maps.xy), dtype=np.bool_)
+    keep[picked] = True
+    return keep
+
+
+def refine_cells(image: Array32, cells: Lattice, shape: CellShape) -> RefinedCorners | None:
+    """Fit all dots or crossings of a lattice, drop bad ones, add missed ones; None without any.
+
+    Parameters
+    ----------
+    image
+        (h, w) float32 with a contrast of about 1.
+    cells
+        Bright places of the pattern.
+    shape
+        Its shape. Dots are located at their centres, lines where they cross.
+    """
+    learnt = _learn(image, _at_feature(cells, shape))
+    if learnt is None:
+        return None
+    rough, cell, noise = learnt
+    maps = fit_local_maps(rough.ij, rough.ij, rough.xy, leave_out_self=False)
+    rough, maps = rough.select(maps.usable), maps.select(maps.usable)
+    if len(rough.ij) < CORNERS_MIN:
+        return None
+    first = _fit(image, rough.ij, maps, cell, noise, iterations=3)
+    expected = first.fit.shown > SHOWN_MIN
+    if first.good.sum() < CORNERS_MIN:
+        return None
+    quality = float(first.good[expected].mean())
+    known = _fill(image, first.select(first.good), cell, noise)
+    for _ in range(LAST_ROUNDS):
+        maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
+        known, maps = known.select(maps.usable), maps.select(maps.usable)
+        if len(known.cells) < CORNERS_MIN:
+            return None
+        known = _fit(image, known.cells, maps, cell, noise, iterations=2)
+    last = known
+    keep = last.good & _undisturbed(last.fit, last.good)
+    keep = find_consistent(last.cells, last.maps, last.fit, keep)
+    if keep.sum() < CORNERS_MIN:
+        return None
+    agreeing = int(keep.sum())
+    keep = select_connected(last.cells, last.maps, last.fit, keep)
+    order = np.lexsort(last.cells[keep].T[::-1])
+    covariance = last.fit.covariance * inflate_variance(last.fit, keep)[:, None, None]
+    spacing = float(np.median(np.sqrt(np.abs(last.maps.cell_px2[keep]))))
+    failed = np.concatenate([first.maps.xy[expected & ~first.good], last.maps.xy[~keep]])
+    return RefinedCorners(
+        last.cells[keep][order],
+        last.fit.xy[keep][order],
+        covariance[keep][order],
+        shape.blur * spacing,
+        quality,
+        failed,
+        agreeing - int(keep.sum()),
+    )
+
+
+def _at_feature(cells: Lattice, shape: CellShape) -> Lattice:
+    """Move a lattice of bright places to the dots, or to the crossings of the lines."""
+    # The opening between lines and their crossing are half a cell apart along both axes.
+    moved = shape.centred == (shape.pattern == "lines")
+    if not moved:
+        return cells
+    maps = fit_local_maps(cells.ij, cells.ij, cells.xy, leave_out_self=False)
+    half = maps.xy + 0.5 * maps.axes.sum(axis=1) + 0.125 * maps.bend.sum(axis=1) + 0.25 * maps.twist
+    return Lattice(cells.ij, half, maps.axes).select(maps.usable)
+
+
+def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseModel] | None:
+    """Learn the mean cell and the noise from some cells; also return all cells, centred."""
+    maps = fit_local_maps(cells.ij, cells.ij, cells.xy, leave_out_self=False)
+    few = _sample(image, maps)
+    if few.sum() < CORNERS_MIN:
+        return None
+    some = maps.select(few)
+    windows = gather_cells(image, some)
+    # The first round weighs all pixels equally.
+    cell = average_cells(windows, some, None)
+    fit = fit_cells(windows, some, cell, None, iterations=2)
+    for left in range(MEAN_ROUNDS - 1, -1, -1):
+        typical = float(np.median(fit.gain))
+        good = (fit.gain > 0.5 * typical) & (fit.chi2 < 4.0 * float(np.median(fit.chi2)))
+        if typical <= 0.0 or good.sum() < CORNERS_MIN:
+            return None
+        noise = fit_noise(fit.select(good))
+        some, windows, fit = some.select(good), windows.select(good), fit.select(good)
+        cell = average_cells(windows, some, fit)
+        if left:
+            fit = fit_cells(windows, some, cell, noise, iterations=2)
+    u, v = cell.find_centre()
+    # The spline has the scale of the mean gain, which is about 1.
+    centred = maps.xy + u * maps.axes[:, 0] + v * maps.axes[:, 1]
+    return Lattice(cells.ij, centred, maps.axes), cell.shift(u, v), noise
+
+
+@dataclass(frozen=True)
+class _FittedCells:
+    """Cells with their local maps and fits, and which of them are credible."""
+
+    cells: Indices
+    maps: LocalMaps
+    fit: CellFit
+    good: Mask
+
+    def select(self, keep: Mask) -> _FittedCells:
+        return _FittedCells(
+            self.cells[keep], self.maps.select(keep), self.fit.select(keep), self.good[keep]
+        )
+
+
+def _fit(
+    image: Array32,
+    cells: Indices,
+    maps: LocalMaps,
+    cell: UnitCell,
+    noise: NoiseModel,
+    *,
+    iterations: int,
+) -> _FittedCells:
+    fit = fit_cells(gather_cells(image, maps), maps, cell, noise, iterations=iterations)
+    spacing = np.linalg.norm(maps.axes, axis=2).min(axis=1)
+    moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
+    good = (fit.shown > SHOWN_MIN) & (moved < 0.25 * spacing)
+    good &= fit.shift_px < STEP_MAX_PX + 0.01 * spacing
+    good &= np.isfinite(fit.chi2)
+    if np.any(good):
+        good &= fit.gain > CONTRAST_MIN * float(np.median(fit.gain[good]))
+    return _FittedCells(cells, maps, fit, good)
+
+
+def _undisturbed(fit: CellFit, good: Mask) -> Mask:
+    """Select cells that look like the mean cell, as far as noise and what is visible tell; (n,)."""
+    pooled = float(np.median(fit.chi2[good]))
+    significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
+    surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
+    contrast = 0.5 * np.abs(fit.level[:, 1] - fit.level[:, 0])
+    return ~(significant & (surplus > (MISFIT_MAX * contrast) ** 2))
+
+
+def _fill(image: Array32, known: _FittedCells, cell: UnitCell, noise: NoiseModel) -> _FittedCells:
+    """Fit free cells next to good ones, round by round, as long as that finds more."""
+    limit = np.array([image.shape[1], image.shape[0]]) - 1
+    tried = _keys(known.cells)
+    while True:
+        near = np.unique((known.cells[:, None] + STEPS[None]).reshape(-1, 2), axis=0)
+        near = near[~np.isin(_keys(near), tried)]
+        if not len(near):
+            break
+        maps = fit_local_maps(near, known.cells, known.fit.xy)
+        inside = np.all((maps.xy >= 0) & (maps.xy <= limit), axis=1) & maps.usable
+        near, maps = near[inside], maps.select(inside)
+        if not len(near):
+            break
+        tried = np.concatenate([tried, _keys(near)])
+        fitted = _fit(image, near, maps, cell, noise, iterations=4)
+        if not np.any(fitted.good):
+            break
+        more = fitted.select(fitted.good)
+        known = _FittedCells(
+            np.concatenate([known.cells, more.cells]),
+            LocalMaps.join([known.maps, more.maps]),
+            CellFit.join([known.fit, more.fit]),
+            np.concatenate([known.good, more.good]),
+        )
+    return known
+
+
+def _keys(cells: Indices) -> Indices:
+    """Return one number per cell; indices stay far below 2^20."""
+    return np.asarray(cells[:, 0] * (1 << 21) + cells[:, 1], dtype=np.int64)

@@ -1,0 +1,225 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tell chess boards, dots and crossed lines apart by the Fourier coefficients of their unit cell.
+
+All three repeat on a square lattice, and a chess board is a lattice of squares that touch at their
+corners. What differs is the shape of the bright part: a square on its tip (chess), a disc (dots,
+holes), or a square in line with the lattice (the opening between crossed lines). Its transform is
+known in closed form; size and blur are fitted for each shape, and the best fit names the pattern.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, cast
+
+import numpy as np
+from scipy.special import j1
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.corners.unit_cell import UnitCell
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "PATTERNS",
+    "PATTERN_NAMES",
+    "CellShape",
+    "CellShapes",
+    "Pattern",
+    "PatternChoice",
+    "check_pattern",
+    "fit_shapes",
+]
+
+#: What a grid consists of.
+Pattern = Literal["chess", "dots", "lines"]
+#: What to search for.
+PatternChoice = Literal["auto", "chess", "dots", "lines"]
+PATTERNS = ("auto", "chess", "dots", "lines")
+#: What they are called.
+PATTERN_NAMES = {"chess": "a chess board", "dots": "dots", "lines": "crossed lines"}
+
+# Harmonics up to this order: with more, small spacings would be judged by noise.
+ORDERS = 4
+# Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
+# harmonics, noise alone exceeds it once in 30 images (F test). A pattern so blurred that only its
+# first harmonics are left may be any; it is taken for the chess board that this suite was made for.
+AMBIGUOUS = 2.0
+# Misfit that the steps of sizes and blurs cause.
+MISFIT_LEAST = 2e-4
+# Diameters of discs and sides of squares, in cells; and blurs.
+SIZES: Array = np.linspace(0.08, 0.98, 46)
+CHESS_SIZES: Array = np.linspace(0.7, 1.0, 16)
+BLURS: Array = np.linspace(0.0, 0.24, 13)
+# Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
+# harmonics, noise alone exceeds it once in 30 images (F test). A pattern so blurred that only its
+# first harmonics are left may be any; it is taken for the chess board that this suite was made for.
+AMBIGUOUS = 2.0
+# Misfit that the steps of sizes and blurs cause.
+MISFIT_LEAST = 2e-4
+
+
+@dataclass(frozen=True)
+class CellShape:
+    """The shape of one pattern that describes a unit cell best.
+
+    Attributes
+    ----------
+    pattern
+        Its name.
+    centred
+        Whether the dot, the opening or the bright square is at the lattice point, rather than at the
+        centre of the cell.
+    size
+        Diameter of the dot, or side of the square, in cells.
+    blur
+        Standard deviation of the blur, in cells.
+    misfit
+        Part of the power of the cell that it leaves unexplained.
+    """
+
+    pattern: Pattern
+    centred: bool
+    size: float
+    blur: float
+    misfit: float
+
+
+@dataclass(frozen=True)
+class CellShapes:
+    """The best shape of each pattern.
+
+    Attributes
+    ----------
+    chess, dots, lines
+        The shapes.
+    asymmetry
+        Part of the power by which the cell differs from its mirror image. It is small on a square
+        lattice; dots on a hexagonal one are ellipses in the coordinates of the lattice.
+    power
+        Power of the cell in squared grey values. It is small where cells of a wrong lattice average
+        to grey.
+    """
+
+    chess: CellShape
+    dots: CellShape
+    lines: CellShape
+    asymmetry: float
+    power: float
+
+    def get(self, pattern: Pattern) -> CellShape:
+        """Return the best shape of a pattern."""
+        return {"chess": self.chess, "dots": self.dots, "lines": self.lines}[pattern]
+
+    @property
+    def best(self) -> CellShape:
+        """The shape with the least misfit; that of a chess board as far as the blur allows it."""
+        if self.allows("chess"):
+            return self.chess
+        return min(self.dots, self.lines, key=lambda shape: shape.misfit)
+
+    def allows(self, pattern: Pattern) -> bool:
+        """Whether it may be this pattern: whether no other one is much more likely."""
+        least = min(self.chess.misfit, self.dots.misfit, self.lines.misfit)
+        return self.get(pattern).misfit <= AMBIGUOUS * least
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """Shapes with their normalised transforms, (s, f)."""
+
+    names: tuple[Pattern, ...]
+    centred: Array
+    sizes: Array
+    blurs: Array
+    transforms: Array
+
+
+def check_pattern(pattern: str) -> PatternChoice:
+    """Return ``pattern``, or raise InvalidValueError if it is none of :data:`PATTERNS`."""
+    if pattern not in PATTERNS:
+        raise InvalidValueError(f"pattern {pattern!r}", expected=", ".join(PATTERNS))
+    return cast("PatternChoice", pattern)
+
+
+def _harmonics() -> tuple[Array, Array]:
+    """Return the orders (h, k) of one of each pair of opposite coefficients."""
+    orders = np.arange(-ORDERS, ORDERS + 1)
+    h, k = (g.ravel() for g in np.meshgrid(orders, orders, indexing="ij"))
+    half = ((h > 0) | ((h == 0) & (k > 0))) & (h * h + k * k <= ORDERS * ORDERS + 1)
+    return h[half], k[half]
+
+
+@cache
+def _shapes() -> _Shapes:
+    h, k = _harmonics()
+    radius = np.hypot(h, k)
+    names: list[Pattern] = []
+    rows: list[tuple[bool, float, float, Array]] = []
+
+    def add(name: Pattern, size: float, transform: Array) -> None:
+        for blur in BLURS:
+            soft = transform * np.exp(-2.0 * np.pi**2 * blur**2 * radius**2)
+            for centred in (True, False):
+                # A shift by half a cell along both axes.
+                moved = soft if centred else soft * (1.0 - 2.0 * ((h + k) % 2))
+                names.append(name)
+                rows.append((centred, size, float(blur), moved / np.linalg.norm(moved)))
+
+    for size in SIZES:
+        add("dots", float(size), j1(np.pi * size * radius) * size / radius)
+        # Openings wider than half a cell leave lines between them; narrower ones are square dots.
+        square = size * size * np.sinc(size * h) * np.sinc(size * k)
+        add("lines" if size >= 0.5 else "dots", float(size), square)
+    for size in CHESS_SIZES:
+        tip = np.sinc(size * (h + k) / 2.0) * np.sinc(size * (h - k) / 2.0)
+        add("chess", float(size), tip)
+    centred, sizes, blurs, transforms = (np.array(column) for column in zip(*rows, strict=True))
+    return _Shapes(tuple(names), centred, sizes, blurs, transforms)
+
+
+def fit_shapes(cell: UnitCell) -> CellShapes:
+    """Fit the shapes of all patterns to a unit cell with a symmetric motif at its lattice point.
+
+    Parameters
+    ----------
+    cell
+        Coarse mean of the cells.
+    """
+    h, k = _harmonics()
+    m = len(cell.values)
+    centred = cell.shift(*cell.find_centre())
+    # Bins average over their width.
+    seen = centred.coefficients[h, k].real / (np.sinc(h / m) * np.sinc(k / m))
+    shapes = _shapes()
+    power = max(float(seen @ seen), 1e-30)
+    left = 1.0 - (shapes.transforms @ seen) ** 2 / power
+    mirrored = centred.coefficients[h, -k].real / (np.sinc(h / m) * np.sinc(k / m))
+    asymmetry = float(np.sum((seen - mirrored) ** 2)) / (4.0 * power)
+    names = np.array(shapes.names)
+
+    def best(pattern: Pattern) -> CellShape:
+        index = int(np.argmin(np.where(names == pattern, left, np.inf)))
+        return CellShape(
+            pattern,
+            bool(shapes.centred[index]),
+            float(shapes.sizes[index]),
+            float(shapes.blurs[index]),
+            # No shape explains more than its own discretisation lets it.
+            max(float(left[index]), MISFIT_LEAST),
+        )
+
+    return CellShapes(best("chess"), best("dots"), best("lines"), asymmetry, power)
