@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -28,11 +27,13 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.similarity import SimilarityPredictor, turn_drift
 from semcal_ros.core.drift.state import MOTION_SIZE, DriftState
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import RegistrationSettings
+from semcal_ros.core.wording import omit_numbers
 
 __all__ = [
     "DriftEstimate",
@@ -41,16 +42,7 @@ __all__ = [
     "DriftSettings",
     "DriftStatus",
     "DriftUpdate",
-    "omit_numbers",
 ]
-
-
-_NUMBER = re.compile(r"-?\d[\d.]*")
-
-
-def omit_numbers(text: str) -> str:
-    """A text with dots in the place of its numbers, so that frames can be counted by reason."""
-    return _NUMBER.sub("\u2026", text)
 
 
 @dataclass(frozen=True)
@@ -81,6 +73,9 @@ class DriftSettings:
         Number of images that are kept to come back to, and their memory.
     interpolation
         Interpolation of the rectification before registration.
+    similarity
+        Whether a rotation and a change of scale are looked for, and removed as drift. Not where what the specimen
+        does is the point, as for a servo that turns it.
     """
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
@@ -94,6 +89,7 @@ class DriftSettings:
     max_keyframes: int = 48
     max_keyframe_bytes: int = 1 << 28
     interpolation: str = "cubic"
+    similarity: bool = False
 
     def __post_init__(self) -> None:
         checks = (
@@ -135,6 +131,12 @@ class DriftEstimate:
     covariance
         (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all images on the way and
         from the covariance of the camera's scale.
+    similarity, similarity_covariance
+        (4,) rotation of the image (rad, from x towards y) and logarithm of its scale since the first frame,
+        about the origin of the sem frame (the middle of the image without a camera), and their rates
+        per s; (4, 4). The drift is the displacement of what lay at that origin. Zero, with the sigma
+        that the frame itself does not exclude, where no rotation was found
+        (:mod:`semcal_ros.core.drift.similarity`).
     """
 
     time_s: float
@@ -142,13 +144,28 @@ class DriftEstimate:
     velocity_m_s: Array
     acceleration_m_s2: Array
     covariance: Array
+    similarity: Array = field(default_factory=lambda: np.zeros(4), kw_only=True)
+    similarity_covariance: Array = field(
+        default_factory=lambda: np.diag(np.full(4, np.inf)), kw_only=True
+    )
+
+    @property
+    def rotation_rad(self) -> float:
+        """Rotation of the image since the first frame, from x towards y."""
+        return float(self.similarity[0])
+
+    @property
+    def log_scale(self) -> float:
+        """Logarithm of the scale of the image since the first frame."""
+        return float(self.similarity[1])
 
     @property
     def raster(self) -> RasterDrift:
         """The drift during a frame whose centre is at that time, for a
         :class:`~semcal_ros.core.rectification.rectifier.Rectifier`.
         """
-        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2)
+        turn = self.similarity[:2], self.similarity[2:]
+        return RasterDrift(self.drift_m, self.velocity_m_s, self.acceleration_m_s2, *turn)
 
 
 @dataclass(frozen=True)
@@ -237,11 +254,14 @@ class DriftPredictor:
         Process noise of the drift.
     camera
         Camera of the last frame, or None for drift in px.
+    similarity
+        Predictor of rotation and scale, or None where there are none.
     """
 
     state: DriftState
     process_noise: ProcessNoise
     camera: ScanCamera | None
+    similarity: SimilarityPredictor | None = None
 
     @property
     def time_s(self) -> float:
@@ -268,8 +288,22 @@ class DriftPredictor:
         covariance = both @ self.state.covariance[:MOTION_SIZE, :MOTION_SIZE] @ both.T
         covariance[0::2, 0::2] += noise[:2, :2]
         covariance[1::2, 1::2] += noise[:2, :2]
-        covariance += scale_covariance(self.camera, motion[0], motion[1])
-        return DriftEstimate(time_s, motion[0], motion[1], motion[2], covariance)
+        covariance[:2, :2] += self.process_noise.flicker_covariance
+        if self.similarity is None:
+            covariance += scale_covariance(self.camera, motion[0], motion[1])
+            return DriftEstimate(time_s, motion[0], motion[1], motion[2], covariance)
+        similarity = self.similarity.at(time_s)
+        turned = turn_drift(motion[0], motion[1], motion[2], covariance, similarity)
+        scale = scale_covariance(self.camera, turned.position, turned.velocity)
+        return DriftEstimate(
+            time_s,
+            turned.position,
+            turned.velocity,
+            turned.acceleration,
+            turned.covariance + scale,
+            similarity=similarity.mean,
+            similarity_covariance=similarity.covariance,
+        )
 
 
 @dataclass(frozen=True)
@@ -316,6 +350,23 @@ class DriftPath:
         return np.array([u.drift_px for u in self.updates]).reshape(-1, 2)
 
     @cached_property
+    def similarity(self) -> Array:
+        """(n, 4) rotation, rad, and logarithm of the scale since the first frame, and their rates."""
+        return np.array([u.similarity for u in self.updates]).reshape(-1, 4)
+
+    @property
+    def turns(self) -> bool:
+        """Whether rotation or a change of scale was found."""
+        return bool(np.any(self.similarity))
+
+    @property
+    def similarity_sigma(self) -> Array:
+        """(n, 2) 1-sigma of rotation and logarithm of the scale."""
+        return np.array(
+            [np.sqrt(np.diag(u.similarity_covariance)[:2]) for u in self.updates]
+        ).reshape(-1, 2)
+
+    @cached_property
     def residual(self) -> Array:
         """(n,) RMS grey levels that the shift does not explain; NaN where nothing was registered."""
         return np.array([u.residual for u in self.updates])
@@ -339,6 +390,11 @@ class DriftPath:
     def trusted(self) -> Mask:
         """(n,) bool: accepted, and tracked all the way back to the first frame."""
         return self.accepted & ~np.logical_or.accumulate(self.restarted)
+
+    @property
+    def followed(self) -> bool:
+        """Whether any frame was matched with another one; if not, no drift was measured."""
+        return int((self.accepted & ~self.restarted).sum()) > 1
 
     @property
     def sigma_m(self) -> Array:

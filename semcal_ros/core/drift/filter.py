@@ -111,8 +111,10 @@ class DriftFilter:
         pending = self._pending
         assert pending is not None
         given = self.process_noise.psd
-        self.process_noise = ProcessNoise(
-            psd if self._adapts else given, _TIME_CONSTANT * interval_s
+        self.process_noise = replace(
+            self.process_noise,
+            psd=psd if self._adapts else given,
+            time_constant_s=_TIME_CONSTANT * interval_s,
         )
         variances = [0.0, sigma**2, self.process_noise.acceleration_variance]
         prior = Inflate(np.diag(np.repeat(variances, 2)))
@@ -151,6 +153,11 @@ class DriftFilter:
                 near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
             self.process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
             self.state = replay(self.start, self.events, self.process_noise)
+
+    def set_flicker(self, flicker: Array) -> None:
+        """Set the variances (4,) of :attr:`.process_noise.ProcessNoise.flicker`."""
+        x, y, vx, vy = flicker.tolist()
+        self.process_noise = replace(self.process_noise, flicker=(x, y, vx, vy))
 
     def adapt_process_noise(self, nis: float, noise: Array, dt_s: float) -> None:
         """Change the process noise until innovations are as large as predicted.

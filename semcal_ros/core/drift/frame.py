@@ -28,7 +28,13 @@ from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.rectification.raw_positions import RasterDrift, camera_key, raw_from_output
+from semcal_ros.core.rectification.raw_positions import (
+    RasterDrift,
+    camera_key,
+    raw_from_output,
+    rotation_centre,
+    similarity_matrix,
+)
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.registration.reference import Region
 
@@ -110,21 +116,42 @@ class MotionCorrector:
 
     def __init__(self, interpolation: str) -> None:
         self._rectifier = Rectifier(interpolation)
+        self._turning = Rectifier("lanczos4")
         self._regions: LruCache[tuple[object, ...], Region] = LruCache(_MAX_REGIONS)
 
-    def corrected_image(self, frame: ScanFrame, motion: Array) -> tuple[AnyImage, Region]:
+    def corrected_image(
+        self,
+        frame: ScanFrame,
+        motion: Array,
+        turn: Array | None = None,
+        turn_rate: Array | None = None,
+    ) -> tuple[AnyImage, Region]:
         """The image without a motion, and the rectangle of it that was scanned.
 
-        ``motion`` (4,) is the drift velocity (unit per s) and acceleration (unit per s^2).
+        Parameters
+        ----------
+        frame
+            The frame.
+        motion
+            (4,) drift velocity (unit per s) and acceleration (unit per s^2).
+        turn, turn_rate
+            (2,) rotation and scale (:mod:`semcal_ros.core.drift.similarity`) and their rates to take out;
+            None for none. The motion is then that in the axes of the first frame.
         """
         width, height = frame.size
         camera = None if frame.rectified else frame.camera
         displaced = _max_displacement_px(frame, motion)
+        if turn is not None and not np.any(turn):
+            turn = None
+        if turn is not None:
+            displaced = displaced + float(np.hypot(*turn)) * 0.5 * float(np.hypot(width, height))
         drift = None
         if float(np.max(displaced)) > _NEGLIGIBLE_PX:
             # The rectifier takes px where it is given no camera.
             unit = np.eye(2) if camera is not None else frame.px_from_unit
             drift = RasterDrift(np.zeros(2), unit @ motion[:2], unit @ motion[2:])
+            if turn is not None:
+                drift = _turned(frame, drift, turn, turn_rate)
         if camera is None and drift is None:
             return frame.image, (0, 0, width, height)
         left, top, right, bottom = self._regions.get_or_compute(
@@ -134,8 +161,28 @@ class MotionCorrector:
             x, y = (int(np.ceil(d)) for d in displaced)
             left, right = min(left + x, width // 3), max(right - x, 2 * width // 3)
             top, bottom = min(top + y, height // 3), max(bottom - y, 2 * height // 3)
+        region = left, top, right, bottom
+        if turn is not None:
+            # A rotation moves most pixels by a fraction of one: cubic interpolation would falsify it by a
+            # tenth on fine textures, and rounding to grey levels would undo it on coarse ones.
+            raw = frame.image.astype(np.float32)
+            return self._turning.rectify(raw, camera, drift, frame.timing), region
         image = self._rectifier.rectify(frame.image, camera, drift, frame.timing)
-        return image, (left, top, right, bottom)
+        return image, region
+
+
+def _turned(
+    frame: ScanFrame, drift: RasterDrift, turn: Array, turn_rate: Array | None
+) -> RasterDrift:
+    """The drift of a specimen that turns about the origin of the sem frame."""
+    matrix = similarity_matrix(turn)
+    position = drift.position
+    if frame.rectified and frame.camera is not None:
+        # The rectifier, which is given no camera, turns about the middle of the image.
+        off_centre = rotation_centre(frame.size, frame.camera) - rotation_centre(frame.size, None)
+        position = off_centre - matrix @ off_centre
+    rate = np.zeros(2) if turn_rate is None else turn_rate
+    return RasterDrift(position, matrix @ drift.velocity, matrix @ drift.acceleration, turn, rate)
 
 
 def _max_displacement_px(frame: ScanFrame, motion: Array) -> Array:

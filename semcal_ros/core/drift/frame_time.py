@@ -50,6 +50,7 @@ from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import counted
 
 __all__ = [
     "SHEAR_OF_SHIFT_DISTORTED",
@@ -144,7 +145,7 @@ def estimate_frame_time(
     observed = _collect_observations(path)
     count = len(observed.shear)
     if count < _MIN_FRAMES:
-        few = f"{count} frames with a shear against an earlier one"
+        few = f"{counted(count, 'frame')} with a shear against an earlier one"
         return FrameTimeEstimate(np.nan, np.inf, count, np.nan, False, False, few)
     steps = np.diff(path.time_s)
     forward = steps[steps > 0.0]

@@ -18,11 +18,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
+from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityTracker, turn_drift
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["DriftHistory"]
@@ -32,19 +36,19 @@ class DriftHistory:
     """The frames of a tracker, in stretches that each begin with zero drift."""
 
     def __init__(self) -> None:
-        self._stretches: list[tuple[DriftFilter, list[DriftUpdate]]] = []
+        self._stretches: list[tuple[DriftFilter, SimilarityTracker, list[DriftUpdate]]] = []
         self._cameras: list[ScanCamera | None] = []
 
     def __len__(self) -> int:
         return len(self._cameras)
 
-    def begin(self, drift_filter: DriftFilter) -> None:
+    def begin(self, drift_filter: DriftFilter, similarity: SimilarityTracker) -> None:
         """Begin a new stretch."""
-        self._stretches.append((drift_filter, []))
+        self._stretches.append((drift_filter, similarity, []))
 
     def add(self, update: DriftUpdate, camera: ScanCamera | None) -> None:
         """Add a frame."""
-        self._stretches[-1][1].append(update)
+        self._stretches[-1][2].append(update)
         self._cameras.append(camera)
 
     def smooth(self) -> DriftPath:
@@ -62,23 +66,42 @@ class DriftHistory:
                 "no frames", expected="at least one", do="track at least one first"
             )
         updates: list[DriftUpdate] = []
-        for drift_filter, stretch in self._stretches:
+        for drift_filter, similarity, stretch in self._stretches:
             process_noise = drift_filter.process_noise
             if process_noise.psd > 0.0:
                 process_noise = estimate_process_noise(
                     drift_filter.start, drift_filter.events, process_noise
                 )
             states = smooth(drift_filter.start, drift_filter.events, process_noise)
-            for update, state in zip(stretch, states, strict=True):
+            turns, first_s = similarity.smooth(), drift_filter.start.time_s
+            for update, state, turn in zip(stretch, states, turns, strict=True):
                 camera = self._cameras[len(updates)]
-                scale = scale_covariance(camera, state.position, state.velocity)
-                updates.append(
-                    replace(
-                        update,
-                        drift_m=state.position,
-                        velocity_m_s=state.velocity,
-                        acceleration_m_s2=state.acceleration,
-                        covariance=state.drift_covariance + scale,
-                    )
-                )
+                smoothed = _smoothed(update, state, turn, camera)
+                if update.time_s > first_s:
+                    smoothed.covariance[:2, :2] += process_noise.flicker_covariance
+                updates.append(smoothed)
         return DriftPath(tuple(updates))
+
+
+def _smoothed(
+    update: DriftUpdate,
+    state: DriftState,
+    turn: SimilarityEstimate | None,
+    camera: ScanCamera | None,
+) -> DriftUpdate:
+    """The update with what is known of it with hindsight."""
+    motion = state.position, state.velocity, state.acceleration
+    covariance = state.drift_covariance
+    if turn is not None:
+        update = replace(update, similarity=turn.mean, similarity_covariance=turn.covariance)
+        if np.all(np.isfinite(turn.covariance)):
+            turned = turn_drift(*motion, covariance, turn)
+            motion = turned.position, turned.velocity, turned.acceleration
+            covariance = turned.covariance
+    return replace(
+        update,
+        drift_m=motion[0],
+        velocity_m_s=motion[1],
+        acceleration_m_s2=motion[2],
+        covariance=covariance + scale_covariance(camera, motion[0], motion[1]),
+    )

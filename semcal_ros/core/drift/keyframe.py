@@ -21,7 +21,7 @@ no longer matters. Then the mean stays as it is, so that it cannot wander.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -65,6 +65,8 @@ class Keyframe:
         Time of the first frame.
     averaged
         Number of frames in the mean.
+    turn
+        (2,) rotation and scale that were removed from the first frame.
     """
 
     frame: ScanFrame
@@ -73,6 +75,7 @@ class Keyframe:
     region: Region
     time_s: float
     averaged: int = 1
+    turn: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def nbytes(self) -> int:
@@ -122,12 +125,19 @@ class Keyframe:
 
 
 def make_keyframe(
-    frame: ScanFrame, removed: Array, image: AnyImage, region: Region, time_s: float
+    frame: ScanFrame,
+    removed: Array,
+    image: AnyImage,
+    region: Region,
+    time_s: float,
+    turn: Array | None = None,
 ) -> Keyframe:
-    """A keyframe from a frame and its image without the motion ``removed`` (4,)."""
-    return Keyframe(
-        frame, removed.copy(), np.array(to_gray(image), dtype=np.float32), region, time_s
-    )
+    """A keyframe from a frame and its image without the motion ``removed`` (4,) and the rotation and scale
+    ``turn`` (2,).
+    """
+    gray = np.array(to_gray(image), dtype=np.float32)
+    turned = np.zeros(2) if turn is None else turn.copy()
+    return Keyframe(frame, removed.copy(), gray, region, time_s, turn=turned)
 
 
 def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
@@ -161,7 +171,7 @@ def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
     new = cv2.warpAffine(gray, warp, (width, height), flags=cv2.INTER_CUBIC)
     region = _map_region(key.region, matrix, offset, now.size)
     mean = np.asarray(new, dtype=np.float32)
-    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged)
+    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged, key.turn)
 
 
 def _map_region(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:

@@ -153,7 +153,9 @@ class KeyframeStore:
         return latest[2]
 
     def _is_outdated(self, before: Keyframe, now: Keyframe) -> bool:
-        """Whether a keyframe has become much better than the one that was prepared."""
+        """Whether a keyframe has become much better than the one that was prepared, or another one."""
+        if now.averaged < before.averaged:
+            return True
         if before.frame is not now.frame or not np.array_equal(before.removed, now.removed):
             return True
         return now.averaged in MEAN_COUNTS and now.averaged > before.averaged

@@ -58,15 +58,27 @@ class ProcessNoise:
         Power spectral density of the acceleration at low frequencies, length^2 / s^3.
     time_constant_s
         Time in which an acceleration decays, s; 0 for a white one.
+    flicker
+        Variances (x, y) of the drift at the middle of a frame about its mean over the frame that are due to 1/f
+        noise (:mod:`semcal_ros.core.drift.flicker`), and of the mean velocity over the frame about that of
+        the mean drift.
     """
 
     psd: float
     time_constant_s: float = 0.0
+    flicker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def acceleration_variance(self) -> float:
         """Stationary variance of each component; 0 for a white one, which has none."""
         return 0.5 * self.psd / self.time_constant_s if self.time_constant_s > 0.0 else 0.0
+
+    @property
+    def flicker_covariance(self) -> Array:
+        """(2, 2) covariance that 1/f noise adds to a drift between the middles of two frames: once for the frame
+        and once for the first one, from which the drift counts.
+        """
+        return np.diag(2.0 * np.array(self.flicker[:2]))
 
     def frame_covariance(self, scan_s: float) -> Array:
         """(4, 4) covariance of the mean drift and the mean velocity over an acquisition, given
@@ -79,7 +91,7 @@ class ProcessNoise:
         if self.time_constant_s > 0.0:
             psd *= min(1.0, 0.5 * scan_s / self.time_constant_s)
         variances = [psd * scan_s**3 * _MEAN_POSITION, psd * scan_s * _MEAN_VELOCITY]
-        return np.diag(np.repeat(variances, 2))
+        return np.diag(np.repeat(variances, 2) + np.array([0.0, 0.0, *self.flicker[2:]]))
 
     def discretise(self, dt_s: float) -> tuple[Array, Array]:
         """(3, 3) transition matrix of ``[x, v, a]`` of one axis over an interval, and the (3, 3)

@@ -180,19 +180,20 @@ def estimate_process_noise(
     if sum(isinstance(event, Measure) for event in part) < _MIN_FOR_LIKELIHOOD:
         return near
     candidates = [
-        _maximise_likelihood(start, part, near.psd, factor * near.time_constant_s)
+        _maximise_likelihood(start, part, near, factor * near.time_constant_s)
         for factor in time_constants
     ]
     return min(candidates, key=lambda pair: pair[0])[1]
 
 
 def _maximise_likelihood(
-    start: DriftState, events: Sequence[Event], near: float, time_constant_s: float
+    start: DriftState, events: Sequence[Event], near: ProcessNoise, time_constant_s: float
 ) -> tuple[float, ProcessNoise]:
     """Minus twice the log likelihood of the best density, and the process noise with it."""
 
     def with_density(log_psd: float) -> ProcessNoise:
-        return ProcessNoise(near * float(np.exp(log_psd)), time_constant_s)
+        psd = near.psd * float(np.exp(log_psd))
+        return replace(near, psd=psd, time_constant_s=time_constant_s)
 
     def cost(log_psd: float) -> float:
         return _run_forward(start, events, with_density(log_psd))[2]

@@ -44,6 +44,7 @@ from semcal_ros.core.drift.estimates import (
     DriftUpdate,
 )
 from semcal_ros.core.drift.filter import DriftFilter
+from semcal_ros.core.drift.flicker import FlickerEstimator
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
     GATE,
@@ -65,8 +66,15 @@ from semcal_ros.core.drift.measurement import (
     measure_itself,
 )
 from semcal_ros.core.drift.operations import CorrectShear, Marginalise, Measure, Predict
+from semcal_ros.core.drift.similarity import (
+    SimilarityMatch,
+    SimilarityTracker,
+    constrain_registration,
+    turn_drift,
+)
 from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.rectification.raw_positions import similarity_matrix
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
 from semcal_ros.core.registration.reference import Region
 from semcal_ros.core.registration.register import Registration, register
@@ -98,6 +106,8 @@ _CANDIDATES = 2
 _MAX_REGISTRATIONS = 4
 # Part of the image's height by which drift may shear it.
 _MAX_SHEAR = 0.1
+# Rotation and scale that are left at the edge of a frame are worth another registration from here on.
+_MAX_TURN_PX = 0.1
 # Divisions by intervals stay finite.
 _MIN_INTERVAL_S = 1e-9
 
@@ -117,6 +127,15 @@ class _Track:
     sample: bytes
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
+    flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
+    similarity: SimilarityTracker = field(
+        default_factory=lambda: SimilarityTracker(keeps_history=False)
+    )
+
+    def forget(self, key: int) -> None:
+        """Remove a keyframe from what is estimated."""
+        self.filter.apply(Marginalise(key))
+        self.similarity.forget(key)
 
 
 @dataclass(frozen=True)
@@ -137,6 +156,8 @@ class _Match:
         The measurement for the filter.
     keyframe_time_s
         Time of the keyframe.
+    similarity
+        What it says of rotation and scale.
     """
 
     candidate: Candidate
@@ -146,6 +167,7 @@ class _Match:
     removed: Array
     measure: Measure
     keyframe_time_s: float
+    similarity: SimilarityMatch
 
 
 @dataclass(frozen=True)
@@ -199,7 +221,8 @@ class DriftTracker:
                 "a forecast before the first frame", expected="at least one frame"
             )
         state = track.filter.state.without_keyframes()
-        return DriftPredictor(state, track.filter.process_noise, track.camera)
+        similarity = track.similarity.predictor()
+        return DriftPredictor(state, track.filter.process_noise, track.camera, similarity)
 
     def update(
         self,
@@ -250,6 +273,7 @@ class DriftTracker:
             self._predict(track, frame, centre_s)
             update = self._follow(track, frame)
         track.filter.mark_frame()
+        track.similarity.mark_frame(track.filter.state.time_s)
         track.camera, track.time_s = fitted, centre_s
         if self._history is not None:
             self._history.add(update, fitted)
@@ -263,32 +287,36 @@ class DriftTracker:
         start = initial_state(centre_s, centre_covariance(frame.camera))
         kept = self._history is not None
         drift_filter = DriftFilter(start, settings.acceleration_psd, history=kept)
+        similarity = SimilarityTracker(keeps_history=kept)
         if self._history is not None:
-            self._history.begin(drift_filter)
+            self._history.begin(drift_filter, similarity)
         store = KeyframeStore(
             settings.registration, settings.max_keyframe_bytes, settings.max_keyframes
         )
-        track = _Track(drift_filter, store, frame.camera, centre_s, frame.sample)
+        track = _Track(
+            drift_filter, store, frame.camera, centre_s, frame.sample, similarity=similarity
+        )
         rejection = self._add_keyframe(track, frame, np.zeros(4))
         if rejection is not None:
             # Nothing can be measured against such an image: wait for a better one.
-            return track, _make_update(start, frame, DriftStatus.COASTING, rejection)
-        state = track.filter.state
-        return track, _make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0)
+            return track, _make_update(track, frame, DriftStatus.COASTING, rejection)
+        return track, _make_update(track, frame, DriftStatus.KEYFRAME, overlap=1.0)
 
     def _add_keyframe(
         self, track: _Track, frame: ScanFrame, removed: Array
     ) -> Rejection[MatchFailure] | None:
         """Make this frame a keyframe that was not measured; why it cannot be one, or None."""
-        image, region = self._corrector.corrected_image(frame, removed)
-        keyframe = make_keyframe(frame, removed, image, region, track.filter.state.time_s)
+        turn, time_s = track.similarity.position, track.filter.state.time_s
+        image, region = self._corrector.corrected_image(frame, removed, turn, track.similarity.rate)
+        keyframe = make_keyframe(frame, removed, image, region, time_s, turn)
         reference = keyframe.prepare_reference(self.settings.registration)
         if reference.defect:
             return Rejection(MatchFailure.UNUSABLE_IMAGE, reference.defect)
         key, forgotten = track.store.add(keyframe, reference)
         track.filter.add_keyframe(key, removed, frame.acceleration_term_s2)
+        track.similarity.add_keyframe(key, turn, time_s)
         for old in forgotten:
-            track.filter.apply(Marginalise(old))
+            track.forget(old)
         return None
 
     # -- every other frame ------------------------------------------------------------------------
@@ -309,6 +337,7 @@ class DriftTracker:
             drift_filter.set_motion_prior(step / dt, (_VELOCITY_CHANGE * step) ** 2 / dt**3, dt)
         speed = float(np.hypot(*drift_filter.state.velocity))
         drift_filter.apply(Predict(centre_s))
+        track.similarity.predict(centre_s)
         if 0.0 < _PAUSE * drift_filter.process_noise.time_constant_s < dt:
             drift_filter.apply(inflate_after_pause(speed, dt))
 
@@ -353,7 +382,9 @@ class DriftTracker:
         """
         motion = track.filter.state.motion
         first = motion if _is_removable(motion, frame) else np.zeros(4)
-        match = self._match_once(track, frame, candidate, first)
+        turn = track.similarity.expected_turn(candidate.key)
+        match = self._match_once(track, frame, candidate, first, turn)
+        match = self._match_turned(track, frame, candidate, match, first, turn)
         for _ in range(_MAX_REGISTRATIONS - 1):
             if isinstance(match, _RejectedMatch):
                 break
@@ -362,25 +393,77 @@ class DriftTracker:
                 # A jump, not a drift: the gate decides.
                 break
             corrected = self._correct_keyframe(track, candidate, state)
-            if not corrected and not exceeds_tolerance(state.motion - match.removed, frame):
+            turned = match.similarity.remaining_px(frame.size) > _MAX_TURN_PX
+            moved = exceeds_tolerance(state.motion - match.removed, frame)
+            if not (corrected or moved or turned):
                 break
-            again = self._match_once(track, frame, candidate, state.motion)
+            again = self._match_once(track, frame, candidate, state.motion, match.similarity.turn)
             if isinstance(again, _RejectedMatch):
                 break
             match = again
         return match
 
-    def _match_once(
-        self, track: _Track, frame: ScanFrame, candidate: Candidate, motion: Array
+    def _match_turned(
+        self,
+        track: _Track,
+        frame: ScanFrame,
+        candidate: Candidate,
+        before: _Match | _RejectedMatch,
+        motion: Array,
+        turn: Array,
     ) -> _Match | _RejectedMatch:
-        """Register a frame that is corrected for a motion."""
+        """Register a frame again without the rotation and the scale that the registration ``before``
+        shows, where it shows any; the better match of the two.
+        """
+        similarity, key = track.similarity, candidate.key
+        if candidate.rescaled or not self.settings.similarity:
+            return before
+        if isinstance(before, _Match):
+            time_s, last_s = track.filter.state.time_s, track.time_s
+            suggested = similarity.confirm_turn(before.registration, turn, frame, time_s, last_s)
+        else:
+            suggested = similarity.suggest_turn(key, before.registration, turn, frame)
+        if suggested is None:
+            return before
+        if similarity.is_active:
+            match = self._match_once(track, frame, candidate, motion, suggested)
+            return match if isinstance(match, _Match) else before
+        mean = track.store[key]
+        similarity.activate(key, suggested, track.filter.state.time_s)
+        self._forget_mean(track, key)
+        match = self._match_once(track, frame, candidate, motion, suggested)
+        if isinstance(match, _RejectedMatch):
+            similarity.deactivate()
+            track.store.replace(key, mean)
+            return before
+        for other in similarity.keys:
+            if other != key:
+                self._forget_mean(track, other)
+        return match
+
+    def _forget_mean(self, track: _Track, key: int) -> None:
+        """Go back to the first frame of a keyframe: the mean is of frames that were turned."""
+        old = track.store[key]
+        if old.averaged == 1:
+            return
+        image, region = self._corrector.corrected_image(old.frame, old.removed, old.turn)
+        first = make_keyframe(old.frame, old.removed, image, region, old.time_s, old.turn)
+        track.store.replace(key, first)
+
+    def _match_once(
+        self, track: _Track, frame: ScanFrame, candidate: Candidate, motion: Array, turn: Array
+    ) -> _Match | _RejectedMatch:
+        """Register a frame that is corrected for a motion, a rotation and a scale."""
         store, key = track.store, candidate.key
-        image, region = self._corrector.corrected_image(frame, motion)
+        image, region = self._corrector.corrected_image(frame, motion, turn, track.similarity.rate)
         reference = (
             store.resampled_reference(key, frame) if candidate.rescaled else store.reference(key)
         )
         shift, covariance = track.filter.state.predict_shift(key)
-        px_from_unit = frame.px_from_unit
+        px_from_unit, is_turned = frame.px_from_unit, track.similarity.is_active
+        appears = track.similarity.keyframe_similarity(key)
+        if is_turned:
+            px_from_unit = similarity_matrix(appears) @ px_from_unit
         registration = register(
             reference,
             image,
@@ -393,10 +476,18 @@ class DriftTracker:
             return _RejectedMatch(registration.rejection, registration)
         keyframe = store[key]
         averaged = np.inf if candidate.rescaled else float(store.averaged(key))
-        measure = make_measurement(key, keyframe.frame, frame, registration, motion, averaged)
+        similarity = track.similarity.match(
+            key, registration, turn, frame, averaged, measures=not candidate.rescaled
+        )
+        measured = registration
+        if is_turned:
+            measured = constrain_registration(registration, similarity, appears, frame)
+        measure = make_measurement(key, keyframe.frame, frame, measured, motion, averaged)
         if track.filter.pending == key:
             track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
-        return _Match(candidate, registration, image, region, motion, measure, keyframe.time_s)
+        return _Match(
+            candidate, registration, image, region, motion, measure, keyframe.time_s, similarity
+        )
 
     def _correct_keyframe(self, track: _Track, candidate: Candidate, state: DriftState) -> bool:
         """Take the shear out of a keyframe; whether there was any. Only a single frame has one."""
@@ -410,8 +501,10 @@ class DriftTracker:
         ):
             return False
         removed = keyframe.removed + remaining
-        image, region = self._corrector.corrected_image(keyframe.frame, removed)
-        corrected = make_keyframe(keyframe.frame, removed, image, region, keyframe.time_s)
+        image, region = self._corrector.corrected_image(keyframe.frame, removed, keyframe.turn)
+        corrected = make_keyframe(
+            keyframe.frame, removed, image, region, keyframe.time_s, keyframe.turn
+        )
         track.store.replace(candidate.key, corrected)
         term_s2 = keyframe.frame.acceleration_term_s2
         track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
@@ -446,6 +539,8 @@ class DriftTracker:
             return _RejectedMatch(judged, match.registration, disputed)
         if judged is not None:
             drift_filter.apply(judged)
+        since_s = state.time_s - track.time_s
+        track.similarity.use(match.similarity, since_s)
         if outcome.shear_nis > GATE:
             measure = measure.without_shear()
         if match.candidate.ratio > _SMALL_ZOOM:
@@ -454,9 +549,22 @@ class DriftTracker:
             # A zoom in small steps would make a long chain of keyframes.
             measure = zoomed
         drift_filter.update(measure)
-        since_s = state.time_s - track.time_s
         drift_filter.adapt_process_noise(outcome.nis, measure.covariance[:2, :2], since_s)
+        if not match.candidate.rescaled:
+            self._look_for_flicker(track, frame, match)
         return None
+
+    def _look_for_flicker(self, track: _Track, frame: ScanFrame, match: _Match) -> None:
+        """Estimate again what drift faster than the frames does to them, at growing intervals."""
+        averaged = float(track.store.averaged(match.candidate.key))
+        if not track.flicker.add(match.registration, averaged, frame.size):
+            return
+        variance_px2 = track.flicker.variance_px2()
+        unit = 1.0 / np.sqrt(abs(np.linalg.det(frame.px_from_unit)))
+        frame_s = 1.0 if frame.timing is None else frame.timing.frame_time_s
+        flicker = variance_px2 * unit**2 / np.array([1.0, 1.0, frame_s**2, frame_s**2])
+        if not np.array_equal(flicker, track.filter.process_noise.flicker):
+            track.filter.set_flicker(flicker)
 
     def _change_scale(
         self, track: _Track, frame: ScanFrame, match: _Match, measure: Measure
@@ -479,7 +587,7 @@ class DriftTracker:
         track.outliers.reset(state)
         registration, candidate = match.registration, match.candidate
         if candidate.ratio > _SMALL_ZOOM:
-            return _make_update(state, frame, DriftStatus.KEYFRAME, registration=registration)
+            return _make_update(track, frame, DriftStatus.KEYFRAME, registration=registration)
         store.use(candidate.key)
         status, merged = DriftStatus.TRACKED, False
         overlap, enough = registration.alignment.overlap, self.settings.rekey_overlap
@@ -500,7 +608,7 @@ class DriftTracker:
             mean = keyframe.with_frame(match.image, match.region, registration)
             store.replace(candidate.key, mean)
             merged = True
-        update = _make_update(track.filter.state, frame, status, registration=registration)
+        update = _make_update(track, frame, status, registration=registration)
         return replace(update, keyframe_time_s=match.keyframe_time_s, merged=merged)
 
     def _coast(
@@ -530,7 +638,7 @@ class DriftTracker:
         if is_lost or (rescaled and is_of_keyframe):
             return self._restart(track, frame, rejection, disputed)
         return _make_update(
-            track.filter.state,
+            track,
             frame,
             DriftStatus.COASTING,
             rejection,
@@ -552,11 +660,11 @@ class DriftTracker:
             if unmatched is not None and len(track.store) > 2:
                 # No frame has ever matched it.
                 track.store.forget(unmatched)
-                track.filter.apply(Marginalise(unmatched))
+                track.forget(unmatched)
             track.rejected = 0
             track.outliers.reset()
         return _make_update(
-            track.filter.state,
+            track,
             frame,
             DriftStatus.COASTING,
             defect or rejection,
@@ -590,16 +698,21 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
 def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noise: Array) -> int:
     """Make this frame a keyframe, as it was measured against the one before; its number."""
     state = track.filter.state
-    keyframe = make_keyframe(frame, match.removed, match.image, match.region, state.time_s)
+    turn = match.similarity.removed
+    keyframe = make_keyframe(frame, match.removed, match.image, match.region, state.time_s, turn)
     key, forgotten = track.store.add(keyframe)
     track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
+    if match.candidate.rescaled:
+        track.similarity.add_keyframe(key, turn, state.time_s)
+    else:
+        track.similarity.clone_keyframe(key, measure.key, match.registration, turn, state.time_s)
     for old in forgotten:
-        track.filter.apply(Marginalise(old))
+        track.forget(old)
     return key
 
 
 def _make_update(
-    state: DriftState,
+    track: _Track,
     frame: ScanFrame,
     status: DriftStatus,
     rejection: Rejection[MatchFailure] | None = None,
@@ -610,17 +723,28 @@ def _make_update(
     restarted: bool = False,
 ) -> DriftUpdate:
     """The drift at a frame; ``overlap`` is for a frame without a registration."""
-    covariance = state.drift_covariance + scale_covariance(
-        frame.camera, state.position, state.velocity
+    state = track.filter.state
+    motion, covariance = (
+        (state.position, state.velocity, state.acceleration),
+        state.drift_covariance,
     )
+    is_first = registration is None and rejection is None
+    similarity = track.similarity.estimate(registration, frame, is_first=is_first)
+    if track.similarity.is_active:
+        turned = turn_drift(*motion, covariance, similarity)
+        motion = turned.position, turned.velocity, turned.acceleration
+        covariance = turned.covariance
+    covariance = covariance + scale_covariance(frame.camera, motion[0], motion[1])
+    if not is_first:
+        covariance[:2, :2] += track.filter.process_noise.flicker_covariance
     if disputed is not None:
         covariance[:2, :2] += disputed
     alignment = None if registration is None else registration.alignment
     return DriftUpdate(
         time_s=state.time_s,
-        drift_m=state.position.copy(),
-        velocity_m_s=state.velocity.copy(),
-        acceleration_m_s2=state.acceleration.copy(),
+        drift_m=motion[0].copy(),
+        velocity_m_s=motion[1].copy(),
+        acceleration_m_s2=motion[2].copy(),
         covariance=covariance,
         status=status,
         rejection=rejection,
@@ -635,4 +759,6 @@ def _make_update(
         ),
         keyframe_time_s=float("nan"),
         merged=False,
+        similarity=similarity.mean,
+        similarity_covariance=similarity.covariance,
     )

@@ -27,12 +27,17 @@ estimate towards whole pixels.
 
 A scanned frame is seen line after line, so that what drifts during the frame is sheared and
 stretched: the shift changes linearly with the row. That change is estimated with the shift.
+
+Where the specimen turns or the magnification creeps, the shift also changes along a row. A rotation
+and a scale can be estimated with the rest (:meth:`Alignment.fit_similarity`); they are told by what
+changes along the rows, which were scanned in an instant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,7 +63,13 @@ from semcal_ros.core.registration.tiles import (
     tile_window,
 )
 
-__all__ = ["Alignment", "align", "tile_residual_energies", "unmeasured_alignment"]
+__all__ = [
+    "Alignment",
+    "SimilarityFit",
+    "align",
+    "tile_residual_energies",
+    "unmeasured_alignment",
+]
 
 
 # A start that needs more steps than these is outside the range of convergence.
@@ -85,6 +96,8 @@ _BLOCK_SIGMAS = 14.0
 _MIN_BLOCKS = 36
 # Rows of tiles from which a change of the shift over the rows can be told apart from noise.
 _MIN_SHEAR_ROWS = 6
+# Rows of tiles per cosine mode down the frame: the higher ones are of rows that share smoothed noise.
+_ROWS_PER_MODE = 1.5
 # A shear whose scaled information matrix has a larger condition number is not determined.
 _MAX_CONDITION = 1e6
 # Noise of lines is looked for from this number of rows of tiles on, and found where it makes the
@@ -95,6 +108,31 @@ _ROWS_RATIO = 2.0
 # million images of noise.
 _CHANCE = 5.0
 _FEATURELESS = "featureless in one direction: no more gradient in common there than by chance"
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """Shift, shear, rotation and scale, estimated together.
+
+    Attributes
+    ----------
+    values
+        (6,) shift (x, y) of the middle of the image, px; by how much more its last row is shifted than
+        its first, px; rotation (rad, from x towards y) and logarithm of the scale against the
+        reference, as the change of the shift along the rows tells them. The shear is what remains.
+    covariance
+        (6, 6).
+    """
+
+    values: Array
+    covariance: Array
+
+    def about(self, offset_px: Array) -> SimilarityFit:
+        """The same with the shift of the point that lies ``offset_px`` (2,) from the middle."""
+        x, y = offset_px.tolist()
+        matrix = np.eye(6)
+        matrix[:2, 4:] = [[-y, x], [x, y]]
+        return SimilarityFit(matrix @ self.values, matrix @ self.covariance @ matrix.T)
 
 
 @dataclass(frozen=True)
@@ -142,6 +180,20 @@ class Alignment:
     overlap: float
     converged: bool
     iterations: int
+    _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
+
+    def fit_similarity(self) -> SimilarityFit | None:
+        """Estimate a rotation and a scale, too; None where too few tiles are compared."""
+        comparison = self._comparison
+        return None if comparison is None else _fit_similarity(comparison)
+
+    def row_power(self, modes: int) -> Array | None:
+        """(2, k, 2) power of the shifts of the rows of tiles about a straight line, px^2 per row, in the
+        lowest cosine modes down the frame, k = ``modes`` or as many as there are rows for; and the same of
+        the noise alone. None where there are too few rows.
+        """
+        comparison = self._comparison
+        return None if comparison is None else _measure_row_power(comparison, modes)
 
 
 def unmeasured_alignment() -> Alignment:
@@ -382,6 +434,7 @@ def _summarise(
         overlap=_overlap_fraction(level.size, comparison.image_size, comparison.improved),
         converged=converged,
         iterations=passes,
+        _comparison=comparison,
     )
 
 
@@ -454,6 +507,63 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     residual = comparison.fit.scores + explained
     scores = (powers[:, :, None] * residual[:, None, :]).reshape(-1, 4)
     return joint, _robust_covariance(comparison, scores, inverse)
+
+
+def _measure_row_power(comparison: _Comparison, modes: int) -> Array | None:
+    """Power of the sum of both halves of the columns, and of their difference, which has the same noise."""
+    rows, cols = len(comparison.window.y), len(comparison.window.x)
+    modes = min(modes, int(rows / _ROWS_PER_MODE))
+    if min(modes, cols) < _MIN_SHEAR_ROWS:
+        return None
+    scores = comparison.fit.scores.reshape(rows, cols, 2)
+    # Neighbours share noise; pairs of columns take turns.
+    sign = np.where((np.arange(cols) // 2) % 2 == 0, 1.0, -1.0)
+    both = np.stack([scores.sum(axis=1), np.einsum("rcj,c->rj", scores, sign)])
+    shifts = -rows * both @ np.linalg.inv(comparison.fit.information)
+    basis, line = _cosines(rows, modes), comparison.window.y - comparison.window.y.mean()
+    slope = np.einsum("krj,r->kj", shifts, line) / float(line @ line)
+    shifts = shifts - line[:, None] * slope[:, None, :]
+    power = np.einsum("rm,krj->kmj", basis, shifts) ** 2 / rows
+    return np.asarray(power * comparison.level.factor**2)
+
+
+@lru_cache(maxsize=16)
+def _cosines(rows: int, modes: int) -> Array:
+    """(rows, modes) orthonormal cosines (the discrete cosine transform of type II)."""
+    phase = np.outer(np.arange(rows) + 0.5, np.arange(modes)) * (np.pi / rows)
+    return np.asarray(np.sqrt(2.0 / rows) * np.cos(phase))
+
+
+def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
+    """The shift of the image's middle, shear, rotation and scale."""
+    window, factor = comparison.window, comparison.level.factor
+    if min(len(window.x), len(window.y)) < _MIN_SHEAR_ROWS:
+        return None
+    width, height = (factor * n for n in comparison.image_size)
+    weights = _tile_information(comparison)
+    x, y = np.tile(window.x, len(window.y)), np.repeat(window.y, len(window.x))
+    powers = np.stack([np.ones_like(y), y, x], axis=1)
+    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 9)
+    whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 3, 3)
+    information = whole.transpose(2, 0, 3, 1).reshape(6, 6)
+    scaled, scale = equilibrate(information)
+    if np.linalg.cond(scaled) > _MAX_CONDITION:
+        return None
+    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
+    scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 6)
+    step = -inverse @ scores.sum(axis=0)
+    explained = np.einsum("tij,tj->ti", weights, powers @ step.reshape(3, 2))
+    residual = comparison.fit.scores + explained
+    scores = (powers[:, :, None] * residual[:, None, :]).reshape(-1, 6)
+    covariance = _robust_covariance(comparison, scores, inverse)
+    step[:2] += comparison.shift
+    # The last row minus the first; along a row, what changes is scale (x) and rotation (y).
+    aspect = height / width
+    matrix = np.zeros((6, 6))
+    matrix[:4, :4] = factor * np.eye(4)
+    matrix[2:4, 4:] = factor * aspect * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    matrix[4:, 4:] = factor / width * np.array([[0.0, 1.0], [1.0, 0.0]])
+    return SimilarityFit(matrix @ step, matrix @ covariance @ matrix.T)
 
 
 def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array) -> Array | None:

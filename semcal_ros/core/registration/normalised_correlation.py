@@ -34,7 +34,7 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask, mad_si
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["CoarsePeak", "CoarseReference", "find_coarse_peaks"]
+__all__ = ["CoarsePeak", "CoarseReference", "find_coarse_peaks", "remove_shading"]
 
 
 # Longest sides to which the images are reduced, tried one after the other: each step costs four
@@ -142,7 +142,7 @@ class CoarseReference:
         )
 
     def _prepare(self, factor: int, image_shape: tuple[int, ...]) -> _SurfacePart | None:
-        small = _remove_shading(self.pyramid.at(factor))
+        small = remove_shading(self.pyramid.at(factor))
         geometry = _plan_surface(small.shape, image_shape, self.min_overlap)
         if geometry is None:
             return None
@@ -180,7 +180,7 @@ def find_coarse_peaks(
     return best if best and best[0].significant else []
 
 
-def _remove_shading(image: AnyImage) -> Image:
+def remove_shading(image: AnyImage) -> Image:
     """Shading removed: only structure below an eighth of the field is compared."""
     small = np.asarray(image, dtype=np.float32)
     sigma = max(small.shape) / _SHADING_PARTS
@@ -194,7 +194,7 @@ def _remove_shading(image: AnyImage) -> Image:
 def _find_peaks_at(
     reference: CoarseReference, image: Pyramid, factor: int, guess_px: Array
 ) -> list[CoarsePeak]:
-    small = _remove_shading(image.at(factor))
+    small = remove_shading(image.at(factor))
     reference_part = reference.part(factor, small.shape)
     if reference_part is None:
         return []

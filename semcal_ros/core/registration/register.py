@@ -38,9 +38,11 @@ from semcal_ros.core.registration.ambiguity import choose_peak
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
+    SimilarityFit,
     align,
     unmeasured_alignment,
 )
+from semcal_ros.core.registration.mismatch import explain_deformation, explain_mismatch
 from semcal_ros.core.registration.noise_spectrum import (
     estimate_noise_variance,
     gaussian_taps,
@@ -81,6 +83,17 @@ _MIN_SIGNAL = 0.06
 _MIN_SIGNAL_SHARE = 0.02
 
 
+# How an image appears that fits part by part, but not by one shift. (That its halves disagree says it already.)
+_SIGNS_OF_DEFORMATION = frozenset(
+    {
+        MatchFailure.UNDETERMINED,
+        MatchFailure.NOT_CONVERGED,
+        MatchFailure.STAGES_DISAGREE,
+        MatchFailure.DISSIMILAR,
+    }
+)
+
+
 @dataclass(frozen=True)
 class Registration:
     """Shift of an image against a reference.
@@ -105,6 +118,19 @@ class Registration:
     correlation: float
     rejection: Rejection[MatchFailure] | None
     nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
+
+    _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
+    _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
+
+    def fit_similarity(self) -> SimilarityFit | None:
+        """Shift, shear, rotation and scale together, about the middle of the whole image; None where too
+        little is compared for them.
+        """
+        fit = self.alignment.fit_similarity()
+        if fit is None:
+            return None
+        about = fit.about(self._middle_px)
+        return replace(about, values=about.values + np.append(self._origin_px, np.zeros(4)))
 
     @property
     def accepted(self) -> bool:
@@ -332,7 +358,10 @@ def register(
     pyramid = Pyramid(gray)
     peaks = find_coarse_peaks(reference.coarse, pyramid, guess)
     if not peaks:
-        return _reject(MatchFailure.NO_PEAK, "no shift stands out: featureless, or another place")
+        found = explain_mismatch(reference.coarse, pyramid, guess)
+        return _reject(
+            MatchFailure.NO_PEAK, found or "no shift stands out: featureless, or another place"
+        )
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
     chosen = choose_peak(reference, pyramid, peaks, guess, spread)
     if isinstance(chosen, Rejection):
@@ -351,16 +380,33 @@ def register(
             levels = [level for level in reference.levels if level.factor <= peak.step_px]
             alignment = align(levels, pyramid, np.array(peak.shift_px))
     if isinstance(alignment, Rejection):
-        return Registration(unmeasured_alignment(), float("nan"), alignment)
+        named = _name_deformation(alignment, reference, pyramid)
+        return Registration(unmeasured_alignment(), float("nan"), named)
     texture = _texture(gray, inside, reference.settings)
     correlation = _correct_correlation(reference, texture, alignment)
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
+    if rejection is not None:
+        rejection = _name_deformation(rejection, reference, pyramid)
     moved = replace(
         alignment,
         shift_px=alignment.shift_px + origin,
         joint_px=alignment.joint_px + np.append(origin, [0.0, 0.0]),
     )
-    return Registration(moved, correlation, rejection)
+    height, width = np.shape(image)[:2]
+    middle = 0.5 * (np.array([width, height]) - np.add(inside[:2], inside[2:]))
+    return Registration(
+        moved, correlation, rejection, _middle_px=middle.astype(np.float64), _origin_px=origin
+    )
+
+
+def _name_deformation(
+    rejection: Rejection[MatchFailure], reference: Reference, pyramid: Pyramid
+) -> Rejection[MatchFailure]:
+    """The same rejection, with another reason where that is only how a deformation shows."""
+    if rejection.status not in _SIGNS_OF_DEFORMATION:
+        return rejection
+    found = explain_deformation(reference.coarse.pyramid, pyramid)
+    return replace(rejection, reason=found) if found else rejection
 
 
 def _reject(failure: MatchFailure, reason: str) -> Registration:

@@ -115,11 +115,13 @@ class PyramidLevel:
 class TileWindow:
     """The tiles whose pixels the image shows, as ranges of rows and columns of tiles.
 
-    ``y`` (rows,) are their middles in the image, in units of its height from its centre.
+    ``x`` (cols,) and ``y`` (rows,) are their middles in the image, in units of its width and of its
+    height from its centre.
     """
 
     rows: slice
     cols: slice
+    x: Array
     y: Array
 
     @property
@@ -250,7 +252,7 @@ def tile_window(
         ranges.append(slice(first, last))
         middle = origin + side * (np.arange(first, last) + 0.5) - 0.5 + shift[axis]
         middles.append((middle - 0.5 * (image_size[axis] - 1)) / image_size[axis])
-    return TileWindow(ranges[1], ranges[0], middles[1])
+    return TileWindow(ranges[1], ranges[0], middles[0], middles[1])
 
 
 def _window_rectangle(level: PyramidLevel, window: TileWindow) -> tuple[int, int, int, int]:

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -155,3 +157,38 @@ def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
     # The way adds uncertainty, and says so.
     assert np.all(sigma[frames // 2] > 1.5 * sigma[-1])
     assert np.all(np.abs(error[1:]) < 4.5 * sigma[1:])
+
+
+def test_drift_of_recursive_averages_is_that_of_their_effective_time() -> None:
+    size, averages = 128, 4
+    texture = Texture(5, 256, 1.5, 5.0)
+
+    def drift_px(time_s: Any) -> tuple[Any, Any]:
+        return 0.1 * time_s + 0.01 * time_s**2, -0.007 * time_s**2
+
+    rng = np.random.default_rng(0)
+    timing = ScanTiming(1.0, recursive_averages=averages)
+    history = DriftHistory()
+    tracker, shown = DriftTracker(history=history), np.zeros((size, size))
+    for k in range(-30, 14):
+        # Passes in an instant, in the middle of their second; long ago they were at rest.
+        view = texture.view(drift_px(max(k + 0.5, -12.0)), size)
+        image = 128.0 + 40.0 * view + 3.0 * rng.standard_normal(view.shape)
+        shown = image if k == -30 else shown + (image - shown) / averages
+        if k >= 0:
+            tracker.update(shown.astype(np.float32), float(k), None, timing)
+    updates = history.smooth().updates
+    # The mean of an accelerated drift over the weights of the passes differs from the drift at their mean time by
+    # half the acceleration times their variance: by the same in each frame. The blur is not undone.
+    times = np.array([u.time_s for u in updates])
+    assert times[0] == 0.5 - (averages - 1)
+    drift = np.array([u.drift_m for u in updates])
+
+    def error(late_s: float) -> float:
+        truth = np.stack(drift_px(times + late_s), axis=1)
+        return float(np.max(np.abs(drift - truth + truth[0])))
+
+    # An image that is blurred to one side by some pixels seems to lie less far to that side.
+    assert error(0.0) < 0.1
+    # The stamps alone would be wrong by three passes.
+    assert error(averages - 1.0) > 0.5

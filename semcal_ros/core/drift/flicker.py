@@ -1,0 +1,158 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Drift that is faster than the frames: 1/f noise along the slow axis of a scan.
+
+Scanners creep, and fields and stages wander, with a power that falls as one over the frequency. What is
+slower than a frame is drift, and the filter follows it. What is faster bends the columns of a frame to and fro.
+A registration measures the mean over the frame; the specimen was elsewhere at its middle, and no scatter of
+the tiles says so. With the one-sided density ``A^2 / f`` (f in cycles per frame, A^2 the variance of one e-fold of
+frequencies) the variance of the two about each other is
+
+    A^2 int (1 - sinc f)^2 / f df.
+
+The density is told by how the shifts of the R rows of tiles depart from a line: in cosine modes m = 2, 3, ... down
+the frame their power is ``A^2 / m + a``, with a white part from lines that jitter, which the covariance of a
+registration has already. The noise of the images has the power of the difference of two halves of the
+columns, in which what moves whole lines cancels.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.registration.register import Registration
+
+__all__ = ["FlickerEstimator"]
+
+
+# Modes that are used: the lowest after the line; 15 rows of tiles resolve them.
+_MODES = np.arange(2, 10)
+# Gains in twice the log likelihood (chi-square with 1 degree of freedom). Where the rows do not clearly move, by this
+# multiple of the noise and two sigmas, a density must explain them better than nothing does at a level that chance
+# reaches once in 4000 times. Where they do, the question is only whether lines jitter one by one instead: that
+# must explain them better by two sigmas; and beside it, 1/f noise must gain one: too large an
+# uncertainty is the lesser evil.
+_SIGNIFICANT, _TWO_SIGMAS, _ONE_SIGMA = 12.0, 4.0, 1.0
+_MOVING, _SIGMAS_MOVING = 2.0, 2.0
+# Ratios of powers stay finite.
+_TINY = 1e-30
+# Frames that are remembered, and the multiple of their median power from which one is left out: chance makes less
+# of sixteen numbers, an image that is wrong in places makes much more.
+_KEPT, _OUTLIER = 64, 20.0
+# An estimate is made again after this much more: it has become more certain by a fifth.
+_GROWTH = 1.5
+# Iterations of the fit: amounts are then right to some per cent.
+_ITERATIONS = 60
+# Part of the field by which a frame may be shifted: beyond, distortion bends it, too.
+_MAX_SHIFT = 0.1
+# Power of a mode of 1/f noise about its line, times m: 1 but for the line and the ends (4000 simulated frames).
+_OF_MODE = 0.9
+# Integral of (1 - sinc f)^2 / f up to 12 cycles per frame, which 24 rows of tiles resolve, and of the square of the
+# response of a fitted line, from a quarter of a cycle per frame on: what is slower is drift.
+_OF_MEAN, _OF_SHEAR = 3.0, 7.8
+
+
+class FlickerEstimator:
+    """Density of the 1/f noise of a stream, from its latest registrations."""
+
+    def __init__(self) -> None:
+        self._powers: deque[Array] = deque(maxlen=_KEPT)
+        self._count, self._due = 0, 1
+
+    @property
+    def count(self) -> int:
+        """Number of registrations."""
+        return self._count
+
+    def add(self, registration: Registration, averaged: float, size: tuple[int, int]) -> bool:
+        """Add a registration against the mean of ``averaged`` frames of ``size`` (width, height); whether the
+        next estimate is due.
+        """
+        if np.any(np.abs(registration.shift_px) > _MAX_SHIFT * np.array(size)):
+            return False
+        power = registration.alignment.row_power(int(_MODES[-1]) + 1)
+        if power is None:
+            return False
+        # The keyframe is bent, too.
+        known = np.full((2, len(_MODES), 2), np.nan)
+        modes = power.shape[1] - int(_MODES[0])
+        known[:, :modes] = power[:, _MODES[:modes]] / (1.0 + 1.0 / averaged)
+        self._powers.append(known)
+        self._count += 1
+        if self._count < self._due:
+            return False
+        self._due = min(int(np.ceil(_GROWTH * self._count)), self._count + _KEPT)
+        return True
+
+    def variance_px2(self) -> Array:
+        """(4,) variances of the shift of a frame (x, y) about that of its middle, and of its shear; zero
+        where there is no 1/f noise to be seen.
+        """
+        if not self._powers:
+            return np.zeros(4)
+        powers = np.array(self._powers)
+        total = np.nanmean(powers, axis=(1, 2, 3))
+        powers = powers[total <= _OUTLIER * np.median(total)]
+        counts = np.count_nonzero(np.isfinite(powers[:, 0, :, 0]), axis=0).astype(np.float64)
+        seen = counts > 0.0
+        whole, noise = np.nanmean(powers[:, :, seen], axis=0)
+        modes, counts = _MODES[seen], counts[seen]
+        density = np.array([_fit_density(whole[:, k], noise[:, k], modes, counts) for k in (0, 1)])
+        return np.concatenate([_OF_MEAN * density, _OF_SHEAR * density])
+
+
+def _fit_density(whole: Array, noise: Array, modes: Indices, counts: Array) -> float:
+    """A^2 from the mean powers of modes in ``counts`` frames, or 0 where jitter and the noise of the images explain
+    them as well.
+    """
+    # The logarithm of a ratio of two chi-squares with n degrees of freedom has a sigma of 2 / sqrt(n).
+    ratio = float(counts @ whole) / max(float(counts @ noise), _TINY)
+    chance = float(np.exp(2.0 * _SIGMAS_MOVING / np.sqrt(np.sum(counts))))
+    if ratio < chance:
+        return 0.0
+    level = np.full(len(modes), max(float(np.mean(noise)), _TINY))
+    white = np.ones((len(modes), 1))
+    pink = (_OF_MODE / modes)[:, None]
+
+    def gain(before: Array, after: Array) -> float:
+        return float(np.sum(counts * (np.log(before / after) + whole / before - whole / after)))
+
+    _, plain = _fit_powers(whole, white, level, counts)
+    values, fitted = _fit_powers(whole, pink, level, counts)
+    mixed, fitted_mixed = _fit_powers(whole, np.column_stack([pink, white]), level, counts)
+    needed = -_TWO_SIGMAS
+    if gain(fitted, fitted_mixed) > _TWO_SIGMAS:
+        # Lines do not jitter by an amount that is not seen.
+        values, fitted, needed = mixed, fitted_mixed, _ONE_SIGMA
+    if ratio < _MOVING * chance:
+        needed = _SIGNIFICANT
+    return float(values[0]) if gain(plain, fitted) > needed else 0.0
+
+
+def _fit_powers(whole: Array, columns: Array, level: Array, counts: Array) -> tuple[Array, Array]:
+    """Most likely amounts, not negative, of the columns in powers above a level, and the powers that they predict.
+
+    A power is a chi-square with one degree of freedom for each frame; each multiplicative step makes the
+    amounts more likely (Fevotte and Idier 2011, doi:10.1162/NECO_a_00168).
+    """
+    amounts = np.full(columns.shape[1], float(np.mean(whole)))
+    for _ in range(_ITERATIONS):
+        expected = columns @ amounts + level
+        risen = columns.T @ (counts * whole / expected**2)
+        amounts = amounts * np.sqrt(risen / (columns.T @ (counts / expected)))
+    return amounts, columns @ amounts + level
