@@ -35,6 +35,11 @@ from semcal_ros.core.calibration.joint import (
     fit_joint,
     without_magnification,
 )
+from semcal_ros.core.calibration.nominal_scale import (
+    advise_scale,
+    check_nominal_scale,
+    observed_scale_factor,
+)
 from semcal_ros.core.calibration.outliers import (
     find_change_point,
     find_outliers,
@@ -63,7 +68,8 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigm
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
+from semcal_ros.core.wording import counted
 
 __all__ = [
     "METHODS",
@@ -120,7 +126,7 @@ class MethodOptions:
             return
         if isinstance(step, str) or not (np.isfinite(step) and step > 0.0):
             raise InvalidValueError(
-                f"pda_step {step!r}", expected='"auto" or a positive step in magnification'
+                f"pda_step {step!r}", expected='"auto" or a finite step in magnification above 0'
             )
 
 
@@ -183,11 +189,15 @@ class CalibrationOptions:
             return
         if self.breakpoints:
             raise InvalidValueError(
-                f"breakpoints with method {self.method}", expected='method "joint"'
+                f"breakpoints with method {self.method}",
+                expected='method "joint"',
+                do="use --method joint",
             )
         if self.residual == "on":
             raise InvalidValueError(
-                f"a residual field with method {self.method}", expected='method "joint"'
+                f"a residual field with method {self.method}",
+                expected='method "joint"',
+                do="use --method joint",
             )
 
 
@@ -222,7 +232,10 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class _MethodFit:
-    """The common result of all methods; ``without`` gives it without one magnification."""
+    """The common result of all methods.
+
+    ``without`` gives it without one magnification; ``failure`` says how it did not converge.
+    """
 
     functions: Functions
     covariance: Array
@@ -233,6 +246,7 @@ class _MethodFit:
     warnings: tuple[str, ...]
     residual: ResidualField | None = None
     repeatability: float = 0.0
+    failure: str = ""
 
 
 def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
@@ -245,14 +259,14 @@ def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
         )
     if len(views) < _MIN_VIEWS:
         raise CalibrationError(
-            f"a calibration from {len(views)} views",
+            f"a calibration from {counted(len(views), 'view')}",
             expected=f"at least {_MIN_VIEWS} views of the grid in different directions",
             do="add tilted views",
         )
     for view in views:
         if (count := len(view.board_xy_m)) < _MIN_CORNERS:
             raise CalibrationError(
-                f"view {view.name} with {count} corners",
+                f"view {view.name} with {counted(count, 'corner')}",
                 expected=f"at least {_MIN_CORNERS} in every view",
                 do="leave this view out",
             )
@@ -286,12 +300,15 @@ def calibrate_views(
         perspective is that of a photograph.
     on_stage
         Called with the name of the stage that begins and the fraction of the work that is done, 0
-        to 1 (only ``"joint"``, which starts again after leaving out views).
+        to 1 (``"joint"`` starts again after leaving out views).
 
     Raises
     ------
     CalibrationError
         If the views do not allow a calibration.
+    UnusableCalibrationError
+        If their scale is off by more than a factor of 3 from the nominal one, or the adjustment
+        did not converge.
     InvalidValueError
         For breakpoints outside the magnifications of the views.
     """
@@ -300,6 +317,9 @@ def calibrate_views(
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _check_breakpoints(options.breakpoints, magnifications)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in ordered]))
+    factor = observed_scale_factor(ordered, nominal)
+    _check_scale(setup, factor)
     if priors is None:
         setup = adapt_priors(setup)
     if options.method == "joint":
@@ -311,8 +331,11 @@ def calibrate_views(
         fit = _fit_joint(setup, joint)
         fit = replace(fit, warnings=(*notes, *fit.warnings))
     else:
+        on_stage("one magnification after the other", 0.0)
         fit = _fit_discrete(setup, options.method, options.method_options)
+    _check_converged(setup, fit, factor)
 
+    on_stage("held-out magnifications", 0.95)
     scale = ScaleSigma(fit.repeatability, options.squares_sigma, options.height_sigma_m)
     model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
     poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
@@ -326,6 +349,35 @@ def calibrate_views(
     return CalibrationResult(
         replace(model, statistics=statistics), setup.views, poses, held_out, warnings, outliers
     )
+
+
+def _units(setup: Setup) -> dict[str, Any]:
+    """Return what the nominal scale of the views is made of."""
+    known = tuple(side for side in setup.squares_m if side > 0.0)
+    pixel_size_m = None
+    if len(setup.magnifications) == 1:
+        pixel_size_m = 1.0 / float(setup.nominal_px_per_m(setup.magnifications)[0])
+    return {
+        "display_width_m": setup.display_width_m,
+        "squares_m": known,
+        "pixel_size_m": pixel_size_m,
+    }
+
+
+def _check_scale(setup: Setup, factor: float) -> None:
+    check_nominal_scale(factor, **_units(setup))
+
+
+def _check_converged(setup: Setup, fit: _MethodFit, factor: float) -> None:
+    """Refuse a fit that is not at a minimum, or that ended far from the nominal scale."""
+    if fit.failure:
+        raise UnusableCalibrationError(
+            f"an adjustment that did not converge ({fit.failure}), where the images show {factor:.3g} "
+            "times the scale that magnification, display width and squares predict",
+            expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+            do="leave out what are not such views; " + advise_scale(factor, **_units(setup)),
+        )
+    _check_scale(setup, float(np.median([fit.functions["scale"](g) for g in setup.magnifications])))
 
 
 def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> tuple[float, ...]:
@@ -406,8 +458,6 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
     adjustment, result = fit.adjustment, fit.adjustment.result
     factor = variance_factor(adjustment.problem, result)
     warnings = []
-    if not result.converged:
-        warnings.append(f"the adjustment did not converge: {result.status.value}")
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     if misfit > _MISFIT:
@@ -447,6 +497,7 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
         tuple(warnings),
         None if fit.field is None else fit.field.field,
         estimate_repeatability(setup, fit),
+        "" if result.converged else result.status.value,
     )
 
 
@@ -470,7 +521,6 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodF
         for g, r in zip(setup.magnifications, discrete.results, strict=True)
         if not r.converged
     ]
-    warnings = [f"no convergence at magnification {', '.join(failed)}"] if failed else []
     details = {
         "converged": not failed,
         "options": asdict(options),
@@ -489,7 +539,8 @@ def _fit_discrete(setup: Setup, method: str, options: MethodOptions) -> _MethodF
         np.full(len(setup.views), setup.priors.height_sigma_m),
         None,
         details,
-        tuple(warnings),
+        (),
+        failure=f"at magnification {', '.join(failed)}" if failed else "",
     )
 
 

@@ -204,7 +204,7 @@ def fit_poses(
         raise CalibrationError(
             "views that the calibration cannot project",
             expected="images of the microscope that was calibrated",
-            do="check the magnification and the display width",
+            do="check the magnification and --display-width",
         )
     g_of_view = magnifications[problem.group]
     best = _select_best(usable, problem.starts, g_of_view)

@@ -34,6 +34,7 @@ from semcal_ros.core.camera.plane_geometry import (
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.wording import counted
 
 __all__ = ["InitialValues", "initial_values", "pose_from_camera"]
 
@@ -120,9 +121,9 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     known = np.all(np.isfinite(ideal), axis=1)
     if known.sum() < 4:
         raise CalibrationError(
-            f"view {view.name}, in which the calibration can undistort only {known.sum()} corners",
+            f"view {view.name}, in which the calibration can undistort only {counted(known.sum(), 'corner')}",
             expected="images of the microscope that was calibrated",
-            do="check the magnification and the display width",
+            do="check the magnification and --display-width",
         )
     principal = np.array([camera.px, camera.py])
     centre = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])

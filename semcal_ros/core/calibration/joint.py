@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, BundleStatus, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.line_jitter import LineJitter, estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
@@ -69,6 +69,7 @@ from semcal_ros.core.calibration.variance_components import (
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = [
     "RESIDUAL_MODES",
@@ -267,14 +268,29 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     functions = refit_functions(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
-    result = adjust(problem, state, tolerance=_COARSE)
+    result = _check_projection(adjust(problem, state, tolerance=_COARSE))
     for _ in range(_FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
         spread = update_components(setup, problem, result)
         problem = build_problem(setup, functions, setup.views, spread)
-        result = refine(problem, result.state, tolerance=_COARSE)
+        result = _refine_coarsely(problem, result.state)
     return with_coefficients(functions, result.state.theta), result.state, spread
+
+
+def _check_projection(result: BundleResult) -> BundleResult:
+    """Return the result, unless the camera does not show some corners at all; then nothing is known."""
+    if result.status is BundleStatus.NO_PROJECTION:
+        raise UnusableCalibrationError(
+            "an adjustment in which a corner has no projection",
+            expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+            do="check magnifications, --display-width and --squares, or leave out other views",
+        )
+    return result
+
+
+def _refine_coarsely(problem: Problem, state: State) -> BundleResult:
+    return _check_projection(refine(problem, state, tolerance=_COARSE))
 
 
 def _theta(setup: Setup, functions: Functions, state: State) -> Array:
@@ -369,7 +385,7 @@ def _select_and_adjust(
     """Choose the number of coefficients of every function until the choice no longer changes."""
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
-    result = refine(problem, state, tolerance=_COARSE)
+    result = _refine_coarsely(problem, state)
     converged, rounds = len(setup.magnifications) < 3, 0
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
@@ -382,7 +398,7 @@ def _select_and_adjust(
         spread = update_components(setup, problem, result)
         problem = build_problem(setup, functions, setup.views, spread)
         state = replace(result.state, theta=_theta(setup, functions, result.state))
-        result = refine(problem, state, tolerance=_COARSE)
+        result = _refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
     return Adjustment(functions, problem, result, spread, rounds, converged)
 
@@ -400,7 +416,7 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     )
     for _ in range(_LAST_UPDATES):
         problem = build_problem(setup, functions, setup.views, spread)
-        result = refine(problem, state, tolerance=_COARSE)
+        result = _refine_coarsely(problem, state)
         before, state = spread, result.state
         spread = update_components(setup, problem, result)
         if _largest_change(before, spread) < _SMALL_CHANGE:
@@ -485,7 +501,7 @@ def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: b
     if choosing:
         return _select_and_adjust(setup, functions, state, spread, _current_sizes(adjustment))
     problem = build_problem(setup, functions, setup.views, spread)
-    result = refine(problem, state, tolerance=_COARSE)
+    result = _refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
     return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
 
@@ -527,6 +543,7 @@ def fit_joint(
     if field is not None:
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
+    on_stage("uncertainty", 0.9)
     padded = _pad_functions(adjustment.functions)
     jitter = estimate_jitter(adjustment.problem, adjustment.result)
     covariance = _pad_covariance(setup, padded, adjustment, field, jitter)

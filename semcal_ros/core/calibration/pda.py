@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.discrete import DiscreteFit
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.wording import counted
 
 __all__ = [
     "FittedEquation",
@@ -194,7 +195,7 @@ def _fit_curve(
         raise CalibrationError(
             f"a differential equation for {name} whose solution diverges",
             expected="smooth calibration results",
-            do='use method "joint" or a lower order',
+            do="use --method joint, or a lower --pda-order",
         )
     whitened = rows / sigma[:, None]
     inverse = np.linalg.pinv(whitened.T @ whitened, rcond=1e-12, hermitian=True)
@@ -237,9 +238,9 @@ def pda_functions(
     g = discrete.magnifications
     if len(g) < needed:
         raise CalibrationError(
-            f"{len(g)} magnifications",
+            counted(len(g), "magnification"),
             expected=f"at least {needed} for this method",
-            do='record more magnifications or use method "joint"',
+            do="record more magnifications, or use --method joint",
         )
     position = _rescale(g)
     functions: dict[str, ContinuousFunction] = {}

@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.discrete import DiscreteFit
 from semcal_ros.core.calibration.pda import equation_error, pda_functions
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.wording import counted
 
 __all__ = ["StepTrial", "choose_step", "select_magnifications", "try_steps"]
 
@@ -136,9 +137,9 @@ def try_steps(
     needed = _SPARE + (order if legendre_degree is None else legendre_degree)
     if len(discrete.magnifications) < needed:
         raise CalibrationError(
-            f"{len(discrete.magnifications)} magnifications",
+            counted(len(discrete.magnifications), "magnification"),
             expected=f"at least {needed} to choose a step",
-            do="record more magnifications, or choose no step",
+            do="record more magnifications, or leave --pda-step out",
         )
     trials = []
     for step, used in _list_steps(discrete.magnifications, needed).items():
@@ -165,6 +166,6 @@ def choose_step(trials: Sequence[StepTrial]) -> float:
         raise CalibrationError(
             f"no finite error with any of {len(trials)} steps",
             expected="smooth calibration results",
-            do='use method "joint" or a lower order',
+            do="use --method joint, or a lower --pda-order",
         )
     return best.step

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, AnyImage, Array, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, AnyImage, Array, Mask, check_positive
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
@@ -97,10 +97,7 @@ class GridView:
             raise InvalidValueError(
                 f"view arrays of shapes {shapes}", expected="(n, 2), (n, 2), (n,)"
             )
-        if not (np.isfinite(self.magnification) and self.magnification > 0):
-            raise InvalidValueError(
-                f"magnification {self.magnification}", expected="a positive number"
-            )
+        check_positive(self.magnification, "magnification")
         if not (np.all(np.isfinite(self.image_xy)) and np.all(self.sigma_px > 0)):
             raise InvalidValueError("a view with non-finite corners", expected="finite pixels")
         if self.covariance_px2 is not None and not _all_positive(self.covariance_px2, n):
@@ -164,7 +161,7 @@ class FoundView:
     magnification
         Magnification of the image.
     image
-        (h, w) grey values.
+        (h, w) grey values where they are at hand, or None.
     detection
         The corners.
     stage, visit
@@ -175,7 +172,7 @@ class FoundView:
 
     name: str
     magnification: float
-    image: AnyImage
+    image: AnyImage | None
     detection: LatticeDetection
     stage: StageReading | None = None
     visit: int = -1

@@ -25,6 +25,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -128,6 +129,8 @@ class CalibrationModel:
         Distortion that the parameters do not describe, or None.
     scale_sigma
         Uncertainty of the scale beyond the covariance.
+    provenance
+        Where it comes from.
     """
 
     functions: Mapping[str, ContinuousFunction]
@@ -140,6 +143,7 @@ class CalibrationModel:
     statistics: Mapping[str, Any] = field(default_factory=dict)
     residual: ResidualField | None = None
     scale_sigma: ScaleSigma = ScaleSigma()
+    provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
         missing = [name for name in FUNCTION_NAMES if name not in self.functions]
@@ -203,9 +207,11 @@ class CalibrationModel:
             spread, cross = self.covariance[size:, size:], design @ self.covariance[:size, size:]
             residual = self.residual.at(g, spread, cross)
         if not in_range:
-            covariance = covariance + self._extrapolation_covariance(g)
+            with np.errstate(over="ignore"):  # the camera refuses what is not finite
+                covariance = covariance + self._extrapolation_covariance(g)
         parameters = design @ theta
-        covariance[0, 0] += (parameters[0] * self.scale_sigma.relative(parameters[5])) ** 2
+        with np.errstate(over="ignore"):
+            covariance[0, 0] += (parameters[0] * self.scale_sigma.relative(parameters[5])) ** 2
         values = dict(zip(PARAMETER_NAMES, parameters.tolist(), strict=True))
         try:
             return ScanCamera(
@@ -224,6 +230,14 @@ class CalibrationModel:
                 expected=f"a magnification near the calibrated range {low:g} to {high:g}",
                 do="calibrate there",
             ) from error
+
+    def extrapolation_sigma(self, magnification: float) -> float:
+        """Relative 1-sigma of the scale that a magnification outside the calibrated range adds; 0 inside."""
+        g = checked_magnification(magnification)
+        low, high = self.magnification_range
+        if low * (1 - 1e-9) <= g <= high * (1 + 1e-9):
+            return 0.0
+        return float(np.sqrt(self._extrapolation_covariance(g)[0, 0]) / self.at(g).m)
 
     def _extrapolation_covariance(self, g: float) -> Array:
         """Return a diagonal (10, 10) allowance for the unknown course of the functions.

@@ -20,7 +20,10 @@ pass ``k`` is acquired at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 
-(design section 7). A frame averaged from several passes shows the mean over the passes.
+(design section 7). A frame averaged from several passes shows the mean over the passes. Where each line is scanned
+n times before the next one, its time ``T / rows`` is that of n lines, and the pixel shows their mean.
+A recursive average ``y_k = y_(k-1) + (x_k - y_(k-1)) / N`` of passes x shows what was N - 1 passes ago
+on average.
 """
 
 from __future__ import annotations
@@ -36,6 +39,10 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["ScanTiming"]
 
 
+# Eleven days: what is longer has lost its unit.
+_LONGEST_S = 1e6
+
+
 @dataclass(frozen=True)
 class ScanTiming:
     """Raster timing of one microscope setting.
@@ -48,16 +55,40 @@ class ScanTiming:
         Number of passes that are averaged into one image.
     flyback_fraction
         Part of the line period, in [0, 1), in which the beam returns and nothing is recorded.
+    line_averages
+        Number of times that each line is scanned before the next one; all of them are part of the frame time.
+    recursive_averages
+        N of a recursive average of passes; 1 for none. The stamp is that of the latest pass.
     """
 
     frame_time_s: float
     averages: int = 1
     flyback_fraction: float = 0.0
+    line_averages: int = 1
+    recursive_averages: int = 1
 
     def __post_init__(self) -> None:
         check_positive(self.frame_time_s, "frame time", "s")
+        if self.frame_time_s > _LONGEST_S:
+            raise InvalidValueError(
+                f"frame time {self.frame_time_s:g} s",
+                expected=f"at most {_LONGEST_S:g} s",
+                do="state the unit, as in --frame-time 500ms",
+            )
         if self.averages < 1:
             raise InvalidValueError(f"{self.averages} averaged passes", expected="at least 1")
+        if self.line_averages < 1:
+            raise InvalidValueError(f"{self.line_averages} scans of a line", expected="at least 1")
+        if self.recursive_averages < 1:
+            raise InvalidValueError(
+                f"a recursive average of {self.recursive_averages} passes", expected="at least 1"
+            )
+        if self.averages > 1 and self.recursive_averages > 1:
+            raise InvalidValueError(
+                f"{self.averages} averaged passes and a recursive average of {self.recursive_averages}",
+                expected="one of the two",
+                do="set averages or recursive_averages to 1",
+            )
         if not 0 <= self.flyback_fraction < 1:
             raise InvalidValueError(
                 f"flyback fraction {self.flyback_fraction}", expected="a number in [0, 1)"
@@ -70,12 +101,21 @@ class ScanTiming:
 
     @property
     def centre_offset_s(self) -> float:
-        """Seconds from the stamp (start of the first pass) to the centre of the acquisition."""
-        return 0.5 * self.acquisition_time_s
+        """Seconds from the stamp (start of the first pass, or of the latest one of a recursive average) to the
+        centre of the acquisition.
+        """
+        return 0.5 * self.acquisition_time_s - self._lag_s
+
+    @property
+    def _lag_s(self) -> float:
+        """Mean age of a recursive average beyond its latest pass, s."""
+        return (self.recursive_averages - 1) * self.frame_time_s
 
     @property
     def pass_variance_s2(self) -> float:
-        """Variance of the times at which the passes acquire one pixel, s^2."""
+        """Variance of the times at which the averaged passes acquire one pixel, s^2; 0 for a recursive average,
+        in which an acceleration over that many passes cannot be told from a drift.
+        """
         return self.frame_time_s**2 * (self.averages**2 - 1) / 12.0
 
     def pixel_offset_s(self, row: ArrayLike, col: ArrayLike, rows: int, cols: int) -> Array:
@@ -89,6 +129,8 @@ class ScanTiming:
             Size of the frame in pixels.
         """
         line_s = self.frame_time_s / rows
-        passes_s = 0.5 * (self.averages - 1) * self.frame_time_s
+        passes_s = 0.5 * (self.averages - 1) * self.frame_time_s - self._lag_s
         within_line = np.asarray(col, dtype=np.float64) / cols * (1.0 - self.flyback_fraction)
+        if self.line_averages > 1:
+            within_line = (within_line + 0.5 * (self.line_averages - 1)) / self.line_averages
         return passes_s + line_s * (np.asarray(row, dtype=np.float64) + within_line)

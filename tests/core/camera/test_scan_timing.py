@@ -35,6 +35,40 @@ def test_mean_and_variance_of_the_times_of_averaged_passes(averages: int) -> Non
     assert timing.centre_offset_s == pytest.approx(0.2 * averages)
 
 
+def test_a_line_that_is_scanned_several_times_is_seen_at_the_mean_of_its_scans() -> None:
+    timing = ScanTiming(0.6, 1, 0.2, line_averages=3)
+    # Each of 8 lines takes 0.075 s, three times 0.025 s, of which 0.02 s are spent on 40 pixels.
+    scans = [3 * 0.075 + k * 0.025 + 0.02 * 10 / 40 for k in range(3)]
+    assert timing.pixel_offset_s(3, 10, 8, 40) == pytest.approx(np.mean(scans))
+    assert timing.acquisition_time_s == pytest.approx(0.6)
+    # The last scan of the last line ends with the frame.
+    assert timing.pixel_offset_s(7, 40, 8, 40) + 0.025 + 0.005 == pytest.approx(0.6)
+
+
+def test_a_recursive_average_is_as_old_as_its_weights_say() -> None:
+    timing = ScanTiming(0.5, 1, 0.1, recursive_averages=4)
+    weights = np.zeros(400)
+    weights[0] = 1.0
+    for k in range(1, 400):
+        weights *= 1.0 - 1.0 / 4.0
+        weights[k] += 1.0 / 4.0
+    starts = 0.5 * (np.arange(400) - 399.0)
+    shown = float(weights @ starts)
+    plain = ScanTiming(0.5, 1, 0.1)
+    offset = timing.pixel_offset_s(3, 10, 8, 40) - plain.pixel_offset_s(3, 10, 8, 40)
+    assert offset == pytest.approx(shown)
+    assert timing.centre_offset_s == pytest.approx(0.25 + shown)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"line_averages": 0}, {"recursive_averages": 0}, {"averages": 2, "recursive_averages": 2}],
+)
+def test_impossible_averages_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(InvalidValueError):
+        ScanTiming(1.0, **wrong)
+
+
 @pytest.mark.parametrize("wrong", [(0.0, 1, 0.0), (np.nan, 1, 0.0), (1.0, 0, 0.0), (1.0, 1, 1.0)])
 def test_impossible_timings_are_refused(wrong: tuple[float, int, float]) -> None:
     with pytest.raises(InvalidValueError):

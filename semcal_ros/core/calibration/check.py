@@ -1,0 +1,389 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether a calibration still describes the microscope, from a few views of the grid.
+
+The calibration is adjusted to the views (:mod:`~semcal_ros.core.calibration.revision`), with changes that all
+magnifications share, and the changes are tested: with all others zero, a group of changes
+lowers chi-square by ``b' L^-1 b``, where ``L`` is their information and ``b`` the score. The most significant
+group is taken, and then the next one given that, as long as one is significant (forward selection; Lehmann and
+Romano, Testing Statistical Hypotheses, chapter 7, has the test of linear hypotheses).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.normal_equations import Problem
+from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.revision import (
+    CHANGING,
+    Revision,
+    free_sigmas,
+    make_setup,
+    revise,
+)
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.wording import counted
+
+__all__ = ["CHANGES", "CalibrationCheck", "Change", "ShapeTest", "Verdict", "check_calibration"]
+
+#: Groups of parameters that are tested together, by the name under which a change is reported.
+CHANGES = {
+    "scale": ("scale",),
+    "aspect": ("aspect",),
+    "skew": ("skew",),
+    "distortion": ("xi_r", "xi_t"),
+    "centre of distortion": ("ex", "ey"),
+}
+# A valid calibration is called degraded in one check of a hundred: each of the tests has its share.
+_FALSE_ALARMS = 0.01
+_TESTS = len(CHANGES) + 1
+# Turns of signs: a hundred times the reciprocal of the least probability that matters.
+_FLIPS = 20_000
+# Cells per side in which the mean residual is tested: as fine as the knots of a residual field.
+_CELLS = 6
+# Least number of views in which a cell is seen; fewer do not tell a pattern from the scatter of the views.
+_ENOUGH_VIEWS = 6
+# A scale that is off by more than this is another microscope, display width or grid: repeatability and ageing
+# of an SEM are below 1 % (ISO 16700 asks for better than 10 % of the maker's magnification).
+_OTHER_SCALE = 0.1
+
+
+class Verdict(Enum):
+    """What a check says."""
+
+    VALID = "valid"
+    DEGRADED = "degraded"
+    INVALID = "invalid"
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of the camera since the calibration.
+
+    Attributes
+    ----------
+    name
+        Key of :data:`CHANGES`.
+    values, sigmas
+        Changes of its parameters with their 1-sigma: relative for the scale, px for the centre.
+    chi2, p_value
+        By how much it lowers chi-square, and how probable as much is without a change.
+    largest_px
+        Largest displacement in the image that it makes, without a shift of the whole.
+    """
+
+    name: str
+    values: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    chi2: float
+    p_value: float
+    largest_px: float
+
+
+@dataclass(frozen=True)
+class ShapeTest:
+    """Whether residuals form a pattern that all views share.
+
+    Attributes
+    ----------
+    rms_px
+        RMS of the mean residual per axis over the cells of the image, less its noise.
+    p_value
+        How probable a pattern as strong is without one; NaN where too few views were seen.
+    stated_px
+        1-sigma per axis with which the calibration knows what no pose imitates, RMS over the image.
+    """
+
+    rms_px: float
+    p_value: float
+    stated_px: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether there is a pattern, and a stronger one than the calibration allows for."""
+        return self.p_value < _FALSE_ALARMS / _TESTS and self.rms_px > self.stated_px
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """Result of :func:`check_calibration`.
+
+    Attributes
+    ----------
+    verdict
+        Valid, degraded, or invalid: of another microscope, display width or grid.
+    changes
+        What has changed, the most significant first; empty if nothing has.
+    tested
+        All tested changes, each by itself, in the order of :data:`CHANGES`.
+    shape
+        Test for distortion that no parameter describes.
+    scale_change, scale_sigma
+        By how much the scale (px per m) of the images is larger than the calibration's, relative, given what has
+        changed, and its 1-sigma:
+        of the images, their height, the calibration and the repeatability of its visits.
+    rms_px
+        RMS of the residuals with the changes adjusted.
+    views, out_of_range
+        Numbers of views that were used, and that lie outside the calibrated range.
+    """
+
+    verdict: Verdict
+    changes: tuple[Change, ...]
+    tested: tuple[Change, ...]
+    shape: ShapeTest
+    scale_change: float
+    scale_sigma: float
+    rms_px: float
+    views: int
+    out_of_range: int
+
+    @property
+    def summary(self) -> str:
+        """The verdict, what has changed, and how far nm per pixel is off, in one sentence."""
+        named = [change.name for change in self.changes]
+        named += ["distortion that no parameter describes"] * self.shape.significant
+        changed = f" ({', '.join(named)})" if named else ""
+        return (
+            f"{self.verdict.value}{changed}: nm per px off by {-100.0 * self.scale_change:+.3f} "
+            f"+- {100.0 * self.scale_sigma:.3f} %, by {counted(self.views, 'view')}"
+        )
+
+
+def check_calibration(
+    model: CalibrationModel,
+    views: Sequence[GridView],
+    *,
+    image_size: tuple[int, int],
+    untilted: str | Sequence[str] = "auto",
+    axis: StageAxis | None = None,
+) -> CalibrationCheck:
+    """Test whether views of the grid agree with a calibration within both uncertainties.
+
+    The grid is taken to be the one of the calibration, and to lie within ``model.scale_sigma.height_m`` of its
+    height: neither the size of the squares nor a height can be told from the scale.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    views
+        One or more views. Of one view without a known tilt, aspect and skew cannot be told from a tilt, and are
+        uncertain by as much.
+    image_size
+        (width, height) of the images.
+    untilted, axis
+        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+
+    Raises
+    ------
+    CalibrationError
+        If no view lies in the calibrated range, or the calibration cannot project the views at all.
+    InvalidValueError
+        If an untilted view is named that is not there.
+    """
+    setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
+    revision = revise(model, setup, free_sigmas(setup))
+    setup, problem, result = revision.setup, revision.problem, revision.result
+    estimate = _estimate_changes(revision)
+    tested, changes = (
+        tuple(replace(c, largest_px=_largest_px(model, setup, c)) for c in group)
+        for group in ([_test(estimate, [], name) for name in CHANGES], _select(estimate))
+    )
+    scale = next((c for c in changes if c.name == "scale"), tested[0])
+    shape = _test_shape(setup, problem, result, _stated_px(model, setup))
+    verdict = Verdict.DEGRADED if changes or shape.significant else Verdict.VALID
+    if changes and abs(scale.values[0]) > _OTHER_SCALE:
+        verdict = Verdict.INVALID
+    return CalibrationCheck(
+        verdict,
+        changes,
+        tested,
+        shape,
+        scale.values[0],
+        scale.sigmas[0],
+        float(np.sqrt(np.mean(np.sum(result.residuals_px**2, axis=1)))),
+        len(setup.views),
+        len(views) - len(setup.views),
+    )
+
+
+def _stated_px(model: CalibrationModel, setup: Setup) -> float:
+    """The calibration's own 1-sigma per axis of what no pose imitates, RMS over the image, px."""
+    camera = model.at(float(np.median(setup.magnifications))).resized(*setup.image_size)
+    covariance = camera.joint_covariance
+    if covariance is None:
+        return 0.0
+    x, y = np.meshgrid(*(np.linspace(0.0, n - 1.0, 7) for n in setup.image_size))
+    lattice: Array = np.stack([x.ravel(), y.ravel()], axis=1)
+    jacobian = camera.project_jacobian(camera.sem_from_ideal(lattice))
+    known = np.isfinite(jacobian).all(axis=(1, 2))
+    # A pose moves the image by a homography; here its derivative, for x and y in turn.
+    x, y = (lattice[known] / camera.width - 0.5).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    moves = np.stack(
+        [
+            np.stack([one, x, y, zero, zero, zero, x * x, x * y], axis=1),
+            np.stack([zero, zero, zero, one, x, y, x * y, y * y], axis=1),
+        ],
+        axis=1,
+    ).reshape(2 * len(x), 8)
+    basis, _ = np.linalg.qr(moves)
+    rows = jacobian[known].reshape(2 * len(x), -1)
+    left = rows - basis @ (basis.T @ rows)
+    return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", left, covariance, left))))
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Estimate of all changes as a Gaussian: its information and score."""
+
+    information: Array
+    score: Array
+
+    def solve(self, names: Sequence[str]) -> tuple[Array, Array, float]:
+        """Values and covariance of some changes where all others are zero, and the chi-square they explain."""
+        index = [CHANGING.index(name) for name in names]
+        if not index:
+            return np.zeros(0), np.zeros((0, 0)), 0.0
+        covariance = np.asarray(
+            np.linalg.inv(self.information[np.ix_(index, index)]), dtype=np.float64
+        )
+        values = covariance @ self.score[index]
+        return values, covariance, float(values @ self.score[index])
+
+
+def _estimate_changes(revision: Revision) -> _Estimate:
+    own = revision.changes
+    information = np.asarray(np.linalg.inv(revision.covariance[own, own]), dtype=np.float64)
+    return _Estimate(information, information @ revision.result.state.theta[own])
+
+
+def _test(estimate: _Estimate, given: Sequence[str], name: str) -> Change:
+    """Test one group of changes where those of other groups are free and the rest is zero."""
+    group = CHANGES[name]
+    values, covariance, explained = estimate.solve([*given, *group])
+    _, _, before = estimate.solve(given)
+    gain = max(explained - before, 0.0)
+    own = slice(len(given), None)
+    return Change(
+        name,
+        tuple(values[own].tolist()),
+        tuple(np.sqrt(np.diag(covariance))[own].tolist()),
+        gain,
+        float(chi2.sf(gain, len(group))),
+        0.0,
+    )
+
+
+def _select(estimate: _Estimate) -> list[Change]:
+    """The changes that the views prove, the most significant first, each given all of them."""
+    chosen: list[str] = []
+    while len(chosen) < len(CHANGES):
+        given = [p for name in chosen for p in CHANGES[name]]
+        rest = [_test(estimate, given, name) for name in CHANGES if name not in chosen]
+        best = min(rest, key=lambda change: change.p_value)
+        if best.p_value >= _FALSE_ALARMS / _TESTS:
+            break
+        chosen.append(best.name)
+    # What a later choice explains better is taken back.
+    while True:
+        others = {
+            name: [p for other in chosen if other != name for p in CHANGES[other]]
+            for name in chosen
+        }
+        found = [_test(estimate, others[name], name) for name in chosen]
+        needless = [change for change in found if change.p_value >= _FALSE_ALARMS / _TESTS]
+        if not needless:
+            return sorted(found, key=lambda change: change.p_value)
+        chosen.remove(max(needless, key=lambda change: change.p_value).name)
+
+
+def _test_shape(
+    setup: Setup, problem: Problem, result: BundleResult, stated_px: float
+) -> ShapeTest:
+    """Test the mean residuals of cells by turning the signs of whole views.
+
+    Without a common pattern, the residuals of a view are as probable as their negatives, whatever the corners of
+    one view have in common.
+    """
+    width, height = setup.image_size
+    cell = np.minimum((problem.observed_px / (width, height) * _CELLS).astype(int), _CELLS - 1)
+    index = cell[:, 1] * _CELLS + cell[:, 0]
+    views, cells = len(setup.views), _CELLS**2
+    inlier = result.huber_weight >= 1.0
+    place = problem.view_of_point * cells + index
+    count = np.bincount(place[inlier], minlength=views * cells).reshape(views, cells)
+    means = np.zeros((views, cells, 2))
+    for axis in range(2):
+        sums = np.bincount(
+            place[inlier], weights=result.residuals_px[inlier, axis], minlength=views * cells
+        )
+        means[:, :, axis] = sums.reshape(views, cells) / np.maximum(count, 1)
+    seen = count > 0
+    enough = seen.sum(axis=0) >= _ENOUGH_VIEWS
+    if not np.any(enough):
+        return ShapeTest(0.0, np.nan, stated_px)
+    means, seen = means[:, enough], seen[:, enough]
+    number = seen.sum(axis=0)[:, None]
+    square = np.sum(means**2, axis=0) / number
+
+    def statistic(signs: Array) -> Array:
+        mean = np.einsum("nv,vcx->ncx", signs, means) / number
+        return np.sum(mean**2 / np.maximum(square, 1e-12) * number, axis=(1, 2))
+
+    rng = np.random.default_rng(0)
+    flips = rng.choice([-1.0, 1.0], size=(_FLIPS, views))
+    observed = float(statistic(np.ones((1, views)))[0])
+    beyond = int(np.sum(statistic(flips) >= observed))
+    noise = (square - np.mean(means, axis=0) ** 2) / np.maximum(number - 1, 1)
+    pattern = (np.sum(means, axis=0) / number) ** 2 - np.maximum(noise, 0.0)
+    rms = float(np.sqrt(max(np.mean(pattern), 0.0)))
+    return ShapeTest(rms, (beyond + 1) / (_FLIPS + 1), stated_px)
+
+
+def _largest_px(model: CalibrationModel, setup: Setup, change: Change) -> float:
+    """Largest displacement in the image that a change makes, without a shift of the whole."""
+    largest = 0.0
+    for g in setup.magnifications:
+        camera = model.at(float(g)).resized(*setup.image_size)
+        x, y = np.meshgrid(
+            np.linspace(0.0, camera.width - 1.0, 9), np.linspace(0.0, camera.height - 1.0, 9)
+        )
+        # Points of the reference plane that are seen all over the image.
+        inverse = np.linalg.inv(camera.ideal_from_sem_jacobian)
+        plane = (np.stack([x.ravel(), y.ravel()], axis=1) - (camera.px, camera.py)) @ inverse.T
+        points = np.column_stack([plane, np.zeros(len(plane))])
+        changed: dict[str, Any] = {}
+        for name, value in zip(CHANGES[change.name], change.values, strict=True):
+            if name == "scale":
+                changed["m"] = camera.m * (1.0 + value)
+            else:
+                changed[name] = getattr(camera, name) + value
+        moved = replace(camera, **changed).project(points) - camera.project(points)
+        moved -= np.nanmean(moved, axis=0)
+        largest = max(largest, float(np.nanmax(np.hypot(*moved.T))))
+    return largest

@@ -1,0 +1,255 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which views to record next, so that nm per pixel becomes more certain.
+
+Each candidate is a visit of a magnification with three views of the grid, of which two are tilted. What it would tell
+about the camera is its Fisher information, with poses, repeatability, height and drift eliminated. The visits
+are chosen one after the other, each the one that lowers the largest 1-sigma of nm per pixel over the range the
+most: greedy experimental design (Fedorov, Theory of Optimal Experiments, 1972, for the G-criterion).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, check_positive
+from semcal_ros.core.calibration.bundle_adjustment import refine
+from semcal_ros.core.calibration.normal_equations import Effects, State, make_problem
+from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors
+from semcal_ros.core.calibration.revision import positive_number
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.calibration_model import (
+    FUNCTION_NAMES,
+    CalibrationModel,
+    design_matrix,
+)
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = ["PLANNED_TILTS_RAD", "PlannedVisit", "ViewPlan", "plan_views"]
+
+#: Tilts of the views of a planned visit: without tilt, and two that a stage of any SEM reaches.
+PLANNED_TILTS_RAD = (0.0, math.radians(20.0), math.radians(40.0))
+# In-plane turns of these views: different ones, so that aspect and skew are seen.
+_TURNS_RAD = (0.2, 1.3, 2.4)
+# Candidates, and magnifications at which the sigma is judged.
+_CANDIDATES, _JUDGED = 15, 25
+# A plan of more visits is a new calibration.
+_MOST_VISITS = 30
+# 1-sigma of a corner per axis, px: a sharp image; what limits a calibration is the visits, not the corners.
+_CORNER_SIGMA_PX = 0.05
+# Squares across the image that a view should show, at least.
+_SQUARES_ACROSS = 8.0
+_MOST_CORNERS_ACROSS = 30
+
+
+@dataclass(frozen=True)
+class PlannedVisit:
+    """A visit to make.
+
+    Attributes
+    ----------
+    magnification
+        The magnification to set.
+    square_m
+        Side of the squares to look at.
+    largest, at
+        Largest relative 1-sigma of nm per pixel in the range after it, and the magnification where that is.
+    """
+
+    magnification: float
+    square_m: float
+    largest: float
+    at: float
+
+
+@dataclass(frozen=True)
+class ViewPlan:
+    """Visits that make nm per pixel more certain.
+
+    Attributes
+    ----------
+    visits
+        The visits, in the order of their use; empty if the target is met.
+    largest, at
+        Largest relative 1-sigma of nm per pixel in the range now, and the magnification where that is.
+    floor
+        What no number of views goes below at any magnification: repeatability, squares, height.
+    reached
+        Whether the target is met at the end.
+    """
+
+    visits: tuple[PlannedVisit, ...]
+    largest: float
+    at: float
+    floor: float
+    reached: bool
+
+
+def plan_views(
+    model: CalibrationModel,
+    target: float,
+    *,
+    squares_m: Sequence[float],
+    most_visits: int = 10,
+) -> ViewPlan:
+    """Choose visits until the relative 1-sigma of nm per pixel is below a target in the whole calibrated range.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    target
+        Relative 1-sigma to reach.
+    squares_m
+        Sides of the squares that the grid has.
+    most_visits
+        End after so many, with the target met or not.
+
+    Raises
+    ------
+    InvalidValueError
+        If a number is out of range, or there are no squares.
+    """
+    check_positive(target, "target =")
+    if not 1 <= most_visits <= _MOST_VISITS:
+        raise InvalidValueError(f"{most_visits} visits", expected=f"1 to {_MOST_VISITS}")
+    if not squares_m or min(squares_m) <= 0.0:
+        raise InvalidValueError(f"squares of {list(squares_m)} m", expected="positive sizes")
+    low, high = model.magnification_range
+    judged = np.geomspace(low, high, _JUDGED) if high > low else np.array([low])
+    candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
+    root = _root(model)
+    rows = np.stack([_pixel_rows(model, float(g)) @ root for g in judged])  # (G, 2, K)
+    fixed = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
+    designs = [_design(model, float(g)) @ root for g in candidates]
+    seen = [_square_for(model.at(float(g)), squares_m) for g in candidates]
+    information = [
+        _visit_information(model, float(g), square)
+        for g, square in zip(candidates, seen, strict=True)
+    ]
+    gains = [d.T @ i @ d for d, i in zip(designs, information, strict=True)]
+    precision = np.eye(root.shape[1])
+
+    def judge(matrix: Array) -> tuple[float, int]:
+        inverse = np.linalg.inv(matrix)
+        own = np.max(np.einsum("gak,kl,gal->ga", rows, inverse, rows), axis=1)
+        total = np.sqrt(own + fixed**2)
+        worst = int(np.argmax(total))
+        return float(total[worst]), worst
+
+    largest, worst = judge(precision)
+    start = worst_pixel_size(model)
+    visits: list[PlannedVisit] = []
+    while largest > target and len(visits) < most_visits:
+        scores = [_mean_variance(precision + gain, rows, fixed) for gain in gains]
+        best = int(np.argmin(scores))
+        precision = precision + gains[best]
+        largest, worst = judge(precision)
+        visits.append(
+            PlannedVisit(float(candidates[best]), seen[best], largest, float(judged[worst]))
+        )
+    return ViewPlan(tuple(visits), *start, float(fixed.max()), largest <= target)
+
+
+def _mean_variance(precision: Array, rows: Array, fixed: Array) -> float:
+    """A smooth form of the largest variance: its eighth-power mean, so that ties have an order."""
+    own = np.max(np.einsum("gak,kl,gal->ga", rows, np.linalg.inv(precision), rows), axis=1)
+    return float(np.mean((own + fixed**2) ** 8) ** 0.125)
+
+
+def _root(model: CalibrationModel) -> Array:
+    """(K, K) the covariance of the coefficients as root root'."""
+    size = sum(model.functions[name].size for name in FUNCTION_NAMES)
+    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
+    return directions * np.sqrt(np.maximum(variances, 0.0))
+
+
+def _design(model: CalibrationModel, g: float) -> Array:
+    return design_matrix(model.functions, g, model.nominal_px_per_m(g))
+
+
+def _pixel_rows(model: CalibrationModel, g: float) -> Array:
+    """(2, K) relative change of the pixel size along x and y per unit of the coefficients."""
+    camera, design = model.at(g), _design(model, g)
+    scale, aspect = design[0] / camera.m, design[1] / camera.aspect
+    return np.stack([-scale - aspect, -scale + aspect])
+
+
+def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:
+    """The largest squares of which enough fit the image, else the smallest."""
+    field = camera.width * camera.pixel_size_m[0]
+    fitting = [size for size in squares_m if field / size >= _SQUARES_ACROSS]
+    return max(fitting) if fitting else min(squares_m)
+
+
+def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Array:
+    """(10, 10) information of a visit on the camera, all that is not the camera eliminated."""
+    camera = replace(model.at(g), residual=None)
+    fit, priors = (model.statistics.get(key) for key in ("fit", "priors"))
+    usual = Priors()
+
+    views, rotations = [], []
+    field = camera.width * camera.pixel_size_m[0]
+    count = min(int(1.5 * field / square_m) + 2, 2 * _MOST_CORNERS_ACROSS)
+    # More corners than these tell no more than a finer spacing of as many would.
+    step = square_m * max(1, math.ceil(1.5 * field / square_m / (2 * _MOST_CORNERS_ACROSS)))
+    index = (np.arange(count) - 0.5 * (count - 1)) * step
+    board = np.stack(np.meshgrid(index, index), axis=-1).reshape(-1, 2)
+    for tilt, turn in zip(PLANNED_TILTS_RAD, _TURNS_RAD, strict=True):
+        rotation = _tilt(tilt) @ _turn(turn)
+        points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T
+        xy = camera.project(points)
+        inside = np.all((xy >= 0.0) & (xy <= (camera.width - 1.0, camera.height - 1.0)), axis=1)
+        sigmas = np.full(int(inside.sum()), _CORNER_SIGMA_PX)
+        views.append(GridView(g, board[inside], xy[inside], sigmas, square_m=square_m))
+        rotations.append(rotation)
+    problem = make_problem(
+        views,
+        np.array([g]),
+        camera.parameters[None, :, None],
+        norm_px=camera.norm_px,
+        nominal_px_per_m=np.array([camera.m]),
+        prior_mean=np.ones(1),
+        prior_sigma=np.full(1, HELD_SIGMA),
+        height_sigma_m=positive_number(priors, "height_sigma_m", usual.height_sigma_m),
+    )
+    y = np.concatenate([v.image_xy[:, 1] for v in views])
+    effects = Effects(
+        np.zeros(len(views), dtype=np.intp),
+        np.zeros(1, dtype=np.intp),
+        max(model.scale_sigma.repeatability, 1e-6),
+        positive_number(fit, "visit_height_sigma_m", usual.visit_height_sigma_m),
+        np.full(len(views), usual.drift_sigma_px),
+        y / camera.height - 0.5,
+    )
+    state = State(np.ones(1), np.stack(rotations), np.zeros((len(views), 3)))
+    result = refine(replace(problem, effects=effects), state, max_iterations=0)
+    return result.information[0, :10, :10]
+
+
+def _tilt(angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def _turn(angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

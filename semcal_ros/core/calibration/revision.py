@@ -1,0 +1,299 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Adjustment of a known calibration to new views of the grid.
+
+The camera of the views is that of the calibration, uncertain by its covariance, plus changes that all
+magnifications share. Poses, visits, drift, the shape of the grid and the stage are adjusted as in a calibration
+(:mod:`~semcal_ros.core.calibration.joint`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.grid_orientation import align_lattices
+from semcal_ros.core.calibration.joint import add_shared_unknowns
+from semcal_ros.core.calibration.line_jitter import estimate_jitter, jitter_covariance
+from semcal_ros.core.calibration.normal_equations import Problem, State
+from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors, Setup
+from semcal_ros.core.calibration.problem import adjust, build_problem, with_shared
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.untilted import mark_untilted
+from semcal_ros.core.calibration.variance_components import (
+    Spread,
+    VarianceComponents,
+    initial_components,
+    update_components,
+)
+from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
+from semcal_ros.core.camera.calibration_model import (
+    FUNCTION_NAMES,
+    CalibrationModel,
+    design_matrix,
+)
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.errors import CalibrationError
+
+__all__ = [
+    "CHANGING",
+    "Revision",
+    "free_sigmas",
+    "make_setup",
+    "positive_number",
+    "revise",
+]
+
+#: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
+#: scale is relative.
+CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+# Prior 1-sigma of a scale that may have changed by anything: no limit in practice.
+_FREE_SCALE = 0.3
+# Updates of the spread of the drift within the images, which is the recording's own.
+_UPDATES = 3
+
+
+@dataclass(frozen=True)
+class Revision:
+    """A calibration that was adjusted to new views.
+
+    Attributes
+    ----------
+    model
+        The calibration before.
+    setup
+        The new views, with the residual field of the calibration taken out.
+    problem, result
+        The adjustment. Its unknowns are a 1, the principal components of the calibration's covariance in sigmas,
+        the height of the grid and the size of its squares, :data:`CHANGING`, and what all views share.
+    covariance
+        (K, K) of the unknowns, with what the jitter of lines adds.
+    """
+
+    model: CalibrationModel
+    setup: Setup
+    problem: Problem
+    result: BundleResult
+    covariance: Array
+
+    @property
+    def components(self) -> slice:
+        """Where the components of the calibration's covariance are among the unknowns."""
+        return slice(1, 1 + sum(self.model.functions[name].size for name in FUNCTION_NAMES))
+
+    @property
+    def changes(self) -> slice:
+        """Where :data:`CHANGING` are among the unknowns."""
+        first = len(self.result.state.theta) - len(self.problem.shared) - len(CHANGING)
+        return slice(first, first + len(CHANGING))
+
+
+def free_sigmas(setup: Setup) -> dict[str, float]:
+    """Prior 1-sigma of changes of any size, by name."""
+    return {name: _FREE_SCALE if name == "scale" else setup.prior_of(name)[1] for name in CHANGING}
+
+
+def make_setup(
+    model: CalibrationModel,
+    views: Sequence[GridView],
+    image_size: tuple[int, int],
+    untilted: str | Sequence[str],
+    axis: StageAxis,
+) -> Setup:
+    """Arrange views in the calibrated range as for a calibration, with the field of the old one taken out.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    views
+        New views; those outside the calibrated range are left out.
+    image_size
+        (width, height) of the images.
+    untilted, axis
+        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+
+    Raises
+    ------
+    CalibrationError
+        If no view lies in the calibrated range.
+    InvalidValueError
+        If an untilted view is named that is not there.
+    """
+    low, high = model.magnification_range
+    inside = [v for v in views if low * (1 - 1e-9) <= v.magnification <= high * (1 + 1e-9)]
+    if not inside:
+        seen = sorted({v.magnification for v in views})
+        raise CalibrationError(
+            f"views at {', '.join(f'{g:g}' for g in seen[:6])}x, outside the calibrated {low:g}x to {high:g}x"
+            if views
+            else "no views of the grid",
+            expected="at least one view of the grid in the calibrated range",
+            do="record the grid at a calibrated magnification",
+        )
+    ordered = sorted(inside, key=lambda v: v.magnification)
+    cameras = {v.magnification: model.at(v.magnification).resized(*image_size) for v in ordered}
+    flat = tuple(
+        replace(v, image_xy=cameras[v.magnification].without_residual(v.image_xy)) for v in ordered
+    )
+    known = model.statistics.get("priors")
+    priors = Priors()
+    if isinstance(known, Mapping) and known.get("is_wide"):
+        priors = priors.of_wide_views(cameras[flat[0].magnification].rho)
+    magnifications = np.unique([v.magnification for v in flat])
+    setup = Setup(flat, magnifications, image_size, model.display_width_m, priors, axis=axis)
+    return add_shared_unknowns(align_lattices(mark_untilted(setup, untilted)))
+
+
+def _spread(model: CalibrationModel, setup: Setup) -> VarianceComponents:
+    """The spread of visits and heights that the calibration found, which a few views cannot tell."""
+    start = initial_components(setup)
+    fit, priors = (model.statistics.get(key) for key in ("fit", "priors"))
+    visit_height = positive_number(fit, "visit_height_sigma_m", start.visit_height.sigma)
+    height = positive_number(priors, "height_sigma_m", setup.priors.height_sigma_m)
+    return replace(
+        start,
+        # A spread of zero would be one that no view can contradict.
+        scale=Spread(max(model.scale_sigma.repeatability, 1e-6), 0.0),
+        visit_height=Spread(visit_height, 0.0),
+        height_sigma_m=np.full(len(setup.views), height),
+    )
+
+
+def positive_number(values: object, key: str, default: float) -> float:
+    """A positive number of the statistics, which are notes that a user may have edited."""
+    value = values.get(key) if isinstance(values, Mapping) else None
+    usable = isinstance(value, (int, float)) and 0.0 < value < np.inf
+    return float(value) if usable and value is not None else default
+
+
+def _camera_designs(model: CalibrationModel, setup: Setup) -> tuple[Array, Array]:
+    """Designs (M, 10, 1 + P + 2) of the camera as calibrated, and the prior 1-sigma of its unknowns.
+
+    The first unknown is 1; the next are the principal components of the calibration's covariance, in sigmas;
+    the last are the height of the grid and the size of its squares.
+    """
+    theta = np.concatenate([model.functions[name].coefficients for name in FUNCTION_NAMES])
+    size = len(theta)
+    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    own = _designs_of_size(model, setup.magnifications, setup.image_size)
+    cameras = own[:, :, :size] @ theta + own[:, :, size]
+    common = np.zeros((*cameras.shape, 2))
+    common[:, 0, 0] = cameras[:, 0] * cameras[:, 5]
+    common[:, 0, 1] = cameras[:, 0]
+    designs = np.concatenate([cameras[:, :, None], own[:, :, :size] @ root, common], axis=2)
+    scale = model.scale_sigma
+    sigma = np.concatenate(
+        [
+            [HELD_SIGMA],
+            np.ones(size),
+            [max(scale.height_m, HELD_SIGMA), max(scale.grid, HELD_SIGMA)],
+        ]
+    )
+    return designs, sigma
+
+
+def _designs_of_size(
+    model: CalibrationModel, magnifications: Array, size: tuple[int, int]
+) -> Array:
+    """(M, 10, K + 1) from the coefficients of a calibration, and 1, to the cameras of images of some size."""
+    s = size[0] / model.image_width
+    shift_y = 0.5 * (size[1] - s * model.image_height)
+    out = []
+    for g in magnifications:
+        design = design_matrix(model.functions, float(g), model.nominal_px_per_m(float(g)))
+        constant = np.zeros(10)
+        for name in ("px", "py", "ex", "ey"):
+            row = PARAMETER_NAMES.index(name)
+            design[row] *= s
+            constant[row] = 0.5 * s - 0.5 + (shift_y if name.endswith("y") else 0.0)
+        design[0] *= s
+        out.append(np.column_stack([design, constant]))
+    return np.stack(out)
+
+
+def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -> Revision:
+    """Adjust a calibration, and all that :func:`make_setup` leaves open, to views.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    setup
+        The views, from :func:`make_setup`.
+    sigmas
+        Prior 1-sigma of each of :data:`CHANGING`.
+
+    Raises
+    ------
+    CalibrationError
+        If the calibration cannot project the views at all.
+    """
+    poses = fit_poses(
+        setup.views,
+        lambda g: replace(model.at(g).resized(*setup.image_size), residual=None),
+        height_sigma_m=_spread(model, setup).height_sigma_m,
+    )
+    spread = _spread(model, setup)
+    problem = _build(model, setup, spread, sigmas)
+    unknowns = problem.designs.shape[2] - len(setup.shared)
+    theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
+    result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
+    for _ in range(_UPDATES if problem.effects is not None else 0):
+        own = update_components(setup, problem, result)
+        spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
+        problem = _build(model, setup, spread, sigmas)
+        result = refine(problem, result.state)
+    freedom = problem.pose_columns * len(setup.views) + len(theta)
+    excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
+    if excess > 0.0:
+        setup = replace(setup, views=tuple(add_excess_noise(setup.views, excess)))
+        problem = _build(model, setup, spread, sigmas)
+        result = refine(problem, result.state)
+    jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
+    return Revision(model, setup, problem, result, result.covariance + jitter)
+
+
+def _build(
+    model: CalibrationModel,
+    setup: Setup,
+    spread: VarianceComponents,
+    sigmas: Mapping[str, float],
+) -> Problem:
+    """Make the adjustment: the camera as calibrated, then :data:`CHANGING`, then what all views share."""
+    problem = build_problem(setup, model.functions, setup.views, spread)
+    designs, sigma = _camera_designs(model, setup)
+    changes = np.zeros((len(designs), 10, len(CHANGING)))
+    for column, name in enumerate(CHANGING):
+        changes[:, FUNCTION_NAMES.index(name), column] = (
+            designs[:, 0, 0] if name == "scale" else 1.0
+        )
+    free = [max(sigmas[name], HELD_SIGMA) for name in CHANGING]
+    cameras = np.concatenate([designs, changes], axis=2)
+    mean = np.append(1.0, np.zeros(cameras.shape[2] - 1))
+    shared = len(problem.shared)
+    own_mean, own_sigma = setup.shared_priors() if shared else (np.zeros(0), np.zeros(0))
+    return replace(
+        problem,
+        designs=with_shared(cameras, shared),
+        prior_mean=np.concatenate([mean, own_mean]),
+        prior_sigma=np.concatenate([sigma, free, own_sigma]),
+    )

@@ -1,0 +1,214 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Renew a calibration with a few views of the grid.
+
+The covariance of the calibration is the prior, and the changes that a check proves are free
+(:mod:`~semcal_ros.core.calibration.check`). What has not changed by that test may have aged a little: its change has
+a prior of the ageing that the user states. The result is the posterior of a linear Gaussian model
+(Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2), so that a second update with
+other views continues from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.check import (
+    CHANGES,
+    CalibrationCheck,
+    Verdict,
+    check_calibration,
+)
+from semcal_ros.core.calibration.revision import (
+    CHANGING,
+    Revision,
+    free_sigmas,
+    make_setup,
+    revise,
+)
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+
+__all__ = ["DEFAULT_AGEING", "CalibrationUpdate", "update_calibration"]
+
+#: 1-sigma of a relative change of the scale since the calibration that the views need not prove: half of the 1 %
+#: that makers promise of the stability of a magnification.
+DEFAULT_AGEING = 5e-3
+# The part of it by which the shape changes: it is made by the ratios of what makes the scale.
+_SHAPE_PART = 0.2
+# More ageing than this is another microscope.
+_MOST_AGEING = 0.1
+
+
+@dataclass(frozen=True)
+class CalibrationUpdate:
+    """Result of :func:`update_calibration`.
+
+    Attributes
+    ----------
+    model
+        The renewed calibration.
+    check
+        What had changed.
+    ageing
+        1-sigma of the change of the scale that was allowed for without proof.
+    rms_px
+        RMS of the residuals of the new views.
+    """
+
+    model: CalibrationModel
+    check: CalibrationCheck
+    ageing: float
+    rms_px: float
+
+
+def update_calibration(
+    model: CalibrationModel,
+    views: Sequence[GridView],
+    *,
+    image_size: tuple[int, int],
+    untilted: str | Sequence[str] = "auto",
+    axis: StageAxis | None = None,
+    ageing: float = DEFAULT_AGEING,
+) -> CalibrationUpdate:
+    """Renew a calibration by views of the grid, of which few are enough for what all magnifications share.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    views
+        New views in the calibrated range.
+    image_size
+        (width, height) of the images.
+    untilted, axis
+        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+    ageing
+        1-sigma of a relative change of the scale since the calibration; that of the other parameters is what
+        displaces the edge of the image by a fifth of that. 0: what has not provably changed stays.
+
+    Raises
+    ------
+    CalibrationError
+        If no view lies in the calibrated range, or the views contradict the calibration: they are of another
+        microscope, or show distortion that it cannot describe.
+    InvalidValueError
+        If the ageing is not from 0 to 0.1.
+    """
+    if not 0.0 <= ageing <= _MOST_AGEING:
+        raise InvalidValueError(f"an ageing of {ageing:g}", expected=f"0 to {_MOST_AGEING:g}")
+    check = check_calibration(model, views, image_size=image_size, untilted=untilted, axis=axis)
+    if check.verdict is Verdict.INVALID:
+        raise CalibrationError(
+            f"views whose scale is {100.0 * check.scale_change:+.1f} % off that of the calibration",
+            expected="the calibrated microscope, grid and display width",
+            do="check --config, --squares and --display-width, else calibrate anew",
+        )
+    if check.shape.significant:
+        raise CalibrationError(
+            f"views with distortion of {check.shape.rms_px:.3f} px RMS that no parameter describes",
+            expected="a change of scale, aspect, skew or distortion",
+            do="calibrate anew",
+        )
+    setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
+    free = free_sigmas(setup)
+    proven = {name for change in check.changes for name in CHANGES[change.name]}
+    # The scale displaces the edge by ageing x half a width; so do xi_r and xi_t there, at a distance of 1. The
+    # centre of the distortion moves by that displacement itself.
+    part = _SHAPE_PART * ageing
+    aged = dict.fromkeys(CHANGING, part) | dict.fromkeys(("ex", "ey"), part * 0.5 * image_size[0])
+    aged["scale"] = ageing
+    sigmas = {name: free[name] if name in proven else aged[name] for name in CHANGING}
+    revision = revise(model, setup, sigmas)
+    rms_px = float(np.sqrt(np.mean(np.sum(revision.result.residuals_px**2, axis=1))))
+    renewed = _apply(revision)
+    log = model.statistics.get("updates", [])
+    entry = {
+        "views": check.views,
+        "rms_px": rms_px,
+        "ageing": ageing,
+        "changed": [change.name for change in check.changes],
+        "scale_change": check.scale_change,
+        "scale_sigma": check.scale_sigma,
+    }
+    statistics = {**model.statistics, "updates": [*(log if isinstance(log, list) else []), entry]}
+    return CalibrationUpdate(replace(renewed, statistics=statistics), check, ageing, rms_px)
+
+
+def _constant(function: ContinuousFunction) -> Array:
+    """Coefficients with which a function is 1 at all magnifications."""
+    grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
+    basis = np.stack([function.basis(float(g)) for g in grid])
+    return np.asarray(np.linalg.lstsq(basis, np.ones(len(grid)), rcond=None)[0], dtype=np.float64)
+
+
+def _steps(revision: Revision) -> tuple[Array, Array]:
+    """Change of the coefficients, (K, K + P), per unit of the components and of :data:`CHANGING`; and (K, K) of the
+    former alone.
+    """
+    model = revision.model
+    functions = [model.functions[name] for name in FUNCTION_NAMES]
+    starts = np.cumsum([0, *(own.size for own in functions)])
+    size = int(starts[-1])
+    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    # Images of another size have their centre at another pixel, in other units.
+    per_px = model.image_width / revision.setup.image_size[0]
+    changes = np.zeros((size, len(CHANGING)))
+    for column, name in enumerate(CHANGING):
+        k = FUNCTION_NAMES.index(name)
+        own = slice(int(starts[k]), int(starts[k + 1]))
+        if name == "scale":
+            changes[own, column] = functions[k].coefficients
+        else:
+            changes[own, column] = _constant(functions[k]) * (
+                per_px if name in ("ex", "ey") else 1.0
+            )
+    return np.concatenate([root, changes], axis=1), root
+
+
+def _apply(revision: Revision) -> CalibrationModel:
+    """The posterior of the coefficients, and of those of the residual field that go with them."""
+    model, theta = revision.model, revision.result.state.theta
+    steps, root = _steps(revision)
+    size = len(root)
+    index = np.r_[revision.components, revision.changes]
+    values = np.concatenate([model.functions[name].coefficients for name in FUNCTION_NAMES])
+    values = values + steps @ theta[index]
+    own = revision.covariance[np.ix_(index, index)]
+    covariance = model.covariance.copy()
+    covariance[:size, :size] = steps @ own @ steps.T
+    if len(covariance) > size:
+        # The views say nothing of the field but through the coefficients that it is correlated with.
+        cross = np.linalg.pinv(root) @ model.covariance[:size, size:]
+        gain = own[:, :size]
+        covariance[:size, size:] = steps @ gain @ cross
+        covariance[size:, :size] = covariance[:size, size:].T
+        left = np.eye(size) - own[:size, :size]
+        covariance[size:, size:] -= cross.T @ left @ cross
+    covariance = 0.5 * (covariance + covariance.T)
+    functions, start = {}, 0
+    for name in FUNCTION_NAMES:
+        function = model.functions[name]
+        functions[name] = replace(function, coefficients=values[start : start + function.size])
+        start += function.size
+    return replace(model, functions=functions, covariance=covariance)

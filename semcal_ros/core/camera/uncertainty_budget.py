@@ -1,0 +1,239 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the uncertainty of nm per pixel, and of a length in an image, consists of.
+
+The parts are independent and add as variances (JCGM 100:2008, "GUM", 5.1.2); the expanded uncertainty has the coverage
+factor 2, which is 95 % for a normal distribution (6.2.1).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, check_positive
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import RectifiedCamera
+from semcal_ros.core.errors import InvalidValueError
+
+__all__ = [
+    "BudgetPart",
+    "UncertaintyBudget",
+    "budget_of_length",
+    "budget_of_pixel_size",
+    "worst_pixel_size",
+]
+
+#: Tilt of a specimen that is mounted flat, 1-sigma: half a degree, as in the priors of a calibration.
+_TILT_SIGMA_RAD = 0.0087
+_COVERAGE = 2.0
+# Magnifications at which the range is judged: four per factor of two over two decades.
+_JUDGED = 25
+# Where a length may lie in the image, as a part of width and height: the worst of these places counts.
+_PLACES = (0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True)
+class BudgetPart:
+    """One source of uncertainty.
+
+    Attributes
+    ----------
+    source
+        What it is.
+    relative
+        Its relative 1-sigma.
+    """
+
+    source: str
+    relative: float
+
+
+@dataclass(frozen=True)
+class UncertaintyBudget:
+    """A quantity and all that makes it uncertain.
+
+    Attributes
+    ----------
+    value_m
+        The quantity, m.
+    parts
+        Its sources of uncertainty, the largest first.
+    """
+
+    value_m: float
+    parts: tuple[BudgetPart, ...]
+
+    @property
+    def relative(self) -> float:
+        """Combined relative 1-sigma."""
+        return math.sqrt(sum(part.relative**2 for part in self.parts))
+
+    @property
+    def sigma_m(self) -> float:
+        """Combined 1-sigma, m."""
+        return self.value_m * self.relative
+
+    @property
+    def coverage(self) -> float:
+        """Coverage factor k of :attr:`expanded_m`."""
+        return _COVERAGE
+
+    @property
+    def expanded_m(self) -> float:
+        """Expanded uncertainty, m."""
+        return _COVERAGE * self.sigma_m
+
+    def share(self, part: BudgetPart) -> float:
+        """Part of the combined variance, 0 to 1."""
+        return part.relative**2 / self.relative**2 if self.relative > 0.0 else 0.0
+
+
+def _budget(value_m: float, parts: dict[str, float]) -> UncertaintyBudget:
+    listed = [BudgetPart(source, relative) for source, relative in parts.items() if relative > 0.0]
+    return UncertaintyBudget(value_m, tuple(sorted(listed, key=lambda part: -part.relative)))
+
+
+def _scale_parts(
+    model: CalibrationModel, magnification: float, height_m: float
+) -> tuple[RectifiedCamera, float, dict[str, float]]:
+    """Camera, pixel size at the height, and the relative parts of its uncertainty."""
+    camera = model.at(magnification)
+    if camera.covariance is None or not math.isfinite(height_m):
+        raise InvalidValueError(f"a height of {height_m} m", expected="a finite one")
+    stretch = 1.0 + camera.rho * height_m
+    if stretch <= 0.0:
+        raise InvalidValueError(
+            f"a height of {1e3 * height_m:g} mm",
+            expected=f"one below the pivot of the scan at {-1e3 / camera.rho:.3g} mm",
+        )
+    rectified, sigma = camera.rectified, model.scale_sigma
+    own = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
+    extra = sigma.relative(camera.rho)
+    beyond = model.extrapolation_sigma(magnification)
+    parts = {
+        "repeatability of the magnification": sigma.repeatability,
+        "squares of the grid": sigma.grid,
+        "height of the specimen": camera.rho * sigma.height_m / stretch,
+        "magnification outside the calibrated range": beyond,
+        "views of the calibration": math.sqrt(max(own**2 - extra**2 - beyond**2, 0.0)),
+        # The cosine of a small tilt differs from 1 by half of its square, of which this is the RMS.
+        "tilt of the specimen": 0.5 * math.sqrt(3.0) * _TILT_SIGMA_RAD**2,
+    }
+    if height_m:
+        rho_sigma = math.sqrt(max(float(camera.covariance[5, 5]), 0.0))
+        parts["distance of the scan pivot"] = abs(height_m) * rho_sigma / stretch
+    return rectified, rectified.pixel_size_m[0] * stretch, parts
+
+
+def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:
+    """Largest relative 1-sigma of nm per pixel in the calibrated range, of the worse axis, and its magnification."""
+    low, high = model.magnification_range
+    # The ends of the range come out of the logarithm with a rounding error.
+    judged = np.clip(np.geomspace(low, high, _JUDGED), low, high)
+    cameras = [model.at(float(g)) for g in judged]
+    sigmas = [
+        max(s / x for s, x in zip(c.pixel_size_sigma_m, c.pixel_size_m, strict=True))
+        for c in cameras
+    ]
+    worst = int(np.argmax(sigmas))
+    return float(sigmas[worst]), float(judged[worst])
+
+
+def budget_of_pixel_size(
+    model: CalibrationModel, magnification: float, *, height_m: float = 0.0
+) -> UncertaintyBudget:
+    """The pixel size of rectified images at a magnification, and what makes it uncertain.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    magnification
+        The magnification.
+    height_m
+        Height of the specimen above the plane of the calibration, towards larger pixels: away from the pole piece.
+
+    Raises
+    ------
+    InvalidValueError
+        As :meth:`.CalibrationModel.at`, or if the height is beyond the pivot of the scan.
+    """
+    _, size_m, parts = _scale_parts(model, magnification, height_m)
+    return _budget(size_m, parts)
+
+
+def budget_of_length(
+    model: CalibrationModel,
+    magnification: float,
+    length_m: float,
+    *,
+    edge_sigma_px: float,
+    height_m: float = 0.0,
+) -> UncertaintyBudget:
+    """A length between two edges in a rectified image, and what makes it uncertain.
+
+    Parameters
+    ----------
+    model, magnification, height_m
+        As for :func:`budget_of_pixel_size`.
+    length_m
+        The length.
+    edge_sigma_px
+        1-sigma of the position of each of both edges, px.
+
+    Raises
+    ------
+    InvalidValueError
+        As there, or if the length does not fit the image.
+    """
+    camera, size_m, parts = _scale_parts(model, magnification, height_m)
+    check_positive(length_m, "length_m =")
+    length_px = length_m / size_m
+    if length_px > max(camera.width, camera.height):
+        raise InvalidValueError(
+            f"a length of {1e6 * length_m:g} um in a field of {1e6 * size_m * camera.width:.4g} um",
+            expected="a length in the image",
+            do="choose a lower magnification",
+        )
+    parts["position of both edges"] = math.sqrt(2.0) * edge_sigma_px / length_px
+    parts["distortion"] = _distortion(camera, length_px)
+    return _budget(length_m, parts)
+
+
+def _distortion(camera: RectifiedCamera, length_px: float) -> float:
+    """Relative 1-sigma of a length beyond that of the pixel size: the worst of places and directions."""
+    covariance = camera.joint_covariance
+    assert covariance is not None
+    worst = 0.0
+    for axis, full in ((0, camera.width), (1, camera.height)):
+        step = np.zeros(2)
+        step[axis] = 0.5 * min(length_px, full - 1.0)
+        own = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
+        for x in _PLACES:
+            for y in _PLACES:
+                middle = np.array([x * camera.width, y * camera.height])
+                # A length that does not fit there is moved to where it does.
+                room = (camera.width, camera.height)
+                middle[axis] = np.clip(middle[axis], step[axis], room[axis] - 1.0 - step[axis])
+                ends: Array = np.stack([middle - step, middle + step])
+                jacobian = camera.project_jacobian(camera.sem_from_ideal(ends))[:, axis]
+                row = (jacobian[1] - jacobian[0]) / (2.0 * step[axis])
+                total = float(row @ covariance @ row)
+                if math.isfinite(total):
+                    worst = max(worst, total - own**2)
+    return math.sqrt(worst)

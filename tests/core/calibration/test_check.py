@@ -1,0 +1,175 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import (
+    CalibrationOptions,
+    CalibrationResult,
+    calibrate_views,
+)
+from semcal_ros.core.calibration.check import CalibrationCheck, Verdict, check_calibration
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import CalibrationError
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.stage import SimulatedStage, stage_views
+
+SEM = preset("jsm820")
+STAGE = SimulatedStage(
+    scale_sigma=1e-3,
+    line_jitter_px=0.05,
+    tilts_rad=(0.0, 0.35, 0.7),
+    tilt_error_rad=0.004,
+    reading_sigma_rad=0.003,
+)
+VISITS = (200.0, 700.0, 2000.0, 6000.0, 2000.0, 700.0, 200.0)
+AXIS = StageAxis(STAGE.axis_rad or 0.0)
+CHECKED = (300.0, 2000.0, 5000.0)
+Camera = Callable[[float], ScanCamera]
+
+
+def simulated(camera_at: Camera, visits: tuple[float, ...], seed: int) -> list[GridView]:
+    return stage_views(camera_at, visits, STAGE, seed=seed, readings=True)
+
+
+def changed(**by: float) -> Camera:
+    """The microscope with other parameters; m is relative."""
+
+    def camera(g: float) -> ScanCamera:
+        own = SEM.camera_at(g)
+        values = {k: getattr(own, k) + v for k, v in by.items() if k != "m"}
+        return replace(own, m=own.m * (1.0 + by.get("m", 0.0)), **values)
+
+    return camera
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> CalibrationResult:
+    views = simulated(SEM.camera_at, VISITS, 1)
+    return calibrate_views(
+        views,
+        image_size=SEM.image_size,
+        display_width_m=SEM.display_width_m,
+        options=CalibrationOptions(axis=AXIS),
+    )
+
+
+def check(calibrated: CalibrationResult, views: list[GridView]) -> CalibrationCheck:
+    return check_calibration(calibrated.model, views, image_size=SEM.image_size, axis=AXIS)
+
+
+def test_what_holds_is_valid_and_no_z_score_is_off(calibrated: CalibrationResult) -> None:
+    checks = [check(calibrated, simulated(SEM.camera_at, CHECKED, 10 + k)) for k in range(4)]
+    assert all(done.verdict is Verdict.VALID for done in checks)
+    # By chance one of 20 tests in 200 is this improbable.
+    assert min(change.p_value for done in checks for change in done.tested) > 5e-4
+    z = [done.scale_change / done.scale_sigma for done in checks]
+    # The calibration's own error is common to all; without it, the scatter would be 0.5 to 1.5.
+    assert np.std(z) < 2.0
+    assert max(np.abs(z)) < 3.5
+
+
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [
+        ("scale", {"m": 0.01}),
+        ("aspect", {"aspect": 0.002}),
+        ("skew", {"skew": -0.002}),
+        ("distortion", {"xi_r": 0.002}),
+        ("centre of distortion", {"ex": 15.0, "ey": -8.0}),
+    ],
+)
+def test_a_change_is_named_with_its_size(
+    calibrated: CalibrationResult, name: str, by: dict[str, float]
+) -> None:
+    done = check(calibrated, simulated(changed(**by), CHECKED, 30))
+    assert done.verdict is Verdict.DEGRADED
+    # Another one beside it would be a chance of one in a hundred.
+    found = done.changes[0]
+    assert found.name == name
+    for value, sigma, true in zip(found.values, found.sigmas, (*by.values(), 0.0), strict=False):
+        assert abs(value - true) < 3.5 * sigma
+        assert sigma < 0.35 * max(by.values(), key=abs) or true == 0.0 or abs(true) > 3 * sigma
+
+
+def test_two_changes_are_both_named(calibrated: CalibrationResult) -> None:
+    done = check(calibrated, simulated(changed(m=0.02, aspect=0.003), CHECKED, 31))
+    assert {change.name for change in done.changes} == {"scale", "aspect"}
+    assert done.scale_change == pytest.approx(0.02, abs=3.5 * done.scale_sigma)
+
+
+def test_another_grid_is_invalid(calibrated: CalibrationResult) -> None:
+    done = check(calibrated, simulated(changed(m=0.25), CHECKED, 32))
+    assert done.verdict is Verdict.INVALID
+
+
+def test_distortion_that_no_parameter_describes(calibrated: CalibrationResult) -> None:
+    """A wave across the image, as of a scan coil that no longer follows."""
+    stage = [
+        replace(
+            view,
+            image_xy=view.image_xy
+            + 0.15 * np.sin(view.image_xy[:, [1]] * 2 * np.pi / 170.0) * [1.0, 0.0],
+        )
+        for visits, seed in ((CHECKED, 40), (CHECKED, 41), (CHECKED, 42))
+        for view in simulated(SEM.camera_at, visits, seed)
+    ]
+    done = check(calibrated, stage)
+    assert done.verdict is Verdict.DEGRADED
+    assert done.shape.significant
+    # 0.15 px amplitude along one axis are 0.075 px RMS per axis; cells are half of a wave high.
+    assert 0.02 < done.shape.rms_px < 0.08
+
+
+def test_one_view_cannot_tell_a_tilt_from_an_aspect(calibrated: CalibrationResult) -> None:
+    (view, *_) = simulated(changed(aspect=0.002), (2000.0,), 33)
+    blind = replace(view, stage=None)
+    done = check_calibration(calibrated.model, [blind], image_size=SEM.image_size, untilted="none")
+    assert done.verdict is Verdict.VALID
+    aspect = next(change for change in done.tested if change.name == "aspect")
+    assert aspect.sigmas[0] > 0.002
+    assert np.isnan(done.shape.p_value)
+
+
+def test_images_of_another_size(calibrated: CalibrationResult) -> None:
+    """The same field with half of the pixels."""
+    views = [
+        replace(
+            view,
+            image_xy=(view.image_xy + 0.5) / 2 - 0.5,
+            sigma_px=view.sigma_px / 2,
+            covariance_px2=None,
+        )
+        for view in simulated(changed(ex=15.0), CHECKED, 34)
+    ]
+    done = check_calibration(calibrated.model, views, image_size=(256, 256))
+    (found,) = done.changes
+    assert found.name == "centre of distortion"
+    assert found.values[0] == pytest.approx(7.5, abs=4 * found.sigmas[0])
+
+
+def test_views_outside_the_range_are_not_judged(calibrated: CalibrationResult) -> None:
+    outside = simulated(SEM.camera_at, (9000.0,), 35)
+    with pytest.raises(CalibrationError, match="9000x, outside the calibrated 200x to 6000x"):
+        check(calibrated, outside)
+    done = check(calibrated, [*outside, *simulated(SEM.camera_at, (2000.0,), 36)])
+    assert (done.views, done.out_of_range) == (3, 3)

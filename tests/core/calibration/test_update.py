@@ -1,0 +1,128 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.update import CalibrationUpdate, update_calibration
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from tests.core.calibration.test_check import (
+    AXIS,
+    CHECKED,
+    SEM,
+    Camera,
+    calibrated,
+    changed,
+    simulated,
+)
+
+__all__ = ["calibrated"]  # the fixture
+
+EVERYWHERE = (250.0, 700.0, 2000.0, 5500.0)
+
+
+def update(
+    calibrated: CalibrationResult, camera: Camera, seed: int, **options: float
+) -> CalibrationUpdate:
+    views = simulated(camera, CHECKED, seed)
+    return update_calibration(
+        calibrated.model, views, image_size=SEM.image_size, axis=AXIS, **options
+    )
+
+
+def deviations(model: CalibrationModel, camera: Camera) -> np.ndarray:
+    """Errors of nm per pixel over their 1-sigma, at all magnifications and along both axes."""
+    out = []
+    for g in EVERYWHERE:
+        ours, true = model.at(g), camera(g)
+        error = np.subtract(ours.pixel_size_m, true.pixel_size_m)
+        out.append(error / ours.pixel_size_sigma_m)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("by", [{"m": 0.005}, {"aspect": 0.002}, {"ex": 15.0}])
+def test_a_few_views_are_enough_for_what_all_magnifications_share(
+    calibrated: CalibrationResult, by: dict[str, float]
+) -> None:
+    camera = changed(**by)
+    done = update(calibrated, camera, 60)
+    assert np.max(np.abs(deviations(done.model, camera))) < 3.0
+    # Nine views at three visits: the repeatability of the visits, and nothing else, is what limits them.
+    sigmas = [max(done.model.at(g).pixel_size_sigma_m) * camera(g).m for g in EVERYWHERE]
+    assert max(sigmas) < 2.5e-3
+    if "ex" in by:
+        before, after, true = (m(2000.0) for m in (calibrated.model.at, done.model.at, camera))
+        assert abs(before.ex - true.ex) > 10.0
+        assert abs(after.ex - true.ex) < 3.0
+    log = done.model.statistics["updates"]
+    assert [entry["views"] for entry in log] == [9]
+
+
+def test_the_stated_uncertainty_after_an_update_is_honest(calibrated: CalibrationResult) -> None:
+    camera = changed(m=-0.004)
+    z = np.concatenate(
+        [deviations(update(calibrated, camera, 80 + k).model, camera) for k in range(4)]
+    )
+    # The calibration's own error of 6000x is common to all four.
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 1.6
+
+
+def test_without_ageing_only_what_has_changed_moves(calibrated: CalibrationResult) -> None:
+    done = update(calibrated, changed(aspect=0.002), 90, ageing=0.0)
+    assert [change.name for change in done.check.changes] == ["aspect"]
+    (aspect,) = done.check.changes[0].values
+    assert aspect == pytest.approx(0.002, abs=3.0 * done.check.changes[0].sigmas[0])
+    for g in EVERYWHERE:
+        before, after = calibrated.model.at(g), done.model.at(g)
+        sigma = np.sqrt(np.diag(before.covariance))
+        moved = np.abs(np.subtract(after.parameters, before.parameters)) / sigma
+        assert np.max(np.delete(moved, 1)) < 3.0
+        error = after.aspect - changed(aspect=0.002)(g).aspect
+        assert abs(error) < 3.0 * np.sqrt(after.covariance[1, 1])
+        # New views make nothing less certain.
+        assert np.all(
+            np.diag(after.covariance)[[0, 2, 6, 7, 8, 9]] <= 1.01 * sigma[[0, 2, 6, 7, 8, 9]] ** 2
+        )
+
+
+def test_a_second_update_continues_from_the_first(calibrated: CalibrationResult) -> None:
+    camera = changed(m=0.005)
+    first = update(calibrated, camera, 60)
+    second = update_calibration(
+        first.model,
+        simulated(camera, CHECKED, 61),
+        image_size=SEM.image_size,
+        axis=AXIS,
+        ageing=0.0,
+    )
+    for g in EVERYWHERE:
+        assert (
+            second.model.at(g).pixel_size_sigma_m[0]
+            < 1.001 * first.model.at(g).pixel_size_sigma_m[0]
+        )
+    assert np.max(np.abs(deviations(second.model, camera))) < 3.0
+    assert len(second.model.statistics["updates"]) == 2
+    # What was added to the first is not changed by the second.
+    assert len(first.model.statistics["updates"]) == 1
+
+
+def test_contradictions_and_impossible_ageing_are_refused(calibrated: CalibrationResult) -> None:
+    with pytest.raises(CalibrationError, match=r"scale is \+2\d\.\d % off .*--squares"):
+        update(calibrated, changed(m=0.25), 62)
+    with pytest.raises(InvalidValueError, match=r"an ageing of 0\.5; expected 0 to 0\.1"):
+        update(calibrated, SEM.camera_at, 62, ageing=0.5)
