@@ -28,6 +28,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["AffineEpipolar", "fit_epipolar"]
 
@@ -90,7 +91,7 @@ def fit_epipolar(
         For fewer than five pairs.
     """
     if len(first) < _LEAST_POINTS:
-        raise StructureError(f"{len(first)} points in two views", expected="at least 5")
+        raise StructureError(f"{counted(len(first), 'point')} in two views", expected="at least 5")
     joint = np.hstack([second, first])
     rng = np.random.default_rng(seed)
     samples = np.argsort(rng.random((trials, len(joint))), axis=1)[:, :4]

@@ -104,7 +104,7 @@ class TrackKeyframe:
     time_s
         Start of its acquisition.
     image
-        (h, w) grey levels.
+        (h, w) grey levels; (0, 0) where the tracker does not keep them.
     camera
         Calibrated camera of its magnification and size.
     ids, xy
@@ -151,6 +151,8 @@ class SequenceTracker:
     ----------
     settings
         Settings of the tracker.
+    keep_images
+        Whether keyframes keep their images, which take memory in proportion to the recording.
 
     Attributes
     ----------
@@ -160,8 +162,11 @@ class SequenceTracker:
         Number of frames taken.
     """
 
-    def __init__(self, settings: TrackerSettings | None = None) -> None:
+    def __init__(
+        self, settings: TrackerSettings | None = None, *, keep_images: bool = True
+    ) -> None:
         self.settings = settings or TrackerSettings()
+        self._keep_images = keep_images
         self.keyframes: list[TrackKeyframe] = []
         self.frames = 0
         self._next_id = 0
@@ -344,7 +349,8 @@ class SequenceTracker:
         motion: Array | None,
     ) -> None:
         self._finish_motions()
-        frame = TrackKeyframe(index, time_s, image.copy(), camera, ids, xy, np.zeros((2, 3)))
+        kept = image.copy() if self._keep_images else np.zeros((0, 0), dtype=image.dtype)
+        frame = TrackKeyframe(index, time_s, kept, camera, ids, xy, np.zeros((2, 3)))
         self.keyframes.append(frame)
         latest = project_to_plane(camera, xy)
         self._reference = _Reference(

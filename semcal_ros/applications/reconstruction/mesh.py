@@ -30,6 +30,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["SurfaceMesh", "triangulate_cloud"]
 
@@ -88,7 +89,7 @@ def triangulate_cloud(
         For fewer than four points or points in one plane.
     """
     if len(points_m) < 4:
-        raise StructureError(f"a mesh of {len(points_m)} points", expected="at least 4")
+        raise StructureError(f"a mesh of {counted(len(points_m), 'point')}", expected="at least 4")
     offset = points_m - centre_m
     directions = offset / np.linalg.norm(offset, axis=1)[:, None]
     try:

@@ -35,6 +35,7 @@ from scipy.optimize import least_squares
 from semcal_ros.applications.reconstruction.factorization import AffineStructure
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["MetricUpgrade", "mirror_structure", "upgrade_to_metric"]
 
@@ -85,7 +86,8 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
     cameras = affine.cameras[placed]
     if len(cameras) < 3:
         raise StructureError(
-            f"{len(cameras)} views", expected="at least 3, since two leave the relief undetermined"
+            counted(len(cameras), "view"),
+            expected="at least 3, since two leave the relief undetermined",
         )
     # Whiten the points, so that Q is near a multiple of the identity and its condition means
     # something.
@@ -98,7 +100,7 @@ def upgrade_to_metric(affine: AffineStructure) -> MetricUpgrade:
     condition = float(values[-1] / values[0])
     if rank < 6 or condition < 1e-7:
         raise StructureError(
-            f"{len(cameras)} views from nearly one direction",
+            f"{counted(len(cameras), 'view')} from nearly one direction",
             expected="views that are rotated about an axis across the beam",
         )
     q = np.zeros((3, 3))

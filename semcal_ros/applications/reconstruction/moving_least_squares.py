@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["LocalSurface", "compute_spacing_m", "fit_local_surface"]
 
@@ -96,7 +97,9 @@ def fit_local_surface(
         For fewer than eight points.
     """
     if len(cloud_m) < _LEAST:
-        raise StructureError(f"a cloud of {len(cloud_m)} points", expected=f"at least {_LEAST}")
+        raise StructureError(
+            f"a cloud of {counted(len(cloud_m), 'point')}", expected=f"at least {_LEAST}"
+        )
     tree = cKDTree(cloud_m)
     at = np.array(at_m, dtype=np.float64)
     surface = _fit_quadrics(cloud_m, tree, at, radius_m)

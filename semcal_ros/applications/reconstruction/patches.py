@@ -23,8 +23,10 @@ texture, and points are found again wherever they are in view.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,10 +41,14 @@ __all__ = [
     "WINDOW",
     "PatchSettings",
     "PosedSurface",
+    "Starmap",
     "compute_displacement_m",
     "measure_patches",
     "project_to_plane_at_centre",
 ]
+
+#: As :func:`itertools.starmap`.
+Starmap = Callable[[Callable[..., Any], Iterable[Sequence[Any]]], Iterator[Any]]
 
 
 def compute_displacement_m(
@@ -71,6 +77,8 @@ WINDOW = 0.6  # sigma of the window in which patches are compared, in half patch
 _GAIN_LEAST = 0.3
 # Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
 _SHADING_POINTS = 100
+# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
+_POINTS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -143,8 +151,12 @@ def measure_patches(
     scan: ScanTiming | None,
     posed: PosedSurface,
     settings: PatchSettings,
+    starmap: Starmap = itertools.starmap,
 ) -> Observations:
-    """Measure every point in every view that faces it and agrees with the template."""
+    """Measure every point in every view that faces it and agrees with the template.
+
+    ``starmap`` compares the patches, some points at a time.
+    """
     size_m = float(np.mean([np.mean(f.camera.pixel_size_m) for f in frames]))
     grid = _make_patch_grid(settings.half_px)
     cuts = [
@@ -169,7 +181,7 @@ def measure_patches(
             everything = np.arange(len(cut.points))
             patches[view, cut.points] -= shading.evaluate(_compute_slopes(cut, everything, grid))
         _normalise(patches, seen)
-        found = _match_patches(patches, seen, settings.half_px)
+        found = _match_patches(patches, seen, settings.half_px, starmap)
         shift += np.where(seen[..., None], np.clip(found.shift, -1.0, 1.0), 0.0)
     assert found is not None
     good = seen & (found.correlation >= settings.least_correlation)
@@ -298,8 +310,15 @@ class _Matched:
     correlation: Array
 
 
-def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
+def _match_patches(patches: Image, seen: Mask, half: int, starmap: Starmap) -> _Matched:
     """Measure the shift of every patch (views, points) against the mean of the others, patch px."""
+    parts = [slice(k, k + _POINTS_AT_ONCE) for k in range(0, patches.shape[1], _POINTS_AT_ONCE)]
+    matched = list(starmap(match_points, ((patches[:, p], seen[:, p], half) for p in parts)))
+    return _Matched(*(np.concatenate(arrays, axis=1) for arrays in zip(*matched, strict=True)))
+
+
+def match_points(patches: Image, seen: Mask, half: int) -> tuple[Array, Array, Array]:
+    """Shift, covariance and correlation of the patches of some points, as in :class:`_Matched`."""
     views, points, _size = patches.shape
     side = 2 * half + 1
     window = np.exp(-0.5 * np.sum(_make_patch_grid(half) ** 2, axis=1) / (WINDOW * half) ** 2)
@@ -330,7 +349,7 @@ def _match_patches(patches: Image, seen: Mask, half: int) -> _Matched:
         covariance[at, point] = variance[:, None, None] * inverse
         own = np.sum(window * stack**2, axis=1)
         correlation[at, point] = both / np.sqrt(power * own)
-    return _Matched(shift, covariance, correlation)
+    return shift, covariance, correlation
 
 
 def _average_template(stack: Array) -> Array:

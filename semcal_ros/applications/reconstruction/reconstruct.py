@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -39,6 +40,7 @@ from semcal_ros.applications.reconstruction.patches import (
     WINDOW,
     PatchSettings,
     PosedSurface,
+    Starmap,
     measure_patches,
     project_to_plane_at_centre,
 )
@@ -47,6 +49,7 @@ from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["Structure", "StructureSettings", "collect_tracks", "mirror_poses", "reconstruct"]
 
@@ -154,6 +157,7 @@ def reconstruct(
     settings: StructureSettings | None = None,
     *,
     on_step: Callable[[str], object] = lambda _: None,
+    starmap: Starmap = itertools.starmap,
 ) -> Structure:
     """Reconstruct points and poses from the keyframes of a :class:`.SequenceTracker`.
 
@@ -167,6 +171,9 @@ def reconstruct(
         Settings of the reconstruction.
     on_step
         Called with the name of every step.
+    starmap
+        As :func:`itertools.starmap`, for the comparison of patches; another one may share the work
+        with other processes.
 
     Raises
     ------
@@ -193,6 +200,7 @@ def reconstruct(
         metric.translations_m[views],
         metric.points_m[points],
         Observations.from_tracks(placed, cameras, 0.3),
+        starmap,
     )
     on_step("adjusting")
     work.adjust_tracks()
@@ -210,7 +218,7 @@ def collect_tracks(
     """Collect the tracks seen in at least ``least`` keyframes, in the plane of the specimen."""
     if len(keyframes) < 3:
         raise StructureError(
-            f"{len(keyframes)} keyframes", expected="at least 3: the specimen hardly turns"
+            counted(len(keyframes), "keyframe"), expected="at least 3: the specimen hardly turns"
         )
     ids = np.concatenate([frame.ids for frame in keyframes])
     names, counts = np.unique(ids, return_counts=True)
@@ -247,7 +255,9 @@ class _Refinement:
         translations: Array,
         points: Array,
         observations: Observations,
+        starmap: Starmap,
     ) -> None:
+        self.starmap = starmap
         self.keyframes, self.cameras, self.scan = keyframes, cameras, scan
         self.settings = settings
         self.rotations, self.translations, self.points = rotations, translations, points
@@ -279,7 +289,7 @@ class _Refinement:
         normals, curvature = self._surface()
         posed = PosedSurface(self.rotations, self.translations, self.points, normals, curvature)
         self.seen = measure_patches(
-            self.keyframes, self.log_greys, self.scan, posed, self.settings.patches
+            self.keyframes, self.log_greys, self.scan, posed, self.settings.patches, self.starmap
         )
         self._prune(self.settings.least_views)
         self._adjust()
@@ -337,7 +347,8 @@ class _Refinement:
     def _keep(self, points: Mask, views: Mask) -> None:
         if np.count_nonzero(points) < 12 or np.count_nonzero(views) < 3:
             raise StructureError(
-                f"{np.count_nonzero(points)} points in {np.count_nonzero(views)} views that agree",
+                f"{counted(np.count_nonzero(points), 'point')} in {counted(np.count_nonzero(views), 'view')} "
+                "that agree",
                 expected="at least 12 points in 3 views",
                 do="record more texture, slower movements or larger turns",
             )

@@ -22,6 +22,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.wording import counted
 
 __all__ = ["SphereFit", "fit_sphere"]
 
@@ -94,7 +95,9 @@ def fit_sphere(
         If fewer than eight points lie on one sphere.
     """
     if len(points_m) < _LEAST:
-        raise StructureError(f"a cloud of {len(points_m)} points", expected=f"at least {_LEAST}")
+        raise StructureError(
+            f"a cloud of {counted(len(points_m), 'point')}", expected=f"at least {_LEAST}"
+        )
     middle = np.median(points_m, axis=0)
     unit = float(np.median(np.linalg.norm(points_m - middle, axis=1)))
     points = (points_m - middle) / unit
@@ -115,7 +118,8 @@ def fit_sphere(
         chosen = np.abs(distance) <= limit
         if np.count_nonzero(chosen) < _LEAST:
             raise StructureError(
-                f"{np.count_nonzero(chosen)} points on one sphere", expected=f"at least {_LEAST}"
+                f"{counted(np.count_nonzero(chosen), 'point')} on one sphere",
+                expected=f"at least {_LEAST}",
             )
         same = np.array_equal(chosen, inliers)
         inliers = chosen
