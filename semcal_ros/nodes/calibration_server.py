@@ -33,12 +33,14 @@ from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fi
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
+from semcal_ros.core.calibration.check import Verdict
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
+from semcal_ros.core.wording import counted
 from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
-from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import calibration_digest, report_scale_warnings
@@ -52,6 +54,7 @@ from semcal_ros.nodes.workers.calibration_worker import (
     without_images,
 )
 from semcal_ros.workflows.calibrate import options_for
+from semcal_ros.workflows.check_and_update import check_found, update_found
 
 __all__ = ["CalibrationServer", "main"]
 
@@ -63,11 +66,15 @@ _PARAMETERS = (
         "Field for what the distortion parameters cannot describe (joint).",
         choices=tuple(RESIDUAL_MODES),
     ),
+    replace(
+        CALIBRATION,
+        description="Calibration that ~/check and ~/update start from, until one is made here.",
+    ),
     OUTPUT,
     ParameterDeclaration("allow_writing", True, "Whether ~/save may write files.", fixed=True),
 )
-# Frames, the report, parameters, views, a calibration, and a call that cancels it.
-_THREADS = 6
+# Frames, the report, parameters, views, a calibration, a call that cancels it, and a check.
+_THREADS = 7
 
 
 @dataclass(frozen=True)
@@ -80,8 +87,8 @@ class _Candidate:
 
 
 class CalibrationServer(StreamNode):
-    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/save, ~/clear; topics ``calibration``,
-    ~/progress, ~/overlay.
+    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/check, ~/update, ~/save, ~/clear; topics
+    ``calibration``, ~/progress, ~/overlay.
 
     ~/calibrate answers when the calibration is done, ~/calibrate_start when it has begun; views can be added meanwhile
     for the next one.
@@ -106,7 +113,7 @@ class CalibrationServer(StreamNode):
         # Before the images, as the magnification.
         self._position = StageInput(self.config.stage, self.endpoints, self.reporter, stream)
         self.receive_frames(self._on_frame, group=stream)
-        quick = MutuallyExclusiveCallbackGroup()
+        quick, compared = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         handlers = (
             ("add_view", self._add_view, quick),
             ("save", self._save, quick),
@@ -115,6 +122,8 @@ class CalibrationServer(StreamNode):
             ("calibrate", self._calibrate, ReentrantCallbackGroup()),
             ("calibrate_start", self._start_calibration, quick),
             ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
+            ("check", self._check, compared),
+            ("update", self._update, compared),
         )
         self._answers = [
             self.endpoints.trigger_service(f"~/{name}", handler, group, self._report_answer)
@@ -215,7 +224,9 @@ class CalibrationServer(StreamNode):
             count = len(self._views)
         self.reporter.count_published(frame.stamp_ns)
         tilt = None if newest.stage is None else newest.stage.tilt_rad
-        text = f"view {count} at {frame.magnification:g}x with {len(detection.xy)} corners"
+        text = (
+            f"view {count} at {frame.magnification:g}x with {counted(len(detection.xy), 'corner')}"
+        )
         text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
         # Who collects views wants to save a calibration, and can still change where.
         return text + (f"; {self._saving}" if count == 1 else "")
@@ -226,7 +237,7 @@ class CalibrationServer(StreamNode):
             self._views.clear()
             self._added = None
             self._position.forget_doubt()
-        return f"{count} views removed"
+        return f"{counted(count, 'view')} removed"
 
     def _calibrate(self) -> str:
         return self._complete(self._begin())
@@ -235,7 +246,7 @@ class CalibrationServer(StreamNode):
         running = self._begin()
         self._beside = threading.Thread(target=self._complete_beside, args=(running,), daemon=True)
         self._beside.start()
-        return f"calibrating from {len(running.job.views)} views; ~/progress shows it, ~/cancel ends it"
+        return f"calibrating from {counted(len(running.job.views), 'view')}; ~/progress shows it, ~/cancel ends it"
 
     def _complete_beside(self, running: CalibrationProcess) -> None:
         """Report, in place of an answer, how a calibration has ended."""
@@ -251,17 +262,23 @@ class CalibrationServer(StreamNode):
                 self.reporter.warn(f"~/calibrate_start: {text}")
 
     def _complete(self, running: CalibrationProcess) -> str:
-        text = ""
+        done = False
         try:
             result = running.run(self.context.ok, lambda stage: self._show(running, stage))
             if result.failed:
                 raise CalibrationError(result.summary)
             calibration = Calibration.loads(result.text, source="the calibration process")
-            text = result.text
+            done = True
         finally:
-            wanted = self._finish(running, done=bool(text))
+            wanted = self._finish(running, done=done)
         if not wanted:
             raise CalibrationError("cancelled")
+        self._adopt(calibration)
+        return result.summary
+
+    def _adopt(self, calibration: Calibration) -> None:
+        """Publish a calibration, and keep it for ~/save."""
+        text = calibration.dumps()
         with self._lock:
             self._calibration = calibration
         message = String()
@@ -269,7 +286,6 @@ class CalibrationServer(StreamNode):
         self._text.publish(message)
         self.reporter.note("calibration_digest", calibration_digest(text))
         self._warnings = report_scale_warnings(self.reporter, calibration)
-        return result.summary
 
     def _begin(self) -> CalibrationProcess:
         self._refuse_rivals()
@@ -315,7 +331,7 @@ class CalibrationServer(StreamNode):
             if self._running is not running:
                 return
             self._stage = stage
-        self._report_progress(f"calibrating from {len(running.job.views)} views")
+        self._report_progress(f"calibrating from {counted(len(running.job.views), 'view')}")
 
     def _cancel(self) -> str:
         with self._lock:
@@ -325,9 +341,43 @@ class CalibrationServer(StreamNode):
         running.cancel()
         job = running.job
         return (
-            f"cancelled the {job.options.method} calibration from {len(job.views)} views"
+            f"cancelled the {job.options.method} calibration from {counted(len(job.views), 'view')}"
             f" after {running.elapsed_s:.1f} s"
         )
+
+    def _compared(self) -> tuple[Calibration, tuple[FoundView, ...]]:
+        """The calibration that is checked or renewed, and the views that say so."""
+        self._refuse_rivals()
+        with self._lock:
+            calibration = self._calibration
+            views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
+            if self._position.doubt:
+                views = tuple(replace(v, stage=None) for v in views)
+        if not views:
+            raise CalibrationError("no usable view yet", do="call ~/add_view first")
+        if calibration is None:
+            path = self.parameters["calibration"]
+            if not path:
+                raise InvalidValueError(
+                    "no calibration to compare with",
+                    expected="the parameter calibration to name a file, or one made here",
+                    do="set it, or call ~/calibrate",
+                )
+            calibration = Calibration.load(self.parameters.allowed_path(path))
+        return calibration, views
+
+    def _check(self) -> str:
+        calibration, views = self._compared()
+        result = check_found(calibration, views, self.config)
+        if result.verdict is not Verdict.VALID:
+            raise CalibrationError(result.summary, do="call ~/update, or calibrate anew")
+        return result.summary
+
+    def _update(self) -> str:
+        calibration, views = self._compared()
+        done = update_found(calibration, views, self.config)
+        self._adopt(Calibration.from_model(done.model))
+        return f"updated; before, it was {done.check.summary}"
 
     def _save(self) -> str:
         if not self.parameters["allow_writing"]:

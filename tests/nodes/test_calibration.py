@@ -67,6 +67,8 @@ def test_there_is_nothing_to_add_calibrate_save_or_cancel_at_first(session: Sess
         ("calibrate", "no usable view"),
         ("save", "no calibration to save"),
         ("cancel", "no calibration is running"),
+        ("check", "no usable view"),
+        ("update", "no usable view"),
     ):
         answer = session.call(service)
         assert not answer.success
@@ -306,15 +308,54 @@ def test_a_file_that_became_a_link_to_elsewhere_is_not_written(
     assert file.is_symlink()
 
 
+def test_a_calibration_is_checked_and_renewed_by_new_views(calibrated: Session) -> None:
+    calibrated.call("clear")
+    for index in (0, 1, VIEWS, VIEWS + 1):
+        calibrated.add_view(index)
+    answer = calibrated.call("check")
+    assert answer.success, answer.message
+    assert answer.message.startswith("valid: nm per px off by ")
+    assert answer.message.endswith("by 4 views")
+    before = len(calibrated.texts)
+    answer = calibrated.call("update")
+    assert answer.success, answer.message
+    calibrated.peer.wait_for(lambda: len(calibrated.texts) > before, "the renewed calibration")
+    renewed = Calibration.loads(calibrated.texts[-1].data)
+    assert [entry["views"] for entry in renewed.statistics["updates"]] == [4]
+    # Said to be at another magnification than they have, views contradict it.
+    calibrated.call("clear")
+    calibrated.show(PLAN.render(VIEWS), 1.3 * PLAN.frames[VIEWS].magnification)
+    assert calibrated.call("add_view").success
+    answer = calibrated.call("check")
+    assert not answer.success
+    assert "invalid (scale" in answer.message
+    assert "calibrate anew" in answer.message
+
+
 def test_too_few_views_are_refused_and_the_calibration_stays(session: Session) -> None:
     before = len(session.texts)
     assert session.call("clear").success
     session.add_view(0)
-    assert session.call("clear").message == "1 views removed"
+    assert session.call("clear").message == "1 view removed"
     session.add_view(0)
     answer = session.call("calibrate")
     assert not answer.success
     assert "expected at least 3 views" in answer.message
+    assert len(session.texts) == before
+
+
+def test_magnifications_in_another_unit_are_refused_with_what_fits(session: Session) -> None:
+    before = len(session.texts)
+    session.call("clear")
+    for index in range(3):
+        g = PLAN.frames[index].magnification * 600.0
+        session.show(PLAN.render(index), g)
+        assert session.call("add_view").success
+    answer = session.call("calibrate")
+    assert not answer.success
+    assert "times the scale" in answer.message
+    assert "--display-width" in answer.message
+    assert "display_width_m and squares_m in a configuration" in answer.message
     assert len(session.texts) == before
 
 

@@ -73,7 +73,7 @@ def test_cancel_ends_it_and_both_calls_say_so(session: Session) -> None:
 
     answer = session.call("cancel")
     assert answer.success
-    assert answer.message.startswith("cancelled the joint calibration from 1 views after ")
+    assert answer.message.startswith("cancelled the joint calibration from 1 view after ")
     session.peer.wait_for(first.done, "the answer of the first call")
     assert (first.result().success, first.result().message) == (False, "cancelled")
     assert not is_alive(worker)
@@ -97,7 +97,7 @@ def test_a_calibration_can_begin_as_soon_as_the_one_before_is_cancelled(session:
 def test_a_calibration_that_is_only_started_can_be_followed_and_cancelled(session: Session) -> None:
     answer = session.call("calibrate_start")
     assert answer.success
-    assert answer.message.startswith("calibrating from 1 views; ")
+    assert answer.message.startswith("calibrating from 1 view; ")
     _held_worker(session)
     assert "a calibration is running" in session.call("calibrate_start").message
     session.peer.wait_for(lambda: session.shown().get("stage") == "start", "the progress")

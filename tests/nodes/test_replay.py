@@ -183,9 +183,9 @@ def test_a_parameter_is_answered_at_any_magnification(replay: Replay) -> None:
     [
         ("p@9000", "within the calibrated range, 500 to 8000"),
         ("p@499", "within the calibrated range"),
-        ("p@-5250", "a positive number"),
-        ("p@nan", "a positive number"),
-        ("p@", "a positive number"),
+        ("p@-5250", "a finite number above 0"),
+        ("p@nan", "a finite number above 0"),
+        ("p@", "a finite number above 0"),
         ("q@5250", "p@<magnification>"),
     ],
 )

@@ -16,13 +16,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 
 from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.core.wording import nearest_name
 from semcal_ros.files.parameter_file import ParameterSection, read_parameter_sections
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 
@@ -31,7 +31,6 @@ __all__ = [
     "HelpWanted",
     "command_line",
     "is_quality",
-    "nearest_name",
     "starting_with",
 ]
 
@@ -141,11 +140,6 @@ def _read_sections(file: str) -> tuple[ParameterSection, ...]:
 def is_quality(name: str) -> bool:
     """Return whether a parameter overrides the quality of service of a topic."""
     return name.startswith(_OF_QOS)
-
-
-def nearest_name(name: str, known: Iterable[str]) -> str:
-    """Return the known name that looks most like a misspelt one; empty if none does."""
-    return next(iter(difflib.get_close_matches(name, list(known), 1)), "")
 
 
 _CURRENT: ContextVar[CommandLine] = ContextVar("command_line", default=CommandLine())  # noqa: B039 - frozen

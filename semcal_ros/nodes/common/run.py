@@ -129,7 +129,17 @@ def _run(factory: Callable[[], Node], line: CommandLine, threads: int) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     finally:
+        _shut_down()
+
+
+def _shut_down() -> None:
+    """Shut the middleware down, which a signal may do at the same moment."""
+    try:
         rclpy.utilities.try_shutdown()
+    except RuntimeError:
+        # It asks whether the middleware is up before it shuts it down, and the signal's thread comes between.
+        if rclpy.utilities.ok():
+            raise
 
 
 @contextmanager

@@ -24,7 +24,12 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
 from semcal_ros.bridge.camera_info import fill_camera_info, fill_raw_camera_info
-from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
+from semcal_ros.bridge.drift import (
+    fill_drift,
+    fill_drift_velocity,
+    rotation_of,
+    rotation_rate_of,
+)
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection
@@ -182,11 +187,21 @@ class DriftOutput:
         pose, twist = self._messages
         # A few matrices per frame, filled only for a subscriber.
         if self._drift.get_subscription_count():
-            fill_drift(pose, drift.estimate.drift_m, drift.estimate.covariance, frame.header)
+            fill_drift(
+                pose,
+                drift.estimate.drift_m,
+                drift.estimate.covariance,
+                frame.header,
+                rotation_of(drift.estimate),
+            )
             self._drift.publish(pose)
         if self._velocity.get_subscription_count():
             fill_drift_velocity(
-                twist, drift.estimate.velocity_m_s, drift.estimate.covariance, frame.header
+                twist,
+                drift.estimate.velocity_m_s,
+                drift.estimate.covariance,
+                frame.header,
+                rotation_rate_of(drift.estimate),
             )
             self._velocity.publish(twist)
         measured = drift.measured

@@ -30,6 +30,7 @@ import numpy as np
 from semcal_ros.core.calibration.calibrate import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.errors import CalibrationError, SemcalError
+from semcal_ros.core.wording import counted
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
 
@@ -49,9 +50,6 @@ _OFTEN_S, _SELDOM_S = 0.2, 1.0
 # A third of the weight of a live node (sched(7)) where both want the same processor: live nodes keep up, and the
 # calibration still advances.
 _NICE = 5
-
-# What numerical code raises on degenerate views.
-_NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
@@ -102,21 +100,14 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
     except SemcalError as error:
         return _refuse(error)
     except MemoryError:
-        what = f"not enough memory for a calibration from {len(job.views)} views"
+        what = f"not enough memory for a calibration from {counted(len(job.views), 'view')}"
         return _refuse(CalibrationError(what, do="use fewer views, or residual off"))
-    except _NUMERIC as error:
-        reason = CalibrationError(
-            f"views that cannot be solved for ({type(error).__name__}: {error})",
-            expected="views of a grid from different directions",
-            do="add tilted views",
-        )
-        return _refuse(reason)
     held_out = [v for v in done.result.held_out_rms_px.values() if np.isfinite(v)]
     worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
     low, high = done.calibration.magnification_range
     summary = (
-        f"{job.options.method} calibration from {len(done.collected.views)} views, {low:g}x to {high:g}x{worst}"
-        f", in {time.monotonic() - started_s:.1f} s"
+        f"{job.options.method} calibration from {counted(len(done.collected.views), 'view')}, "
+        f"{low:g}x to {high:g}x{worst}, in {time.monotonic() - started_s:.1f} s"
     )
     notes = "".join(f"; {warning}" for warning in (*job.notes, *done.result.warnings))
     return JobResult(done.calibration.dumps(), summary + notes)

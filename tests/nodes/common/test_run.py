@@ -38,3 +38,32 @@ def test_an_executor_that_cannot_be_made_any_more_leaves_no_traceback() -> None:
     assert done.stdout.split() == ["0", "0"], done.stderr
     assert done.returncode == 0
     assert "Traceback" not in done.stderr
+
+
+# A signal that comes between the question whether the middleware is up and its end.
+BETWEEN = """
+import rclpy
+from semcal_ros.nodes.common import run
+rclpy.init()
+really = rclpy.utilities.try_shutdown
+def fail():
+    raise RuntimeError("out of order")
+rclpy.utilities.try_shutdown = fail
+try:
+    run._shut_down()
+except RuntimeError as error:
+    print(error)
+def shut_down_late():
+    really()
+    raise RuntimeError("rcl_shutdown already called")
+rclpy.utilities.try_shutdown = shut_down_late
+run._shut_down()
+"""
+
+
+def test_a_signal_that_shuts_down_at_the_same_moment_leaves_no_traceback() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", BETWEEN], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "out of order"
