@@ -270,7 +270,7 @@ def make_nodes(context):
         nodes.append(suite_node(context, "rectifier", "config", "calibration", fixed=stabilized))
     if LaunchConfiguration("calibration_server").perform(context) == "true":
         folder = {"directory": folder_of_calibrations(context)}
-        server = ("calibration_server", "config", "output", "directory")
+        server = ("calibration_server", "config", "calibration", "output", "directory")
         nodes.append(suite_node(context, *server, fallback=folder))
     return nodes
 

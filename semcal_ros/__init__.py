@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from semcal_ros.calibration import Calibration
     from semcal_ros.core.camera.scan_camera import ScanCamera
     from semcal_ros.core.errors import SemcalError
+    from semcal_ros.files.recordings import RecordedFiles
     from semcal_ros.workflows.calibrate import calibrate
+    from semcal_ros.workflows.check_and_update import check, update
+    from semcal_ros.workflows.describe_recording import describe_recording
     from semcal_ros.workflows.measure_cantilever import measure_cantilever
     from semcal_ros.workflows.reconstruct import reconstruct
     from semcal_ros.workflows.rectify import rectify
@@ -32,29 +35,37 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Calibration",
+    "RecordedFiles",
     "ScanCamera",
     "SemcalError",
     "__version__",
     "calibrate",
+    "check",
+    "describe_recording",
     "measure_cantilever",
     "reconstruct",
     "rectify",
     "stack",
     "track_drift",
+    "update",
 ]
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "semcal_ros.calibration",
+    "RecordedFiles": "semcal_ros.files.recordings",
     "ScanCamera": "semcal_ros.core.camera.scan_camera",
     "SemcalError": "semcal_ros.core.errors",
     "calibrate": "semcal_ros.workflows.calibrate",
+    "check": "semcal_ros.workflows.check_and_update",
+    "describe_recording": "semcal_ros.workflows.describe_recording",
     "measure_cantilever": "semcal_ros.workflows.measure_cantilever",
     "reconstruct": "semcal_ros.workflows.reconstruct",
     "rectify": "semcal_ros.workflows.rectify",
     "stack": "semcal_ros.workflows.stack",
     "track_drift": "semcal_ros.workflows.track_drift",
+    "update": "semcal_ros.workflows.check_and_update",
 }
 
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, cast, overload
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.wording import counted
 from semcal_ros.files.calibration_file import (
     format_calibration,
     parse_calibration,
@@ -193,7 +194,7 @@ class Calibration(CalibrationModel):
         facts = dict(self._facts())
         texts = [facts["method"], facts["magnification"], facts["image size"]]
         if "views" in facts:
-            texts.append(f"{facts['views']} views")
+            texts.append(counted(int(facts["views"]), "view"))
         texts += [f"{name} {facts[name]}" for name in ("RMS", "held-out RMS") if name in facts]
         return f"Calibration({', '.join(texts)})"
 

@@ -18,9 +18,11 @@ from __future__ import annotations
 
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = ["CONSTRUCTOR_ERRORS", "read_text_file"]
 
@@ -73,4 +75,13 @@ def read_text_file(
         raise error(f"{path}: not UTF-8 text", expected=expected, do=do) from reason
     except (OSError, ValueError) as reason:  # a name with a null byte is a ValueError
         seen = (isinstance(reason, OSError) and reason.strerror) or reason
+        if isinstance(reason, FileNotFoundError):
+            do = name_similar_file(path) or do
         raise error(f"{path}: {seen}", expected=expected, do=do) from reason
+
+
+def name_similar_file(path: Path) -> str:
+    """Return the question whether a file of a similar name is meant; empty if there is none."""
+    with suppress(OSError, ValueError):
+        return did_you_mean(path.name, (other.name for other in path.absolute().parent.iterdir()))
+    return ""

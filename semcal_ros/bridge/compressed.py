@@ -35,10 +35,12 @@ from semcal_ros.bridge.fields import assign_bytes, require_fields
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.bridge.images import ENCODINGS, image_from_message
 from semcal_ros.core.errors import InvalidValueError, MessageError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = [
     "CODECS",
     "decoded_image",
+    "describe_compressed",
     "fill_compressed",
     "image_from_compressed",
 ]
@@ -66,6 +68,15 @@ def decoded_image(message: Any) -> tuple[NDArray[Any], str]:
 
 
 # -- reading -------------------------------------------------------------------------------------------
+
+
+def describe_compressed(message: Any) -> tuple[tuple[int, int], str]:
+    """(width, height) and encoding of a compressed image without decoding it; raises as
+    :func:`image_from_compressed`.
+    """
+    require_fields(message, ("format", "data"), "sensor_msgs/msg/CompressedImage")
+    header = read_codec_header(_read_bytes(message.data).data)
+    return (header.width, header.height), _agree_on_encoding(str(message.format), header)[0]
 
 
 def image_from_compressed(message: Any) -> tuple[NDArray[Any], str]:
@@ -242,7 +253,11 @@ def fill_compressed(
 
 def _check_carried(codec: str, encoding: str) -> None:
     if codec not in CODECS:
-        raise InvalidValueError(f"codec {codec!r}", expected="one of " + ", ".join(CODECS))
+        raise InvalidValueError(
+            f"codec {codec!r}",
+            expected="one of " + ", ".join(CODECS),
+            do=did_you_mean(codec, CODECS),
+        )
     if encoding not in CODECS[codec]:
         fitting = [name for name, carried in CODECS.items() if encoding in carried]
         raise InvalidValueError(

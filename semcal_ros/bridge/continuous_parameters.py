@@ -84,7 +84,7 @@ def parse_parameter_name(name: str) -> ParameterRequest:
     if not 0.0 < magnification < float("inf"):
         raise InvalidValueError(
             f"magnification {number[:_MAX_SHOWN]!r} in parameter {kind}@",
-            expected="a positive number such as 5250 or 2345.6",
+            expected="a finite number above 0 such as 5250 or 2345.6",
         )
     return ParameterRequest(kind, magnification)
 

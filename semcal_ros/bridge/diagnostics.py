@@ -16,14 +16,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 from semcal_ros.bridge.fields import new_nested
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.arrays import check_positive
 
 __all__ = ["DiagnosticLevel", "DiagnosticSummary", "StreamStatistics", "fill_diagnostic_status"]
 
@@ -61,8 +60,7 @@ class StreamStatistics:
 
     def __init__(self, window_s: float = 5.0, stale_after_s: float = 5.0) -> None:
         for name, value in (("window", window_s), ("stale time", stale_after_s)):
-            if not (math.isfinite(value) and value > 0.0):
-                raise InvalidValueError(f"{name} of {value} s", expected="a positive number")
+            check_positive(value, f"{name} of", "s")
         self._window_s = window_s
         self._stale_after_s = stale_after_s
         self._recent: deque[tuple[float, float | None]] = deque()

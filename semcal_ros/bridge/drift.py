@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,16 @@ from numpy.typing import ArrayLike
 from semcal_ros.bridge.fields import assign_floats
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["UNKNOWN_VARIANCE", "fill_drift", "fill_drift_velocity"]
+__all__ = [
+    "UNKNOWN_VARIANCE",
+    "fill_drift",
+    "fill_drift_velocity",
+    "rotation_of",
+    "rotation_rate_of",
+]
 
 # Standard deviations of 1 km and of 1000 rad.
 UNKNOWN_VARIANCE = 1e6
@@ -41,13 +49,14 @@ def fill_drift(
     drift_m: ArrayLike,
     covariance: ArrayLike,
     header: HeaderMessage,
+    rotation: tuple[float, float] | None = None,
 ) -> None:
     """Set the drift of the specimen in the sem frame.
 
     Parameters
     ----------
     message
-        The message to fill; the orientation becomes the identity.
+        The message to fill.
     drift_m
         (2,) displacement in m: what lay at X is seen at X + drift.
     covariance
@@ -55,6 +64,9 @@ def fill_drift(
         block, m2.
     header
         Header of the image, copied verbatim.
+    rotation
+        Rotation of the image since the first frame, rad from x towards y, and its variance, rad2; None
+        where none was found: the orientation becomes the identity.
 
     Raises
     ------
@@ -68,8 +80,14 @@ def fill_drift(
     pose = message.pose.pose
     pose.position.x, pose.position.y, pose.position.z = x, y, 0.0
     orientation = pose.orientation
-    orientation.x, orientation.y, orientation.z, orientation.w = 0.0, 0.0, 0.0, 1.0
-    assign_floats(message.pose, "covariance", _six_by_six(block))
+    half = 0.0 if rotation is None else 0.5 * rotation[0]
+    orientation.x, orientation.y, orientation.z, orientation.w = (
+        0.0,
+        0.0,
+        math.sin(half),
+        math.cos(half),
+    )
+    assign_floats(message.pose, "covariance", _six_by_six(block, rotation))
 
 
 def fill_drift_velocity(
@@ -77,22 +95,41 @@ def fill_drift_velocity(
     velocity_m_s: ArrayLike,
     covariance: ArrayLike,
     header: HeaderMessage,
+    rotation_rate: tuple[float, float] | None = None,
 ) -> None:
     """Set the velocity of the drift in m/s.
 
-    As :func:`fill_drift`, with the velocity block of a (4, 4) covariance, or a (2, 2) one in m2/s2.
+    As :func:`fill_drift`, with the velocity block of a (4, 4) covariance, or a (2, 2) one in m2/s2, and
+    the rate of the rotation in rad/s with its variance.
     """
     x, y = _pair(velocity_m_s, "drift velocity")
     block = _block(covariance, 2)
     copy_header(message.header, header)
     twist = message.twist.twist
     _set_vector(twist.linear, x, y)
-    _set_vector(twist.angular, 0.0, 0.0)
-    assign_floats(message.twist, "covariance", _six_by_six(block))
+    _set_vector(twist.angular, 0.0, 0.0, 0.0 if rotation_rate is None else rotation_rate[0])
+    assign_floats(message.twist, "covariance", _six_by_six(block, rotation_rate))
 
 
-def _set_vector(vector: Any, x: float, y: float) -> None:
-    vector.x, vector.y, vector.z = x, y, 0.0
+def rotation_of(estimate: DriftEstimate) -> tuple[float, float] | None:
+    """Rotation of a drift and its variance as :func:`fill_drift` takes them; None where none was found."""
+    return _angle_and_variance(estimate, 0)
+
+
+def rotation_rate_of(estimate: DriftEstimate) -> tuple[float, float] | None:
+    """Its rate, for :func:`fill_drift_velocity`."""
+    return _angle_and_variance(estimate, 2)
+
+
+def _angle_and_variance(estimate: DriftEstimate, index: int) -> tuple[float, float] | None:
+    if not np.any(estimate.similarity):
+        return None
+    variance = min(float(estimate.similarity_covariance[index, index]), UNKNOWN_VARIANCE)
+    return float(estimate.similarity[index]), variance
+
+
+def _set_vector(vector: Any, x: float, y: float, z: float = 0.0) -> None:
+    vector.x, vector.y, vector.z = x, y, z
 
 
 def _floats(values: ArrayLike, what: str) -> Array:
@@ -124,7 +161,9 @@ def _block(covariance: ArrayLike, first: int) -> Array:
     return matrix
 
 
-def _six_by_six(block: Array) -> Array:
+def _six_by_six(block: Array, about_z: tuple[float, float] | None) -> Array:
     full = np.diag(np.full(6, UNKNOWN_VARIANCE))
     full[:2, :2] = block
+    if about_z is not None:
+        full[5, 5] = about_z[1]
     return full

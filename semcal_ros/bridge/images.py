@@ -205,7 +205,7 @@ def without_databar(image: NDArray[Any], databar_rows: int) -> NDArray[Any]:
         raise MessageError(
             f"an image of {image.shape[0]} rows with a data bar of {databar_rows} rows",
             expected="a data bar lower than the image",
-            do="correct image.databar_rows in the configuration",
+            do="correct --databar-rows, or image.databar_rows in the configuration",
         )
     return image[: image.shape[0] - databar_rows]
 

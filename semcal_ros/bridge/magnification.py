@@ -136,7 +136,7 @@ def read_magnification(message: Any, config: MicroscopeConfig) -> MagnificationR
     if not (math.isfinite(value_si) and value_si > 0.0):
         raise MessageError(
             f"a {source.quantity.replace('_', ' ')} of {value:g} in field {source.field}",
-            expected="a finite positive number",
+            expected="a finite number above 0",
             do="check the node that publishes it",
         )
     reading = MagnificationReading(value_si, optional_stamp_ns(message), config)

@@ -16,14 +16,21 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import PATH, json_option
-from semcal_ros.cli.output import echo_json
+from semcal_ros.cli.options import HEIGHT, LENGTH, PATH, json_option
+from semcal_ros.cli.output import echo_json, echo_notes, echo_table
+from semcal_ros.core.camera.uncertainty_budget import (
+    UncertaintyBudget,
+    budget_of_length,
+    budget_of_pixel_size,
+)
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.workflows.describe_camera import describe_camera
 
 __all__ = ["command"]
@@ -32,19 +39,110 @@ __all__ = ["command"]
 @click.command("at")
 @click.argument("calibration", type=PATH)
 @click.argument("magnification", type=float)
+@click.option(
+    "--budget", is_flag=True, help="What the uncertainty of nm per pixel consists of, instead."
+)
+@click.option(
+    "--length",
+    type=LENGTH,
+    metavar="LENGTH",
+    help="With --budget: that of a length in the image, such as 10um.",
+)
+@click.option(
+    "--edge-sigma",
+    type=click.FloatRange(min=0.0),
+    default=0.5,
+    show_default=True,
+    metavar="PX",
+    help="With --length: 1-sigma of the position of each of its ends, px.",
+)
+@click.option(
+    "--height",
+    type=HEIGHT,
+    default="0",
+    metavar="LENGTH",
+    help="nm per pixel at this height above the plane of the calibration, away from the pole piece.",
+)
 @json_option
-def command(calibration: Path, magnification: float, as_json: bool) -> None:
+def command(
+    calibration: Path,
+    magnification: float,
+    budget: bool,
+    length: float | None,
+    edge_sigma: float,
+    height: float,
+    as_json: bool,
+) -> None:
     """Camera of CALIBRATION at MAGNIFICATION: K, P, distortion, nm per pixel, with uncertainty.
 
     \b
     Example:
       semcal at cal.yaml 5250 --json
+      semcal at cal.yaml 5250 --budget --length 10um
     """
-    described = describe_camera(Calibration.load(calibration), magnification)
+    model = Calibration.load(calibration)
+    if not budget and length is not None:
+        raise InvalidValueError("--length without --budget", expected="both, or neither")
+    if budget or height:
+        found = (
+            budget_of_pixel_size(model, magnification, height_m=height)
+            if length is None
+            else budget_of_length(
+                model, magnification, length, edge_sigma_px=edge_sigma, height_m=height
+            )
+        )
+        _echo_budget(found, of_length=length is not None, as_json=as_json)
+        if model.scale_sigma.grid == 0.0:
+            echo_notes(
+                [
+                    "the squares of the grid count as exact: the calibration was not told their certificate "
+                    "(--squares-sigma of calibrate)"
+                ]
+            )
+        return
+    described = describe_camera(model, magnification)
     if as_json:
         echo_json(described)
     else:
         _echo_camera(described)
+
+
+def _echo_budget(budget: UncertaintyBudget, *, of_length: bool, as_json: bool) -> None:
+    if as_json:
+        parts = [
+            {"source": p.source, "relative": p.relative, "share": budget.share(p)}
+            for p in budget.parts
+        ]
+        echo_json(
+            {
+                "value_m": budget.value_m,
+                "sigma_m": budget.sigma_m,
+                "expanded_m": budget.expanded_m,
+                "coverage": budget.coverage,
+                "parts": parts,
+            }
+        )
+        return
+    echo_table(
+        ["source of uncertainty", "%", "nm", "share %"],
+        [
+            [
+                part.source,
+                f"{100.0 * part.relative:.4f}",
+                f"{1e9 * budget.value_m * part.relative:.4g}",
+                f"{100.0 * budget.share(part):.1f}",
+            ]
+            for part in budget.parts
+        ],
+    )
+    value, sigma, expanded = (1e9 * v for v in (budget.value_m, budget.sigma_m, budget.expanded_m))
+    digits = min(max(1 - math.floor(math.log10(expanded)), 0), 6)
+    what = "length" if of_length else "nm per px"
+    unit = " nm" if of_length else ""
+    click.echo(
+        f"{what} {value:.{digits}f}{unit}, standard uncertainty {sigma:.{digits}f}, "
+        f"expanded {expanded:.{digits}f} (k = {budget.coverage:g}): {200.0 * budget.relative:.3f} %"
+    )
 
 
 def _format_matrix(name: str, values: Any) -> str:

@@ -23,16 +23,11 @@ from typing import Any
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import (
-    PATH,
-    check_outputs,
-    config_option,
-    magnification_option,
-    output_option,
-    parse_length,
-    recording_argument,
-)
-from semcal_ros.cli.output import echo_notes, echo_table, show_progress
+from semcal_ros.cli.grid_options import grid_options
+from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_option
+from semcal_ros.cli.output import echo_certainty, echo_notes, echo_table, show_progress
+from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.calibrate import (
     METHODS,
     RESIDUAL_MODES,
@@ -40,7 +35,10 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
 )
 from semcal_ros.core.calibration.pda import focal_length_and_skew, prime
-from semcal_ros.core.calibration.untilted import UNTILTED_MODES
+from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.corners import PATTERN_NAMES
+from semcal_ros.core.wording import counted, group_by_kind, omit_numbers
+from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
 
 __all__ = ["command"]
@@ -55,14 +53,6 @@ def _parse_magnifications(
         raise click.BadParameter(f"{text!r} is not a list such as 1000,5000") from None
 
 
-def _parse_untilted(
-    _context: click.Context, _parameter: click.Parameter, text: str
-) -> str | tuple[str, ...]:
-    if text in UNTILTED_MODES:
-        return text
-    return tuple(part.strip() for part in text.split(",") if part.strip())
-
-
 def _parse_step(
     _context: click.Context, _parameter: click.Parameter, text: str | None
 ) -> float | str | None:
@@ -74,11 +64,14 @@ def _parse_step(
         raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
 
 
+# Rejected views that are named for each kind of reason; the report shows all.
+_MOST_NAMED = 5
+
+
 @click.command("calibrate")
-@recording_argument
+@recording_input
 @output_option("Calibration file.")
-@config_option
-@magnification_option
+@grid_options
 @click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
 @click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
 @click.option(
@@ -109,32 +102,26 @@ def _parse_step(
     "--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a statistical test."
 )
 @click.option(
-    "--untilted",
-    callback=_parse_untilted,
-    default="auto",
-    show_default=True,
-    metavar="auto|none|N,N,...",
-    help="joint: frames without tilt, by number or by file name, if no stage says the tilts.",
-)
-@click.option(
     "--squares-sigma",
     type=click.FloatRange(0.0, 0.1),
     help="Relative 1-sigma of the grid's squares, such as 0.001, instead of that of the configuration.",
 )
 @click.option(
     "--height-sigma",
-    callback=parse_length,
+    type=LENGTH_OR_ZERO,
     default=f"{CalibrationOptions.height_sigma_m * 1e6:g}um",
     show_default=True,
     metavar="LENGTH",
     help="1-sigma of the height of what is measured later above or below the untilted grid.",
 )
 @click.option("--report", type=PATH, help="Also write an HTML report.")
+@dask_option
 def command(
-    recording: Path,
+    recording: RecordedFiles,
     output: Path,
-    config: str,
-    magnification: float | None,
+    config: MicroscopeConfig,
+    squares: tuple[float, ...] | None,
+    pattern: str,
     method: str,
     pda_order: int,
     legendre: int | None,
@@ -146,8 +133,9 @@ def command(
     height_sigma: float,
     tau: float | None,
     report: Path | None,
+    dask: str | None,
 ) -> None:
-    """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files or ordinary images, of the chess grid.
+    """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files or ordinary images, of the grid.
 
     \b
     Example:
@@ -161,7 +149,7 @@ def command(
             recording,
             config=config,
             squares_sigma=squares_sigma,
-            magnification=magnification,
+            squares_m=squares,
             options=CalibrationOptions(
                 method,
                 MethodOptions(pda_order, legendre, tau, pda_step),
@@ -170,17 +158,22 @@ def command(
                 untilted,
                 height_sigma_m=height_sigma,
             ),
+            pattern=pattern,
+            keep_images=report is not None,
+            dask=dask,
             on_progress=on_progress,
         )
     done.calibration.save(output)
     _echo_result(done)
     click.echo(f"calibration: {output}")
     if report is not None:
-        _write_report(done, report, f"Calibration from {recording.absolute().name}")
+        with show_progress("writing the report"):
+            _write_report(done, report, f"Calibration from {recording.name}")
         click.echo(f"report: {report}")
 
 
 def _echo_result(done: RecordingCalibration) -> None:
+    echo_certainty(done.calibration)
     statistics, method = done.calibration.statistics, done.calibration.method
     rejected = done.collected.rejected
     total = statistics["views"] + len(rejected)
@@ -200,8 +193,11 @@ def _echo_result(done: RecordingCalibration) -> None:
     )
     if statistics["held_out_rms_px"] is not None:
         click.echo("held out: calibrated without that magnification; * is extrapolated")
+    patterns = sorted({PATTERN_NAMES[view.detection.pattern] for view in done.collected.found})
+    if patterns:
+        click.echo(f"the grid: {' and '.join(patterns)}")
     click.echo(
-        f"{statistics['views']} of {total} views, {statistics['corners']} corners, "
+        f"{statistics['views']} of {counted(total, 'view')}, {counted(statistics['corners'], 'corner')}, "
         f"method {method}: RMS {statistics['rms_px']:.4f} px"
         + (
             f", held out {statistics['held_out_rms_px']:.4f} px"
@@ -216,14 +212,25 @@ def _echo_result(done: RecordingCalibration) -> None:
     told = sum(view.stage is not None for view in done.result.views)
     if told:
         unused = "" if method == "joint" else f", but method {method} does not use it"
-        click.echo(f"the stage is known for {told} of {statistics['views']} views{unused}")
-    for view in rejected[:10]:
-        click.echo(f"rejected: {view.name} at {view.magnification:g}: {view.reason}", err=True)
-    if len(rejected) > 10:
-        click.echo(f"rejected: {len(rejected) - 10} more, see the report", err=True)
+        click.echo(
+            f"the stage is known for {told} of {counted(statistics['views'], 'view')}{unused}"
+        )
+    _echo_rejected(rejected)
     echo_notes(done.notes)
-    for warning in done.result.warnings:
+    for warning in group_by_kind(done.result.warnings):
         click.echo(f"warning: {warning}", err=True)
+
+
+def _echo_rejected(rejected: Sequence[RejectedView]) -> None:
+    """Print each kind of reason once, with the views that have it."""
+    kinds: dict[str, list[RejectedView]] = {}
+    for view in rejected:
+        kinds.setdefault(omit_numbers(view.reason), []).append(view)
+    for views in kinds.values():
+        names = [f"{view.name} at {view.magnification:g}" for view in views[:_MOST_NAMED]]
+        if len(views) > _MOST_NAMED:
+            names.append(f"{len(views) - _MOST_NAMED} more")
+        click.echo(f"rejected: {', '.join(names)}: {views[0].reason}", err=True)
 
 
 def _echo_steps(fit: dict[str, Any]) -> None:

@@ -24,6 +24,7 @@ import click
 from semcal_ros.bridge.names import absolute_namespace
 from semcal_ros.cli.options import PATH, config_option
 from semcal_ros.cli.output import echo_json
+from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import Finding, Severity
 from semcal_ros.doctor.legend import explain_figures
@@ -81,7 +82,7 @@ def command(
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})
     else:
-        click.echo(", ".join(f"{count} {name}" for name, count in _count_levels(found).items()))
+        click.echo(_sum_up(_count_levels(found)))
         # Who looks for help reads the first lines.
         for finding in sorted(found, key=lambda finding: _ORDER.index(finding.level)):
             click.echo(f"{finding.level.value:<8} {finding}")
@@ -98,6 +99,10 @@ def _count_levels(found: list[Finding]) -> dict[str, int]:
         "notes": levels.count(Severity.NOTE),
         "ok": levels.count(Severity.OK),
     }
+
+
+def _sum_up(levels: dict[str, int]) -> str:
+    return f"{counted(levels['problems'], 'problem')}, {counted(levels['notes'], 'note')}, {levels['ok']} ok"
 
 
 def _as_dict(finding: Finding) -> dict[str, str]:

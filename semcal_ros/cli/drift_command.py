@@ -20,15 +20,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import (
-    FIGURE_SUFFIXES,
-    PATH,
-    calibration_option,
-    check_outputs,
-    output_option,
-    recording_argument,
-    recording_options,
-)
+from semcal_ros.cli.options import FIGURE_SUFFIXES, PATH, calibration_option, output_option
 from semcal_ros.cli.output import (
     echo_nominal_unit,
     echo_notes,
@@ -36,35 +28,52 @@ from semcal_ros.cli.output import (
     echo_states,
     show_progress,
 )
+from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.files.tables import TABLE_SUFFIXES
+from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
+from semcal_ros.workflows.drift_video import write_drift_video
 from semcal_ros.workflows.track_drift import describe_forecast, describe_rate, track_drift
 
 __all__ = ["command"]
 
 
 @click.command("drift")
-@recording_argument
-@output_option("CSV file.")
+@recording_input
+@output_option("Table: .csv, .parquet or .xlsx.")
 @calibration_option("Work in rectified coordinates.")
 @click.option("--plot", type=PATH, help="Also draw a figure: .png, .svg or .pdf.")
 @click.option(
+    "--video", type=PATH, help="Frames as recorded, and in place beside them: .mp4 or .avi."
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(*FPS_RANGE),
+    default=10.0,
+    show_default=True,
+    help="Frames per second of the video.",
+)
+@click.option(
     "--forecast",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=click.FloatRange(min=0.0, min_open=True, max=1e6),
     metavar="S",
     help="Also forecast the drift this long after the last frame.",
 )
 @click.option(
     "--live", is_flag=True, help="Drift as known live, without hindsight from later frames."
 )
-@recording_options
 def command(
-    recording: Path,
+    recording: RecordedFiles,
     output: Path,
     calibration: Path | None,
     plot: Path | None,
+    video: Path | None,
+    fps: float,
     forecast: float | None,
     live: bool,
-    config: str,
-    frame_time: float | None,
+    config: MicroscopeConfig,
 ) -> None:
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
 
@@ -75,22 +84,36 @@ def command(
     Example:
       semcal drift recordings/gold --calibration cal.yaml -o drift.csv --plot drift.png
     """
-    check_outputs([("-o", output, ()), ("--plot", plot, FIGURE_SUFFIXES)])
+    outputs = (
+        ("-o", output, TABLE_SUFFIXES),
+        ("--plot", plot, FIGURE_SUFFIXES),
+        ("--video", video, tuple(VIDEO_CODECS)),
+    )
+    check_outputs(outputs, recording=recording)
     with show_progress() as on_progress:
         track = track_drift(
             recording,
             calibration=calibration,
             config=config,
-            frame_time_s=frame_time,
             live=live,
             on_progress=on_progress,
         )
-    track.save_csv(output)
+        if video is not None:
+            write_drift_video(
+                recording,
+                track,
+                video,
+                calibration=calibration,
+                fps=fps,
+                on_progress=on_progress,
+            )
+    track.save(output)
     if plot is not None:
         # Imported here, so that a run without a plot does not wait for matplotlib.
         from semcal_ros.report.drift_figures import write_drift_figure
 
-        write_drift_figure(track.path, plot)
+        with show_progress("drawing"):
+            write_drift_figure(track.path, plot)
     echo_notes(track.notes)
     if calibration is None:
         echo_nominal_unit(
@@ -98,8 +121,15 @@ def command(
             "drift is in raw pixels, scaled by the nominal pixel size",
         )
     echo_states(track.states)
-    if len(track) > 1:
+    if track.path.followed:
         click.echo(describe_rate(track.path))
-    if forecast is not None:
-        click.echo(describe_forecast(track.forecast(forecast), forecast))
-    echo_paths({"drift": output, "plot": plot})
+        if forecast is not None:
+            click.echo(describe_forecast(track.forecast(forecast), forecast))
+    echo_paths({"drift": output, "plot": plot, "video": video})
+    if len(track) > 1 and not track.path.followed:
+        click.echo(
+            f"warning: none of {counted(len(track), 'frame')} was tracked: the drift is not known, "
+            "and its sigma in the table is infinite",
+            err=True,
+        )
+        raise click.exceptions.Exit(1)

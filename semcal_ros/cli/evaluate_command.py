@@ -21,14 +21,13 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import (
-    PATH,
-    config_option,
-    json_option,
-    magnification_option,
-    recording_argument,
-)
+from semcal_ros.cli.options import PATH, dask_option, json_option
 from semcal_ros.cli.output import echo_json, echo_table, show_progress
+from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.corners import PATTERNS
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.evaluate import evaluate
 
 __all__ = ["command"]
@@ -36,12 +35,23 @@ __all__ = ["command"]
 
 @click.command("evaluate")
 @click.argument("calibration", type=PATH)
-@recording_argument
-@config_option
-@magnification_option
+@recording_input
+@click.option(
+    "--pattern",
+    type=click.Choice(PATTERNS),
+    default="auto",
+    show_default=True,
+    help="What the grid consists of: chess squares, dots or holes, or crossed lines.",
+)
+@dask_option
 @json_option
 def command(
-    calibration: Path, recording: Path, config: str, magnification: float | None, as_json: bool
+    calibration: Path,
+    recording: RecordedFiles,
+    config: MicroscopeConfig,
+    pattern: str,
+    dask: str | None,
+    as_json: bool,
 ) -> None:
     """Reprojection RMS of CALIBRATION on a grid RECORDING that it was not made from.
 
@@ -57,7 +67,8 @@ def command(
             calibration,
             recording,
             config=config,
-            magnification=magnification,
+            pattern=pattern,
+            dask=dask,
             on_progress=on_progress,
         )
     if as_json:
@@ -80,5 +91,5 @@ def command(
         ],
     )
     click.echo(
-        f"{result.views} of {result.views + result.rejected} views, RMS {result.rms_px:.4f} px"
+        f"{result.views} of {counted(result.views + result.rejected, 'view')}, RMS {result.rms_px:.4f} px"
     )

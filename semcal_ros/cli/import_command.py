@@ -20,44 +20,40 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, config_option, overwrite_option
+from semcal_ros.cli.options import PATH, overwrite_option
 from semcal_ros.cli.output import show_progress
-from semcal_ros.files.tiff.to_bag import import_folder
-from semcal_ros.workflows.inputs import count_frames, resolve_config
+from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.files.images.to_bag import import_images
+from semcal_ros.files.recordings import RecordedFiles
 
 __all__ = ["command"]
 
 
 @click.command("import")
-@click.argument("folder", type=PATH)
+@recording_input
 @click.argument("output", type=PATH)
-@click.option(
-    "--databar-rows",
-    type=click.IntRange(0),
-    help="Rows of text at the bottom, if the metadata do not say (Zeiss).",
-)
-@config_option
 @overwrite_option
 def command(
-    folder: Path, output: Path, databar_rows: int | None, config: str, overwrite: bool
+    recording: RecordedFiles, config: MicroscopeConfig, output: Path, overwrite: bool
 ) -> None:
-    """Make the bag OUTPUT from the SEM TIFF files in FOLDER (Zeiss, Thermo Fisher, TESCAN, JEOL).
+    """Make the bag OUTPUT from image files.
 
-    Pixel size, databar, working distance and scan rotation come from each file's metadata. Magnifications refer to the
-    display width of the configuration, so that every pixel size is kept exactly.
+    They may be those of an SEM (Zeiss, Thermo Fisher, TESCAN, JEOL, Hitachi, Phenom) or any others. Pixel size,
+    databar, working distance and scan rotation come from the metadata of each file, or from the options.
+    Magnifications refer to the display width of the configuration, so that every pixel size is kept exactly.
 
     \b
     Example:
       semcal import tiffs/ recordings/from_tiff
     """
     with show_progress() as on_progress:
-        done = import_folder(
-            folder,
+        done = import_images(
+            recording,
             output,
-            config=resolve_config(config),
-            databar_rows=databar_rows,
+            config=config,
             overwrite=overwrite,
-            on_progress=count_frames(on_progress, "importing", None),
+            on_progress=lambda done, total: on_progress("importing", done, total),
         )
     for line in done.lines():
         click.echo(line)

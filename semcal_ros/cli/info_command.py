@@ -16,36 +16,173 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import click
 
-from semcal_ros.cli.options import config_option, recording_argument
-from semcal_ros.cli.output import echo_notes, echo_table, show_progress
-from semcal_ros.workflows.describe_recording import describe_recording
+from semcal_ros.cli.options import json_option
+from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
+from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.workflows.describe_recording import (
+    GreyLevels,
+    Intervals,
+    RecordingSummary,
+    describe_recording,
+)
 
 __all__ = ["command"]
 
 
+def _format_time(time_s: float) -> str:
+    """A time in the unit that suits it."""
+    for unit, scale in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
+        if abs(time_s) * scale >= 1.0:
+            return f"{time_s * scale:.4g} {unit}"
+    return f"{time_s * 1e9:.4g} ns" if time_s else "0 s"
+
+
+# A sweep has as many magnifications as frames: of more than this, the middle ones are left out.
+_MOST_ROWS = 24
+_CONDITIONS: Mapping[str, tuple[str, Callable[[float], str]]] = {
+    "maker": ("maker", str),
+    "model": ("model", str),
+    "serial_number": ("serial number", str),
+    "beam": ("beam", str),
+    "detector": ("detector", str),
+    "acceleration_voltage_v": ("voltage", lambda v: f"{1e-3 * v:g} kV"),
+    "working_distance_m": ("working distance", lambda v: f"{1e3 * v:.4g} mm"),
+    "dwell_s": ("dwell", _format_time),
+    "frame_time_s": ("frame time", _format_time),
+    "frame_interval_s": ("frame interval", _format_time),
+    "scan_rotation_rad": ("scan rotation", lambda v: f"{math.degrees(v):.4g} deg"),
+    "stage_tilt_rad": ("stage tilt", lambda v: f"{math.degrees(v):.4g} deg"),
+    "stage_rotation_rad": ("stage rotation", lambda v: f"{math.degrees(v):.4g} deg"),
+}
+
+
 @click.command("info")
-@recording_argument
-@config_option
-def command(recording: Path, config: str) -> None:
-    """What RECORDING contains: topics, frames, sizes, magnifications.
+@recording_input
+@json_option
+def command(recording: RecordedFiles, config: MicroscopeConfig, as_json: bool) -> None:
+    """What RECORDING contains: frames, scale, times, grey levels, and how it was taken.
 
     \b
     Example:
       semcal info recordings/grid
+      semcal info 'scan_*.tif' --json
     """
     with show_progress() as on_progress:
         found = describe_recording(recording, config=config, on_progress=on_progress)
+    if as_json:
+        echo_json(found.summary())
+        return
     if found.topics:
         echo_table(
             ["topic", "type", "messages"], [[t.name, t.type, str(t.count)] for t in found.topics]
         )
-    click.echo(f"{found.frame_count} frames over {found.duration_s:.3f} s")
+    _echo_frames(found)
+    _echo_settings(found)
+    if found.intervals is not None:
+        _echo_intervals(found.intervals)
+    _echo_pixels(found)
+    for name, values in found.conditions.items():
+        label, show = _CONDITIONS[name]
+        click.echo(f"{label}: {_format_values(values, show)}")
+    echo_notes(found.notes)
+
+
+def _echo_frames(found: RecordingSummary) -> None:
+    size = "" if found.file_bytes is None else f", {_format_bytes(found.file_bytes)}"
+    click.echo(f"{counted(found.frame_count, 'frame')} over {found.duration_s:.3f} s{size}")
     for kind, count in found.kinds.items():
         click.echo(f"  {count} x {kind}")
-    low, high = found.magnifications[0], found.magnifications[-1]
-    click.echo(f"{len(found.magnifications)} magnifications, {low:g} to {high:g}")
-    echo_notes(found.notes)
+    if found.first_time is None:
+        click.echo("dates: none (the stamps are not those of a calendar)")
+    else:
+        click.echo(f"dates: {found.first_time} to {found.last_time}")
+
+
+def _echo_settings(found: RecordingSummary) -> None:
+    rows = [
+        [
+            f"{s.magnification:.6g}",
+            f"{1e6 * s.field_width_m:.5g}",
+            f"{1e9 * s.pixel_size_m:.5g}",
+            str(s.frames),
+            str(s.visits),
+        ]
+        for s in found.settings
+    ]
+    if len(rows) > _MOST_ROWS:
+        kept = _MOST_ROWS // 2
+        rows = [*rows[:kept], ["..."] * len(rows[0]), *rows[-kept:]]
+    if rows:
+        echo_table(["magnification", "field um", "nm per px", "frames", "visits"], rows)
+    if len(rows) > 1:
+        low, high = found.magnifications[0], found.magnifications[-1]
+        number = counted(len(found.settings), "magnification")
+        click.echo(f"{number}, {low:g} to {high:g}")
+    click.echo(f"scale: {found.scale_source}")
+
+
+def _echo_intervals(times: Intervals) -> None:
+    click.echo(
+        f"interval: median {_format_time(times.median_s)}, {_format_time(times.least_s)} to "
+        f"{_format_time(times.greatest_s)}{'' if times.regular else ' (not regular)'}"
+    )
+    if times.gaps:
+        click.echo(f"gaps: {times.gaps}, as if {counted(times.missing, 'frame')} were missing")
+    if times.equal_stamps:
+        click.echo(f"equal stamps: {counted(times.equal_stamps, 'frame')}")
+    if times.backwards:
+        click.echo(f"time runs backwards at {counted(times.backwards, 'frame')}")
+
+
+def _echo_pixels(found: RecordingSummary) -> None:
+    if found.equal_pixels:
+        click.echo(
+            f"equal pixels: {found.equal_pixels} of {counted(found.compared, 'frame')} compared with "
+            "the one before"
+        )
+    sampled = (
+        "" if found.decoded == found.frame_count else f", of {found.decoded} frames that were read"
+    )
+    for levels in found.grey_levels:
+        click.echo(f"grey levels: {_describe_levels(levels)}{sampled}")
+
+
+def _describe_levels(levels: GreyLevels) -> str:
+    span = f"{levels.lowest:g} to {levels.highest:g}"
+    if levels.used_bits is None:
+        return f"{span}, {levels.stored_bits} bit floating point"
+    bits = f"{levels.stored_bits} bit"
+    if levels.used_bits < levels.stored_bits:
+        bits += f", of which {levels.used_bits} are used"
+    ends = [
+        f"{part:.2%} {name}"
+        for part, name in (
+            (levels.black_fraction, "black"),
+            (levels.white_fraction, "saturated"),
+        )
+        if part >= 5e-5  # what rounds to 0.01 %
+    ]
+    return ", ".join([f"{span} ({bits})", *ends])
+
+
+def _format_values(values: tuple[Any, ...], show: Callable[[Any], str]) -> str:
+    if isinstance(values[0], str):
+        return ", ".join(values)
+    shown = list(dict.fromkeys(show(value) for value in values))
+    return " to ".join(shown)
+
+
+def _format_bytes(count: int) -> str:
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return counted(count, "byte")

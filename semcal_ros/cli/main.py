@@ -16,13 +16,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib import import_module
 
 import click
 
 import semcal_ros
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.errors import SemcalError, UnusableCalibrationError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.middleware.ament_prefix import add_environment_prefix
 
 __all__ = ["main"]
@@ -31,17 +33,20 @@ __all__ = ["main"]
 _COMMANDS = {
     "at": "camera at a magnification: K, P, distortion, nm per pixel",
     "calibrate": "calibrate from a recording of the chess grid",
+    "check": "whether a calibration still holds, by a few views of the grid",
     "doctor": "what keeps a live stream from working",
     "drift": "specimen drift of a recording, as a table",
     "evaluate": "reprojection error of a calibration on a recording",
     "import": "make a bag from a folder of SEM TIFF files",
     "info": "what a recording contains",
     "measure": "measurements in nanometres: bending of a cantilever",
+    "plan": "which views to record next for a more certain calibration",
     "play": "replay a recording as ROS topics",
     "reconstruct": "shape of a ball that is turned under the beam",
     "rectify": "drift-free, undistorted copy of a recording",
     "simulate": "record the virtual SEM to a bag, with its truth",
     "stack": "drift-corrected average of a recording, and a stabilised video",
+    "update": "renew a calibration with a few views of the grid",
 }
 
 
@@ -63,6 +68,17 @@ class _Group(click.Group):
         command: click.Command = module.command
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
+            raise SemcalError(
+                f"no such command {args[0]!r}",
+                expected="one of " + ", ".join(sorted(_COMMANDS)),
+                do=did_you_mean(args[0], _COMMANDS),
+            )
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(sorted(_COMMANDS.items()))
@@ -82,18 +98,22 @@ def _semcal() -> None:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the command; returns its exit status (0, or 2 for bad input)."""
+    """Run the command; returns its exit status: 0, 2 for bad input, or 1 for input that gave no result to rely on."""
     add_environment_prefix()
     given = sys.argv[1:] if args is None else args
     try:
-        _semcal(args=given or ["--help"], prog_name="semcal", standalone_mode=False)
+        # Without standalone mode, click returns the status of an Exit that a command raises.
+        status = _semcal(args=given or ["--help"], prog_name="semcal", standalone_mode=False)
+        return status if isinstance(status, int) else 0
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except click.UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "semcal"
-        return _refuse(f"{_one_line(error)}; see {command} --help")
+        return _refuse(f"{_one_line(error)}; {_name_choice(error)}see {command} --help")
     except click.ClickException as error:
         return _refuse(_one_line(error))
+    except UnusableCalibrationError as error:
+        return _refuse(str(error), status=1)
     except SemcalError as error:
         return _refuse(str(error))
     except BrokenPipeError:
@@ -103,13 +123,22 @@ def main(args: list[str] | None = None) -> int:
         return _refuse(f"{name}{error.strerror or error}")
     except (KeyboardInterrupt, click.Abort):
         return 130
-    return 0
 
 
 def _one_line(error: click.ClickException) -> str:
     return " ".join(error.format_message().split()).rstrip(".")
 
 
-def _refuse(reason: str) -> int:
+def _name_choice(error: click.UsageError) -> str:
+    """Which of the choices of an option a misspelt one stands for; click only names those of options."""
+    param = error.param if isinstance(error, click.BadParameter) else None
+    if param is None or not isinstance(param.type, click.Choice):
+        return ""
+    given = re.match(r"'([^']*)'", error.message)
+    question = did_you_mean(given.group(1), map(str, param.type.choices)) if given else ""
+    return f"{question} " if question else ""
+
+
+def _refuse(reason: str, *, status: int = 2) -> int:
     click.echo(f"semcal: {reason}", err=True)
-    return 2
+    return status

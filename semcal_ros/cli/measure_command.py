@@ -23,16 +23,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from semcal_ros.applications.cantilever import SHAPES, group_frames
-from semcal_ros.cli.options import (
-    FIGURE_SUFFIXES,
-    PATH,
-    calibration_option,
-    check_outputs,
-    magnification_option,
-    output_option,
-    recording_options,
-)
+from semcal_ros.cli.options import FIGURE_SUFFIXES, LENGTH, PATH, calibration_option, output_option
 from semcal_ros.cli.output import echo_notes, echo_paths, echo_table, show_progress
+from semcal_ros.cli.recording_input import check_outputs, recordings_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.files.images.write import PixelScale
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.measure_cantilever import CantileverMeasurement, measure_cantilever
 
@@ -74,16 +71,16 @@ def command() -> None:
 
 
 @command.command("cantilever")
-@click.argument("recordings", nargs=-1, required=True, type=PATH)
+@recordings_input
 @calibration_option(required=True)
 @click.option(
     "--length",
     required=True,
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="M",
-    help="Length of the cantilever in m.",
+    type=LENGTH,
+    metavar="LENGTH",
+    help="Length of the cantilever, such as 35um; a bare number is in m.",
 )
-@output_option("CSV file.")
+@output_option("Table: .csv, .parquet or .xlsx.")
 @click.option("--plot", type=PATH, help="Deflection of each pose: png, svg, pdf.")
 @click.option("--strip", type=PATH, help="Annotated frames: png, svg or pdf.")
 @click.option("--video", type=PATH, help="Annotated frames: .mp4 or .avi.")
@@ -113,10 +110,8 @@ def command() -> None:
 @click.option(
     "--tip", "tips", type=_PixelType(), multiple=True, help="Free end of the cantilever, likewise."
 )
-@recording_options
-@magnification_option
 def cantilever(
-    recordings: tuple[Path, ...],
+    recordings: list[RecordedFiles],
     calibration: Path,
     length: float,
     output: Path,
@@ -128,9 +123,7 @@ def cantilever(
     shape: str,
     bases: tuple[tuple[float, float], ...],
     tips: tuple[tuple[float, float], ...],
-    config: str,
-    frame_time: float | None,
-    magnification: float | None,
+    config: MicroscopeConfig,
 ) -> None:
     """Bending of a cantilever in RECORDINGS: deflection of its free end in each frame.
 
@@ -145,7 +138,7 @@ def cantilever(
     """
     check_outputs(
         [
-            ("-o", output, (".csv",)),
+            ("-o", output, TABLE_SUFFIXES),
             ("--plot", plot, FIGURE_SUFFIXES),
             ("--strip", strip, FIGURE_SUFFIXES),
             ("--video", video, tuple(VIDEO_CODECS)),
@@ -161,12 +154,11 @@ def cantilever(
             bases=bases,
             tips=tips,
             config=config,
-            frame_time_s=frame_time,
-            magnification=magnification,
             on_progress=on_progress,
         )
-    done.save_csv(output)
-    _draw(done, plot, strip, video, fps)
+    done.save(output)
+    with show_progress("drawing"):
+        _draw(done, plot, strip, video, fps)
     echo_notes(done.notes)
     _echo_result(done)
     echo_paths({"deflections": output, "plot": plot, "strip": strip, "video": video})
@@ -190,13 +182,18 @@ def _draw(
 
     images = [one.images for one in done.series]
     series = [one.measured for one in done.series]
+    # These are raw images, whose pixels are as wide as the camera's.
+    scales = [
+        PixelScale(one.camera.pixel_size_m[0], max(one.camera.pixel_size_sigma_m))
+        for one in done.series
+    ]
     if plot is not None:
         write_poses_figure(done.repeatability, plot)
     if strip is not None:
         firsts = [group[0] for group in group_frames(len(images[0]), done.poses)]
-        write_strip_figure(images, series, firsts, strip)
+        write_strip_figure(images, series, scales, firsts, strip)
     if video is not None:
-        write_bending_video(images, series, done.poses, fps, video)
+        write_bending_video(images, series, scales, done.poses, fps, video)
 
 
 def _echo_result(done: CantileverMeasurement) -> None:

@@ -16,43 +16,101 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import plain_number, quantity
+from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
 
 __all__ = [
+    "DURATION",
     "FIGURE_SUFFIXES",
+    "LENGTH",
+    "LENGTH_OR_ZERO",
+    "PATH",
+    "Quantity",
     "calibration_option",
-    "check_outputs",
     "config_option",
-    "frame_time_option",
+    "dask_option",
     "interpolation_option",
     "json_option",
-    "magnification_option",
     "no_drift_option",
     "output_option",
     "overwrite_option",
-    "parse_length",
+    "parse_angle",
+    "parse_angles",
+    "parse_lengths",
     "parse_ratio",
-    "recording_argument",
-    "recording_options",
     "require_folder",
+    "squares_option",
 ]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-Output = tuple[str, Path | None, Sequence[str]]
 
 
 PATH = click.Path(path_type=Path)
 #: Formats of matplotlib by the suffix of a file name.
 FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
-recording_argument = click.argument("recording", type=PATH)
+
+class Quantity(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic only in newer versions
+    """A positive number with a unit, such as ``35um``; a bare number is in SI.
+
+    Parameters
+    ----------
+    what
+        Name of the quantity, for errors.
+    unit
+        SI unit: ``m`` or ``s``.
+    example
+        Text that is accepted.
+    zero
+        Whether 0 is accepted, too.
+    negative
+        Whether all numbers are accepted.
+    """
+
+    def __init__(
+        self, what: str, unit: str, example: str, *, zero: bool = False, negative: bool = False
+    ) -> None:
+        self.name = what
+        self._negative = negative
+        self._zero = zero
+        self._unit = unit
+        self._example = example
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the value in SI."""
+        if isinstance(value, float):
+            return value
+        found = quantity(value, self._unit, default_unit=self._unit)
+        if found is None and self._is_too_large(value):
+            self.fail(f"{value!r} is too large", param, ctx)
+        if found is None:
+            self.fail(f"{value!r} is not a {self.name} such as {self._example}", param, ctx)
+        if not self._negative and (found < 0.0 or (found == 0.0 and not self._zero)):
+            self.fail(f"{value!r} is not {'0 or above' if self._zero else 'above 0'}", param, ctx)
+        # Without the rounding error of the unit.
+        return float(f"{found:.12g}")
+
+    def _is_too_large(self, text: str) -> bool:
+        """Whether the number overflows, of a text that is not a quantity."""
+        without = re.sub(r"e\+?\d{3,}", "", text.strip(), flags=re.IGNORECASE)
+        return quantity(without, self._unit, default_unit=self._unit) is not None
+
+
+LENGTH = Quantity("length", "m", "35um or 3.5e-5 (m)")
+LENGTH_OR_ZERO = Quantity("length", "m", "10um or 1e-5 (m)", zero=True)
+HEIGHT = Quantity("height", "m", "50um or 5e-5 (m)", negative=True)
+DURATION = Quantity("time", "s", "533ms or 0.533 (s)")
+
+
 config_option = click.option(
     "--config",
     default="generic",
@@ -60,26 +118,53 @@ config_option = click.option(
     metavar="NAME_OR_FILE",
     help="msg_configs of the microscope: topics, units, display width, scan timing.",
 )
-frame_time_option = click.option(
-    "--frame-time",
-    type=click.FloatRange(0.0, min_open=True),
-    metavar="S",
-    help="Seconds of one pass over a frame, instead of what the configuration says.",
-)
-magnification_option = click.option(
-    "--magnification",
-    type=float,
-    help="Magnification of all images: only for a folder of ordinary ones (png, jpg), which do not contain it.",
-)
+
+
+def squares_option(text: str) -> Callable[[Command], Command]:
+    """``--squares`` with its help text."""
+    return click.option("--squares", callback=parse_lengths, metavar="LENGTH,...", help=text)
+
+
+def parse_lengths(
+    _context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, ...] | None:
+    """Callback of an option for lengths with their units, such as ``25um,10um``."""
+    if text is None:
+        return None
+    return tuple(LENGTH.convert(part.strip(), parameter, _context) for part in text.split(","))
+
+
+def parse_angle(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | None:
+    """Callback of an option for an angle with its unit, such as ``7deg``; in rad."""
+    if text is None:
+        return None
+    found = angle_in_degrees(text.strip())
+    if found is None:
+        raise click.BadParameter(f"{text!r} is not an angle such as 7deg")
+    return found
+
+
+def parse_angles(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, ...] | None:
+    """Callback of an option for angles with their units, such as ``0deg,6deg,12deg``; in rad."""
+    if text is None:
+        return None
+    found = (parse_angle(context, parameter, part) for part in text.split(","))
+    return tuple(angle for angle in found if angle is not None)
+
+
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."
 )
+dask_option = click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Dask scheduler, such as tcp://host:8786, whose workers share the work.",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, in SI units.")
-
-
-def recording_options(command: Command) -> Command:
-    """Options for reading a recording: ``--config`` and ``--frame-time``."""
-    return config_option(frame_time_option(command))
 
 
 def output_option(text: str) -> Callable[[Command], Command]:
@@ -109,19 +194,6 @@ def interpolation_option(default: str) -> Callable[[Command], Command]:
     )
 
 
-def parse_length(
-    _context: click.Context, _parameter: click.Parameter, text: str | None
-) -> float | None:
-    """Callback of an option for a length with its unit, such as ``10um``; a bare number is in m."""
-    if text is None:
-        return None
-    length_m = quantity(text, "m", default_unit="m")
-    if length_m is None or length_m < 0.0:
-        raise click.BadParameter(f"{text!r} is not a length such as 10um or 1e-5 (m)")
-    # Without the rounding error of the unit.
-    return float(f"{length_m:.12g}")
-
-
 def parse_ratio(
     _context: click.Context, _parameter: click.Parameter, text: str | None
 ) -> float | None:
@@ -132,46 +204,6 @@ def parse_ratio(
     if ratio is None:
         raise click.BadParameter(f"{text!r} is not a ratio such as 0.1% or 0.001")
     return float(f"{0.01 * ratio:.12g}") if text.strip().endswith("%") else ratio
-
-
-def check_outputs(outputs: Sequence[Output], *, recording: Path | None = None) -> None:
-    """Refuse outputs that cannot be written, before any work is done for them.
-
-    Parameters
-    ----------
-    outputs
-        (option, path or None, suffixes that its kind of file may have; none for any).
-    recording
-        Recording that must not be written to.
-
-    Raises
-    ------
-    InvalidValueError
-        A suffix is not accepted, a folder does not exist, two outputs are one file, or an output
-        belongs to the recording.
-    """
-    taken: set[Path] = set()
-    source = None if recording is None else recording.resolve()
-    for option, path, suffixes in outputs:
-        if path is None:
-            continue
-        if suffixes and path.suffix.lower() not in suffixes:
-            raise InvalidValueError(
-                f"{option} {path}",
-                expected="a name that ends in " + ", ".join(suffixes),
-                do="choose one of these suffixes",
-            )
-        require_folder(path)
-        target = path.resolve()
-        if target in taken:
-            raise InvalidValueError(
-                f"{option} {path} is also another output", expected="a file of its own"
-            )
-        if source is not None and (target == source or source in target.parents):
-            raise InvalidValueError(
-                f"{option} {path} belongs to the recording", expected="a file outside it"
-            )
-        taken.add(target)
 
 
 def require_folder(path: Path) -> None:

@@ -17,6 +17,9 @@
 from __future__ import annotations
 
 import json
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,10 +27,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from semcal_ros.core.wording import counted, group_by_kind
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+    from semcal_ros.core.camera.calibration_model import CalibrationModel
+
 __all__ = [
+    "echo_certainty",
     "echo_json",
     "echo_nominal_unit",
     "echo_notes",
@@ -38,43 +46,93 @@ __all__ = [
 ]
 
 
+# Work of less than this, s, needs no bar.
+_SHOWN_AFTER_S = 1.0
+# How often the time of a stage is shown that reports nothing, s.
+_TICK_S = 0.5
+_COUNTED = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} [{elapsed}<{remaining}]"
+_NOT_COUNTED = "{desc} [{elapsed}]"
+
+
 @contextmanager
-def show_progress() -> Iterator[Callable[[str, int, int | None], None]]:
-    """Make the ``on_progress`` of a workflow: bars on stderr, on terminals, for work of over a second."""
-    # Imported here, so that quick commands do not wait for it.
-    from tqdm import tqdm
+def show_progress(first: str = "opening") -> Iterator[Callable[[str, int, int | None], None]]:
+    """Make the ``on_progress`` of a workflow: a bar on stderr, on terminals, for each stage of over a second.
 
-    bar: tqdm[Any] | None = None
-    shown = ""
+    A stage that does not count anything shows its name and its time.
 
-    def show(stage: str, done: int, total: int | None) -> None:
-        nonlocal bar, shown
-        if bar is None or stage != shown or done < bar.n:
-            if bar is not None:
-                bar.close()
-            bar, shown = (
-                tqdm(total=total, desc=stage, unit="frame", disable=None, delay=1, leave=False),
-                stage,
-            )
-        bar.update(done - bar.n)
-
+    Parameters
+    ----------
+    first
+        What is done before the workflow names a stage.
+    """
+    if not sys.stderr.isatty():
+        yield lambda _stage, _done, _total: None
+        return
+    shown = _Progress(first)
     try:
-        yield show
+        yield shown.show
     finally:
-        if bar is not None:
-            bar.close()
+        shown.close()
+
+
+class _Progress:
+    """The bar of the current stage; a thread keeps it alive while nothing is reported."""
+
+    def __init__(self, first: str) -> None:
+        # Imported here, so that quick commands do not wait for it.
+        from tqdm import tqdm
+
+        self._make = tqdm
+        self._lock = threading.Lock()
+        self._stage = first
+        self._bar = self._begin(first, None)
+        self._ended = threading.Event()
+        self._ticker = threading.Thread(target=self._tick, daemon=True)
+        self._ticker.start()
+
+    def show(self, stage: str, done: int, total: int | None) -> None:
+        with self._lock:
+            if stage != self._stage or done < self._bar.n:
+                self._end()
+                self._stage, self._bar = stage, self._begin(stage, total)
+            self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._ticker.join()
+        self._end()
+
+    def _begin(self, stage: str, total: int | None) -> tqdm[Any]:
+        return self._make(
+            total=total,
+            desc=stage,
+            bar_format=_COUNTED if total else _NOT_COUNTED,
+            delay=_SHOWN_AFTER_S,
+            leave=False,
+        )
+
+    def _end(self) -> None:
+        self._bar.clear()  # close() leaves what only the ticker has shown
+        self._bar.close()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(_TICK_S):
+            with self._lock:
+                if time.time() - self._bar.start_t > _SHOWN_AFTER_S:
+                    self._bar.refresh()
 
 
 def echo_notes(notes: Iterable[str]) -> None:
-    """Print notes for the user to stderr."""
-    for note in notes:
+    """Print notes for the user to stderr, one of each kind."""
+    for note in group_by_kind(notes):
         click.echo(f"note: {note}", err=True)
 
 
 def echo_states(states: Mapping[str, int]) -> None:
     """Print how many frames had which kind of drift."""
     for kind, count in states.items():
-        click.echo(f"{count} frames {kind}")
+        is_key = kind == "keyframe"  # without an import that all commands would wait for
+        click.echo(counted(count, "key frame") if is_key else f"{counted(count, 'frame')} {kind}")
 
 
 def echo_nominal_unit(display_width_m: float, what: str) -> None:
@@ -89,6 +147,19 @@ def echo_paths(paths: Mapping[str, Path | None]) -> None:
     for name, path in paths.items():
         if path is not None:
             click.echo(f"{name}: {path}")
+
+
+def echo_certainty(calibration: CalibrationModel) -> None:
+    """Print how well a calibration knows nm per pixel, where it knows it least."""
+    # Imported here, so that commands without a calibration do not wait for it.
+    from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+
+    worst, where = worst_pixel_size(calibration)
+    low, high = calibration.magnification_range
+    click.echo(
+        f"nm per px is known to {100.0 * worst:.2g} % (1-sigma) or better from {low:g}x to {high:g}x, "
+        f"the least at {where:.0f}x"
+    )
 
 
 def echo_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -16,30 +16,58 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import click
 
+from semcal_ros.applications.reconstruction.tilt_series import HeightMap
 from semcal_ros.cli.options import (
     PATH,
     calibration_option,
-    check_outputs,
+    dask_option,
     output_option,
-    recording_argument,
-    recording_options,
+    parse_angle,
+    parse_angles,
 )
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, show_progress
+from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.wording import counted
 from semcal_ros.files.meshes import MESH_SUFFIXES, UNITS_PER_M
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.files.tables import TABLE_SUFFIXES
+from semcal_ros.workflows.measure_relief import RELIEF_SUFFIXES, measure_relief
 from semcal_ros.workflows.reconstruct import reconstruct
 
 __all__ = ["command"]
 
 
 @click.command("reconstruct")
-@recording_argument
-@calibration_option(required=True)
-@output_option("Mesh: .ply or .stl.")
+@recording_input
+@calibration_option("Needed for a ball; for tilted images it gives the pixel size and its 1-sigma.")
+@output_option(
+    "Mesh of a ball: .ply or .stl. Heights: .tif, or points as .ply, .csv, .parquet, .xlsx."
+)
+@click.option(
+    "--tilts",
+    callback=parse_angles,
+    metavar="ANGLE,...",
+    help="Tilts of two or three images, such as 0deg,6deg,12deg, instead of those of the stage: measures heights.",
+)
+@click.option(
+    "--tilt-axis",
+    callback=parse_angle,
+    metavar="ANGLE",
+    help="About where the tilt axis points in the image, such as 90deg; its sense tells hills from dents.",
+)
+@click.option(
+    "--tilt-sigma",
+    callback=parse_angle,
+    metavar="ANGLE",
+    help="1-sigma of each tilt, such as 0.1deg, instead of that of the configuration.",
+)
 @click.option("--cloud", type=PATH, help="Also write all points: .ply.")
 @click.option("--figure", type=PATH, help="Image of cloud and mesh: .png.")
 @click.option(
@@ -72,11 +100,14 @@ __all__ = ["command"]
     help="1-sigma of the height above or below the plane of the calibration.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-@recording_options
+@dask_option
 def command(
-    recording: Path,
-    calibration: Path,
+    recording: RecordedFiles,
+    calibration: Path | None,
     output: Path,
+    tilts: tuple[float, ...] | None,
+    tilt_axis: float | None,
+    tilt_sigma: float | None,
     cloud: Path | None,
     figure: Path | None,
     unit: str,
@@ -84,15 +115,31 @@ def command(
     keyframes: int,
     height_sigma: float,
     as_json: bool,
-    config: str,
-    frame_time: float | None,
+    config: MicroscopeConfig,
+    dask: str | None,
 ) -> None:
-    """Shape of a ball that turns in RECORDING: points, mesh, diameter.
+    """Heights from two or three tilted images, or the shape of a ball that turns in RECORDING.
 
     \b
-    Example:
+    Examples:
+      semcal reconstruct a.tif b.tif c.tif --tilts -7deg,0deg,7deg -o heights.tif --figure heights.png
       semcal reconstruct recordings/ball --calibration cal.yaml -o ball.ply --figure ball.png
     """
+    if calibration is None or any(given is not None for given in (tilts, tilt_axis, tilt_sigma)):
+        _measure_relief(
+            recording,
+            config,
+            calibration,
+            output,
+            cloud,
+            figure,
+            unit=unit,
+            tilts=tilts,
+            tilt_axis=tilt_axis,
+            tilt_sigma=tilt_sigma,
+            as_json=as_json,
+        )
+        return
     check_outputs(
         [
             ("-o", output, MESH_SUFFIXES),
@@ -105,10 +152,10 @@ def command(
             recording,
             calibration=calibration,
             config=config,
-            frame_time_s=frame_time,
             spacing_px=spacing,
             keyframes=keyframes,
             height_sigma_m=height_sigma,
+            dask=dask,
             on_progress=on_progress,
         )
     done.save_mesh(output, unit=unit)
@@ -118,7 +165,8 @@ def command(
         # Imported here, so that a run without a figure does not wait for matplotlib.
         from semcal_ros.report.ball_figures import write_ball_figure
 
-        write_ball_figure(done.structure, done.ball, figure)
+        with show_progress("drawing"):
+            write_ball_figure(done.structure, done.ball, figure)
     if as_json:
         echo_json({**done.summary(), "notes": done.notes})
     else:
@@ -128,12 +176,80 @@ def command(
         echo_paths({"mesh": output, "points": cloud, "image": figure})
 
 
+def _measure_relief(
+    recording: RecordedFiles,
+    config: MicroscopeConfig,
+    calibration: Path | None,
+    output: Path,
+    cloud: Path | None,
+    figure: Path | None,
+    *,
+    unit: str,
+    tilts: tuple[float, ...] | None,
+    tilt_axis: float | None,
+    tilt_sigma: float | None,
+    as_json: bool,
+) -> None:
+    check_outputs(
+        [
+            ("-o", output, RELIEF_SUFFIXES),
+            ("--cloud", cloud, (".ply", *TABLE_SUFFIXES)),
+            ("--figure", figure, (".png",)),
+        ],
+        recording=recording,
+    )
+    with show_progress() as on_progress:
+        done = measure_relief(
+            recording,
+            tilts_rad=tilts,
+            axis_rad=tilt_axis,
+            tilt_sigma_rad=tilt_sigma,
+            calibration=calibration,
+            config=config,
+            on_progress=on_progress,
+        )
+    done.save(output, unit=unit)
+    if cloud is not None:
+        done.save(cloud, unit=unit)
+    if figure is not None:
+        # Imported here, so that a run without a figure does not wait for matplotlib.
+        from semcal_ros.report.relief_figures import write_relief_figure
+
+        with show_progress("drawing"):
+            write_relief_figure(done.heights, figure)
+    if as_json:
+        echo_json({**done.summary(), "notes": done.notes})
+    else:
+        _echo_relief(done.heights)
+    echo_notes(done.notes)
+    if not as_json:
+        echo_paths({"heights": output, "points": cloud, "image": figure})
+
+
+def _echo_relief(found: HeightMap) -> None:
+    for pair in found.pairs:
+        click.echo(
+            f"{len(pair.first)} of {counted(pair.matches, 'match', 'matches')} agree with a tilt, RMS "
+            f"{pair.rms_px:.2f} px; axis at {math.degrees(pair.axis_rad):.2f} +- "
+            f"{math.degrees(pair.covariance[0, 0] ** 0.5):.2f} deg"
+        )
+    click.echo(
+        f"relief {1e6 * found.relief_m:.4g} um, RMS {1e6 * found.rms_m:.4g} um, 1-sigma "
+        f"{1e6 * found.median_sigma_m:.2g} um (median), of {found.coverage:.0%} of image {found.reference + 1}"
+    )
+    if found.relief_ratio is not None:
+        click.echo(
+            f"relief of the second pair over that of the first: {found.relief_ratio:.3f}, expected 1 +- "
+            f"{found.relief_ratio_sigma:.3f}"
+        )
+
+
 def _echo_summary(result: dict[str, Any]) -> None:
     low, high = (1e9 * v for v in result["diameter_interval_m"])
     parts = {name: 1e9 * value for name, value in result["sigma_parts_m"].items()}
     click.echo(
-        f"{result['points_on_ball']} points on the ball, {result['points']} in all, from "
-        f"{result['views']} keyframes of {result['frames']} frames, RMS "
+        f"{counted(result['points_on_ball'], 'point')} on the ball, {result['points']} in all, from "
+        f"{counted(result['views'], 'keyframe')} of {counted(result['frames'], 'frame')}, RMS "
         f"{result['residual_rms_px']:.3f} px"
     )
     click.echo(

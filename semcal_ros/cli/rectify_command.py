@@ -22,64 +22,84 @@ import click
 
 from semcal_ros.cli.options import (
     calibration_option,
+    dask_option,
     interpolation_option,
     no_drift_option,
-    output_option,
     overwrite_option,
-    recording_argument,
-    recording_options,
 )
 from semcal_ros.cli.output import echo_notes, echo_states, show_progress
+from semcal_ros.cli.recording_input import check_spared, recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.rectify import rectify
 
 __all__ = ["command"]
 
 
 @click.command("rectify")
-@recording_argument
+@recording_input
 @calibration_option(required=True)
-@output_option("Bag to make.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="FILE.tif|FOLDER/|FILE.png|BAG",
+    help="A TIFF of all frames, a folder of TIFFs (its name ends with /), a PNG of one frame, or a bag.",
+)
+@click.option(
+    "--scale-bar",
+    is_flag=True,
+    help="Append a strip with a scale bar and its uncertainty below each picture.",
+)
 @no_drift_option("Leave drift in; correct distortion only.")
 @interpolation_option("linear")
 @click.option(
     "--namespace", default="/sem", show_default=True, help="Namespace of the topics in the output."
 )
-@recording_options
 @overwrite_option
+@dask_option
 def command(
-    recording: Path,
+    recording: RecordedFiles,
     calibration: Path,
-    output: Path,
+    output: str,
+    scale_bar: bool,
     no_drift: bool,
     interpolation: str,
     namespace: str,
-    config: str,
-    frame_time: float | None,
+    config: MicroscopeConfig,
     overwrite: bool,
+    dask: str | None,
 ) -> None:
-    """Drift-free, undistorted copy of RECORDING in square pixels, with camera_info and projection per frame.
+    """Drift-free, undistorted copy of RECORDING in square pixels.
+
+    As a bag, with camera_info and projection per frame; as TIFFs, with pixel size, times and conditions.
 
     \b
     Example:
+      semcal rectify tiffs --calibration cal.yaml -o corrected/ --scale-bar
       semcal rectify recordings/zoom --calibration cal.yaml -o zoom_rect
     """
+    check_spared("-o", Path(output), recording)
     with show_progress() as on_progress:
         done = rectify(
             recording,
             output,
             calibration=calibration,
             config=config,
-            frame_time_s=frame_time,
             drift=not no_drift,
             interpolation=interpolation,
             namespace=namespace,
             overwrite=overwrite,
+            scale_bar=scale_bar,
+            dask=dask,
             on_progress=on_progress,
         )
     echo_notes(done.notes)
     if done.extrapolated:
         click.echo(
-            f"warning: {done.extrapolated} frames are outside the calibrated range", err=True
+            f"warning: {counted(done.extrapolated, 'frame is', 'frames are')} outside the calibrated range",
+            err=True,
         )
     echo_states(done.states)
-    click.echo(f"{done.frame_count} frames: {output}")
+    click.echo(f"{counted(done.frame_count, 'frame')}: {output}")

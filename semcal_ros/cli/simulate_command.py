@@ -22,8 +22,15 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, Command, overwrite_option, parse_length, parse_ratio
+from semcal_ros.cli.options import (
+    LENGTH_OR_ZERO,
+    PATH,
+    Command,
+    overwrite_option,
+    parse_ratio,
+)
 from semcal_ros.cli.output import show_progress
+from semcal_ros.core.wording import counted
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
@@ -99,7 +106,7 @@ def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], C
 @click.option(
     "--eucentric-error",
     "eucentric_error_m",
-    callback=parse_length,
+    type=LENGTH_OR_ZERO,
     metavar="LENGTH",
     help="How far the axis of a one-axis stage misses the specimen.  [default: 100um]",
 )
@@ -117,7 +124,7 @@ def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], C
     "grid_radius_m",
     default="1m",
     show_default=True,
-    callback=parse_length,
+    type=LENGTH_OR_ZERO,
     metavar="RADIUS",
     help="Radius to which the grid is bowed; 0 for a flat one.",
 )
@@ -201,4 +208,4 @@ def command(
             overwrite=overwrite,
             on_progress=on_progress,
         )
-    click.echo(f"{count} frames: {output}")
+    click.echo(f"{counted(count, 'frame')}: {output}")

@@ -23,13 +23,10 @@ import click
 from semcal_ros.cli.options import (
     PATH,
     calibration_option,
-    check_outputs,
+    dask_option,
     interpolation_option,
-    magnification_option,
     no_drift_option,
     output_option,
-    recording_argument,
-    recording_options,
 )
 from semcal_ros.cli.output import (
     echo_nominal_unit,
@@ -38,7 +35,11 @@ from semcal_ros.cli.output import (
     echo_states,
     show_progress,
 )
-from semcal_ros.files.grey_images import GREY_SUFFIXES, TIFF_SUFFIXES
+from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.wording import counted
+from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES
+from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.stack import StackResult, stack
 
@@ -46,7 +47,7 @@ __all__ = ["command"]
 
 
 @click.command("stack")
-@recording_argument
+@recording_input
 @output_option("Average: .tif (32-bit, with the pixel size) or .png (as deep as the recording).")
 @calibration_option("Undo distortion, too.")
 @click.option("--sigma", type=PATH, help="Standard error of the average: .tif.")
@@ -59,23 +60,27 @@ __all__ = ["command"]
     help="Frames per second of the video.",
 )
 @click.option("--at", type=float, metavar="G", help="Take the frames of this magnification.")
+@click.option(
+    "--scale-bar",
+    is_flag=True,
+    help="Append a strip with a scale bar and its uncertainty below the average.",
+)
 @no_drift_option("Average the frames where they are.")
 @interpolation_option("cubic")
-@recording_options
-@magnification_option
+@dask_option
 def command(
-    recording: Path,
+    recording: RecordedFiles,
     output: Path,
     calibration: Path | None,
     sigma: Path | None,
     video: Path | None,
     fps: float,
     at: float | None,
+    scale_bar: bool,
     no_drift: bool,
     interpolation: str,
-    config: str,
-    frame_time: float | None,
-    magnification: float | None,
+    config: MicroscopeConfig,
+    dask: str | None,
 ) -> None:
     """Average of the frames of RECORDING, each moved to where the specimen was in the first one.
 
@@ -86,7 +91,7 @@ def command(
       semcal stack recordings/gold --calibration cal.yaml -o gold.tif --video gold.mp4
     """
     outputs = (
-        ("-o", output, GREY_SUFFIXES),
+        ("-o", output, IMAGE_SUFFIXES),
         ("--sigma", sigma, TIFF_SUFFIXES),
         ("--video", video, tuple(VIDEO_CODECS)),
     )
@@ -96,8 +101,6 @@ def command(
             recording,
             calibration=calibration,
             config=config,
-            frame_time_s=frame_time,
-            magnification=magnification,
             at=at,
             drift=not no_drift,
             interpolation=interpolation,
@@ -105,6 +108,8 @@ def command(
             fps=fps,
             output=output,
             sigma=sigma,
+            scale_bar=scale_bar,
+            dask=dask,
             on_progress=on_progress,
         )
     _echo_result(result, calibrated=calibration is not None)
@@ -118,14 +123,24 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
     elif not result.camera.in_range:
         click.echo("warning: the frames are outside the calibrated range", err=True)
     if result.other_kind:
-        echo_notes([f"{result.other_kind} frames of another size or encoding are left out"])
+        echo_notes([f"{counted(result.other_kind, 'frame')} of another size or encoding left out"])
     echo_states(result.states)
     x_nm, y_nm = (1e9 * size for size in result.camera.pixel_size_m)
     click.echo(
-        f"{result.image.frames} of {len(result.used)} frames averaged, "
+        f"{result.image.frames} of {counted(len(result.used), 'frame')} averaged, "
         f"{x_nm:.6g} x {y_nm:.6g} nm per px"
     )
-    if result.lost:
-        echo_notes([f"tracking was lost: {result.lost} frames after that are left out"])
+    left_out = len(result.used) - result.image.frames
+    if 2 * result.image.frames <= len(result.used):
+        # Half of the frames: more of the recording is missing than is in the average.
+        reasons = "; ".join(
+            f"{counted(count, 'frame')}: {kind}" for kind, count in result.reasons.items()
+        )
+        click.echo(
+            f"warning: {left_out} of {counted(len(result.used), 'frame')} left out: {reasons}",
+            err=True,
+        )
+    elif result.lost:
+        echo_notes([f"tracking was lost: {counted(result.lost, 'frame')} after that left out"])
     if result.typical_error is not None:
         click.echo(f"standard error: {result.typical_error:.4g} grey levels (median of the pixels)")

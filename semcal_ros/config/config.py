@@ -41,6 +41,7 @@ from semcal_ros.config.files import config_names, find_config_file, read_config_
 from semcal_ros.config.yaml_text import load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = [
     "COMPRESSED_IMAGE_TYPE",
@@ -157,7 +158,7 @@ class ImageConfig:
         description="start, centre or end, the moment of the acquisition that is stamped",
     )
     databar_rows: Annotated[int, Field(strict=True, ge=0, le=100_000), _Whole] = Field(
-        default=0, description="the number of rows of the data bar, 0 or more"
+        default=0, description="the number of rows of the data bar, 0 to 100000"
     )
 
 
@@ -198,7 +199,7 @@ class MagnificationConfig:
         default=None, description="a display width in m, above 0 and at most 100"
     )
     image_width_px: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] | None = Field(
-        default=None, description="a positive number of pixels"
+        default=None, description="a number of pixels from 1 to 1000000"
     )
 
     @property
@@ -266,7 +267,7 @@ class _ScanKeys:
     """The keys of :class:`~semcal_ros.core.camera.scan_timing.ScanTiming` in a file."""
 
     frame_time_s: Annotated[_Number, Field(gt=0.0, le=1e6)] = Field(
-        description="the positive time of one pass over the frame in s"
+        description="the time of one pass over the frame in s, above 0 and at most 1000000"
     )
     averages: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] = Field(
         default=1, description="the number of averaged passes, 1 to 1000000"
@@ -274,13 +275,25 @@ class _ScanKeys:
     flyback_fraction: Annotated[_Number, Field(ge=0.0, lt=1.0)] = Field(
         default=0.0, description="a number in [0, 1)"
     )
+    line_averages: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] = Field(
+        default=1, description="the number of scans of each line, 1 to 1000000"
+    )
+    recursive_averages: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] = Field(
+        default=1, description="N of a recursive average of passes, 1 to 1000000"
+    )
 
 
 def _read_scan_timing(value: Any) -> ScanTiming:
     if isinstance(value, ScanTiming):
         return value
     keys = TypeAdapter(_ScanKeys).validate_python(value)
-    return ScanTiming(keys.frame_time_s, keys.averages, keys.flyback_fraction)
+    return ScanTiming(
+        keys.frame_time_s,
+        keys.averages,
+        keys.flyback_fraction,
+        keys.line_averages,
+        keys.recursive_averages,
+    )
 
 
 @_refuse_in_one_line
@@ -474,7 +487,9 @@ def _make_refusal(source: str, found: Problems, declared: type[Any], do: str = "
     path = _format_path(location)
     if kind in _UNKNOWN:
         return ConfigError(
-            f"{source}: unknown key {_shorten(path)}", expected="one of " + ", ".join(fields), do=do
+            f"{source}: unknown key {_shorten(path)}",
+            expected="one of " + ", ".join(fields),
+            do=did_you_mean(str(location[depth])[:_MAX_SEEN], fields) or do,
         )
     key = location[depth] if location else ""
     expected = fields[key].description if location else "a mapping of settings"

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from semcal_ros.core.errors import ConfigError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.text_files import read_text_file
 
 __all__ = ["config_directories", "config_names", "find_config_file", "read_config_text"]
@@ -77,7 +78,8 @@ def find_config_file(name_or_path: str | Path) -> Path:
     raise ConfigError(
         f"no configuration {text[:200]!r}",
         expected="the path of a YAML file or one of the names " + ", ".join(config_names()),
-        do="check the spelling or copy msg_configs/generic.yaml",
+        do=did_you_mean(text[:200], config_names())
+        or "check the spelling or copy msg_configs/generic.yaml",
     )
 
 

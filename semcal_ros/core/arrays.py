@@ -43,6 +43,7 @@ __all__ = [
     "Mask",
     "check_image",
     "check_positive",
+    "check_range",
     "equilibrate",
     "invert_scaled",
     "mad_sigma",
@@ -224,5 +225,33 @@ def check_positive(value: Any, name: str, unit: str = "") -> float:
         seen = str(value)[:_MAX_SHOWN]
         raise InvalidValueError(
             f"{name} {seen}{unit and ' '}{unit}", expected="a finite number greater than 0"
+        )
+    return number
+
+
+def check_range(
+    value: Any, name: str, low: float, high: float, unit: str = "", do: str = ""
+) -> float:
+    """The value as a float, if it lies from ``low`` to ``high``, both above 0.
+
+    Parameters
+    ----------
+    value, name, unit
+        As of :func:`check_positive`, which raises for what is not positive.
+    low, high
+        The limits, in ``unit``.
+    do
+        The next step for the user, for the error.
+
+    Raises
+    ------
+    InvalidValueError
+        For a number outside the limits, and for anything else.
+    """
+    number = check_positive(value, name, unit)
+    if not low <= number <= high:
+        in_unit = unit and f" {unit}"
+        raise InvalidValueError(
+            f"{name} {number:g}{in_unit}", expected=f"{low:g} to {high:g}{in_unit}", do=do
         )
     return number

@@ -15,7 +15,8 @@
 """The one exception tree of the suite.
 
 Every error that a user can cause says three things on one line: what was seen, what was expected, and what to do.
-Programs catch :class:`SemcalError`; the command line prints ``str(error)`` and exits with status 2.
+Programs catch :class:`SemcalError`; the command line prints ``str(error)`` and exits with status 2, or 1 where
+the input was read but gave nothing to rely on.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ __all__ = [
     "SemcalError",
     "StructureError",
     "TiffError",
+    "UnknownScaleError",
+    "UnusableCalibrationError",
 ]
 
 
@@ -93,6 +96,10 @@ class CalibrationError(SemcalError):
     """The data do not allow a calibration."""
 
 
+class UnusableCalibrationError(CalibrationError):
+    """The views give a calibration that must not be used: its scale is far off, or it did not converge."""
+
+
 class CalibrationFileError(SemcalError):
     """A calibration file is corrupt, foreign or from a newer version."""
 
@@ -107,6 +114,10 @@ class MessageError(SemcalError):
 
 class BagError(SemcalError):
     """A recording cannot be read or written."""
+
+
+class UnknownScaleError(BagError):
+    """A recording has neither a magnification nor a pixel size, and none was given."""
 
 
 class StructureError(SemcalError):

@@ -27,6 +27,7 @@ from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import judge_calibrations
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic, suite_topics
@@ -74,7 +75,7 @@ def diagnose_recording(path: Path, config_name: str, calibration: Path | None) -
         found.append(
             note(
                 "magnification",
-                f"{early} images come before the first one, and are not used",
+                f"{counted(early, 'image comes', 'images come')} before the first one: not used",
                 do="publish the magnification before the first image, or make it transient local",
             )
         )

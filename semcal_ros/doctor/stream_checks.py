@@ -26,6 +26,7 @@ from semcal_ros.bridge.stage import missing_joints
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.wording import counted
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import Arrival, Session
@@ -281,7 +282,7 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
         return [
             problem(
                 output.name,
-                f"{nodes} published none of {len(taken)} images",
+                f"{nodes} published nothing for {counted(len(taken), 'image')}",
                 do="see its diagnostics below",
             )
         ]

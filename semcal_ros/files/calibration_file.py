@@ -35,6 +35,7 @@ from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel, ScaleSigma
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_text
@@ -51,8 +52,9 @@ __all__ = [
 ]
 
 
-# The format's only version so far; a file with any other number is refused.
-FILE_VERSION = 1
+# What is written. Version 1 has no provenance; a file with a number that is not listed is refused.
+FILE_VERSION = 2
+_READ_VERSIONS = (1, FILE_VERSION)
 _FORMAT = "semcal-calibration"
 # Characters of a reason: it may repeat a value from the file, which can have any length.
 _MAX_REASON = 400
@@ -129,6 +131,9 @@ def format_calibration(model: CalibrationModel) -> str:
     }
     if model.scale_sigma != ScaleSigma():
         data["scale_sigma"] = asdict(model.scale_sigma)
+    if model.provenance != Provenance():
+        known = asdict(model.provenance).items()
+        data["provenance"] = {name: _to_plain(value) for name, value in known if value}
     if field is not None:
         data["residual_field"] = _write_field(field, model.covariance[size:])
     body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
@@ -178,11 +183,11 @@ def _check_kind(data: Any, source: str) -> None:
             do="make one with `semcal calibrate`",
         )
     version = data.get("version")
-    if version != FILE_VERSION or isinstance(version, bool):  # True equals 1
+    if version not in _READ_VERSIONS or isinstance(version, bool):  # True equals 1
         newer = isinstance(version, int) and version > FILE_VERSION
         raise CalibrationFileError(
             f"{source}: file version {repr(version)[:40]}",
-            expected=f"version {FILE_VERSION}",
+            expected=f"version 1 to {FILE_VERSION}",
             do="update semcal_ros" if newer else "calibrate again",
         )
 
@@ -204,7 +209,7 @@ def _check_schema(data: Mapping[str, Any], source: str) -> None:
         where = ".".join(str(p) for p in error.absolute_path) or "top level"
         raise CalibrationFileError(
             f"{source}: at {where}, {error.message[:160]}",
-            expected="a calibration file of version 1",
+            expected=f"a calibration file of version 1 to {FILE_VERSION}",
             do="restore the file or calibrate again",
         )
 
@@ -229,7 +234,20 @@ def _read_fields(data: Mapping[str, Any]) -> dict[str, Any]:
         "statistics": data.get("statistics", {}),
         "residual": field,
         "scale_sigma": ScaleSigma(**data.get("scale_sigma", {})),
+        "provenance": _read_provenance(data.get("provenance", {})),
     }
+
+
+def _read_provenance(data: Mapping[str, Any]) -> Provenance:
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in data.items()
+    }
+    conditions = data.get("conditions", {})
+    for value in conditions.values():
+        if not isinstance(value[0], str):
+            _check_finite(value)
+    values["conditions"] = {name: tuple(value) for name, value in conditions.items()}
+    return Provenance(**values)
 
 
 def _check_finite(values: Sequence[Any]) -> list[float]:

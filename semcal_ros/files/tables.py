@@ -12,19 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tables of numbers as CSV files."""
+"""Tables of numbers as CSV, Parquet and Excel files."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.atomic import atomic_write_text
+from semcal_ros.files.atomic import atomic_write_bytes
 
-__all__ = ["DRIFT_COLUMNS", "write_csv"]
+__all__ = ["DRIFT_COLUMNS", "SIMILARITY_COLUMNS", "TABLE_SUFFIXES", "write_table"]
 
 DRIFT_COLUMNS = (
     "stamp_ns",
@@ -38,6 +40,14 @@ DRIFT_COLUMNS = (
 )
 """Columns of ``drift.csv``."""
 
+SIMILARITY_COLUMNS = ("rotation_rad", "sigma_rotation_rad", "log_scale", "sigma_log_scale")
+"""Further columns of ``drift.csv`` where the image turns or its scale creeps."""
+
+Rows = Sequence[Sequence[object]]
+
+# Excel computes with 53 bits: a longer whole number, such as a stamp in ns, keeps its digits as text only.
+_EXCEL_WHOLE = 2**53
+
 
 def _cell(value: object) -> str:
     """Format a value so that it reads back the same; None is written as ``nan``."""
@@ -46,21 +56,97 @@ def _cell(value: object) -> str:
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table completely or not at all, with full precision.
+def _encode_csv(columns: Sequence[str], rows: Rows) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(value) for value in row] for row in rows)
+    return text.getvalue().encode("utf-8")
+
+
+def _encode_parquet(columns: Sequence[str], rows: Rows) -> bytes:
+    import pyarrow
+    from pyarrow import parquet
+
+    cells = list(zip(*rows, strict=True)) or [()] * len(columns)
+    table = pyarrow.table(
+        {name: pyarrow.array(values) for name, values in zip(columns, cells, strict=True)}
+    )
+    file = io.BytesIO()
+    parquet.write_table(table, file)
+    return file.getvalue()
+
+
+def _excel_cell(value: object) -> object:
+    if isinstance(value, float):
+        # Excel has neither; an empty cell is left out of its sums and charts.
+        return float(value) if math.isfinite(value) else None
+    return str(value) if isinstance(value, int) and abs(value) > _EXCEL_WHOLE else value
+
+
+def _encode_excel(columns: Sequence[str], rows: Rows) -> bytes:
+    from openpyxl import Workbook
+    from openpyxl.styles import Font
+
+    book = Workbook()
+    sheet = book.active
+    sheet.append(list(columns))
+    for cell in sheet[1]:
+        cell.font = Font(bold=True)
+    sheet.freeze_panes = "A2"
+    for row in rows:
+        sheet.append([_excel_cell(value) for value in row])
+    file = io.BytesIO()
+    book.save(file)
+    return file.getvalue()
+
+
+_ENCODERS: Mapping[str, Callable[[Sequence[str], Rows], bytes]] = MappingProxyType(
+    {".csv": _encode_csv, ".parquet": _encode_parquet, ".xlsx": _encode_excel}
+)
+#: Suffixes of the tables that can be written.
+TABLE_SUFFIXES = tuple(_ENCODERS)
+_LIBRARIES = {".parquet": "pyarrow", ".xlsx": "openpyxl"}
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table completely or not at all, in the format that the suffix names.
+
+    CSV and Parquet keep every number as it is; Excel gets whole numbers beyond 2**53 as text, and empty
+    cells for what is not finite.
+
+    Parameters
+    ----------
+    path
+        ``.csv``, ``.parquet`` (which needs pyarrow) or ``.xlsx`` (which needs openpyxl).
+    columns
+        Names of the columns.
+    rows
+        Numbers, texts, or None for what is not known.
 
     Raises
     ------
     InvalidValueError
-        The number of values in a row differs from the number of columns.
+        The suffix is another one, its library is missing, or the number of values in a row differs from
+        the number of columns.
     OSError
         The file cannot be written; an existing one is untouched.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
+    encode = _ENCODERS.get(path.suffix.lower())
+    if encode is None:
+        raise InvalidValueError(
+            f"{path} for a table", expected="a name that ends in " + ", ".join(TABLE_SUFFIXES)
+        )
+    listed = [tuple(row) for row in rows]
+    for row in listed:
         if len(row) != len(columns):
             raise InvalidValueError(f"a row of {len(row)} values", expected=f"{len(columns)}")
-        writer.writerow([_cell(value) for value in row])
-    atomic_write_text(path, text.getvalue())
+    try:
+        data = encode(columns, listed)
+    except ImportError as error:
+        raise InvalidValueError(
+            f"{path} without {_LIBRARIES[path.suffix.lower()]}: {error}",
+            expected="the library that writes it",
+            do="pip install 'semcal_ros[tables]', or name the table .csv",
+        ) from error
+    atomic_write_bytes(path, data)

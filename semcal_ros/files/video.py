@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Videos of grey frames with a caption."""
+"""Videos of grey frames with a caption and a scale bar."""
 
 from __future__ import annotations
 
@@ -32,8 +32,18 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.errors import BagError, InvalidValueError
+from semcal_ros.core.wording import counted
+from semcal_ros.files.images.scale_bar import ScaleBar, draw_scale_bar
 
-__all__ = ["FPS_RANGE", "VIDEO_CODECS", "VideoCodec", "VideoWriter", "check_video", "open_video"]
+__all__ = [
+    "FPS_RANGE",
+    "VIDEO_CODECS",
+    "VideoCodec",
+    "VideoWriter",
+    "check_video",
+    "open_video",
+    "shade",
+]
 
 #: Frames per second that can be asked for: a frame in ten seconds, and the fastest common displays.
 FPS_RANGE = (0.1, 240.0)
@@ -108,8 +118,6 @@ class VideoWriter:
         (width, height) of the frames, px.
     fps
         Frames per second.
-    grey
-        Grey levels that are shown as black and white.
 
     Raises
     ------
@@ -117,10 +125,7 @@ class VideoWriter:
         As :func:`check_video`, or if FFmpeg has no encoder for it.
     """
 
-    def __init__(
-        self, path: Path, size: tuple[int, int], fps: float, grey: tuple[float, float]
-    ) -> None:
-        self._low, self._high = grey[0], max(grey[1], grey[0] + 1e-6)
+    def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
         # Colour is stored for blocks of 2 x 2 px, so that both numbers must be even.
         even = size[0] + size[0] % 2, size[1] + size[1] % 2
         self._border = even[0] - size[0], even[1] - size[1]
@@ -141,19 +146,20 @@ class VideoWriter:
         self._stream.width, self._stream.height = even
         self._stream.pix_fmt = codec.pixel_format
 
-    def write(self, image: NDArray[np.float32], caption: str) -> None:
-        """Add a frame (h, w), NaN shown as 0, with a line of text at the bottom.
+    def write(self, image: NDArray[np.uint8], caption: str, bar: ScaleBar | None = None) -> None:
+        """Add a frame (h, w) as :func:`shade` makes it, with a line of text at the bottom and a scale bar.
 
         Raises
         ------
         av.FFmpegError
             If the file cannot be written.
         """
-        scale = 255.0 / (self._high - self._low)
-        grey = np.clip(np.rint((np.nan_to_num(image) - self._low) * scale), 0, 255)
         right, bottom = self._border
-        frame = np.pad(grey.astype(np.uint8), ((0, bottom), (0, right)))
-        _draw_caption(frame, caption)
+        frame = np.pad(image, ((0, bottom), (0, right)))
+        end, top = _draw_caption(frame, caption)
+        if bar is not None:
+            room = frame.shape[1] - end
+            draw_scale_bar(frame, bar, above_px=0 if room > 0.5 * frame.shape[1] else top)
         self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
 
     def finish(self) -> None:
@@ -173,24 +179,42 @@ class VideoWriter:
             self._container.close()
 
 
-def _draw_caption(frame: NDArray[np.uint8], text: str) -> None:
+def shade(image: NDArray[np.float32], grey: tuple[float, float]) -> NDArray[np.uint8]:
+    """An image as a video shows it.
+
+    Parameters
+    ----------
+    image
+        (h, w); NaN is shown as 0.
+    grey
+        Grey levels that are shown as black and white.
+    """
+    low, high = grey[0], max(grey[1], grey[0] + 1e-6)
+    scaled = (np.nan_to_num(image) - low) * (255.0 / (high - low))
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+
+
+def _draw_caption(frame: NDArray[np.uint8], text: str) -> tuple[int, int]:
+    """Draw a line of text; returns where it ends to the right, and its height from the bottom."""
     scale = max(0.35, 0.5 * frame.shape[0] / 512)
     place = (round(12 * scale), frame.shape[0] - round(14 * scale))
     thin = max(1, round(1.5 * scale))
     # White with a black edge can be read on any specimen.
     for level, width in ((0, thin + 2), (255, thin)):
         cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, level, width, cv2.LINE_AA)
+    (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thin + 2)
+    return place[0] + wide, frame.shape[0] - place[1] + high
 
 
 @contextmanager
 def open_video(
-    path: Path | None, size: tuple[int, int], frames: int, fps: float, grey: tuple[float, float]
+    path: Path | None, size: tuple[int, int], frames: int, fps: float
 ) -> Iterator[VideoWriter | None]:
     """Write a video that gets its name only once it is complete; None where no ``path`` is given.
 
     Parameters
     ----------
-    path, size, fps, grey
+    path, size, fps
         As for :class:`VideoWriter`.
     frames
         Number of frames that will be written.
@@ -210,7 +234,7 @@ def open_video(
         prefix=f".{target.name}.", suffix=".tmp", dir=target.parent
     ) as scratch:
         file = Path(scratch) / f"video{target.suffix.lower()}"
-        video = VideoWriter(file, size, fps, grey)
+        video = VideoWriter(file, size, fps)
         try:
             yield video
             video.finish()
@@ -220,7 +244,7 @@ def open_video(
             video.release()
         found = _count_frames(file)
         if found != frames:
-            raise _incomplete(path, f"{found} of {frames} frames were encoded")
+            raise _incomplete(path, f"{found} of {counted(frames, 'frame')} encoded")
         os.replace(file, target)
 
 

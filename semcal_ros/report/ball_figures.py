@@ -26,6 +26,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from semcal_ros.applications.reconstruction import Ball, Structure
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.wording import counted
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
@@ -69,7 +70,7 @@ def plot_ball(structure: Structure, ball: Ball) -> Figure:
     other = near & ~on_ball
     if other.any():
         cloud.scatter(*points[other].T, s=3, c=SECOND, label="not on it")
-    cloud.set_title(f"{np.count_nonzero(on_ball)} points", fontsize=9, color=INK)
+    cloud.set_title(counted(np.count_nonzero(on_ball), "point"), fontsize=9, color=INK)
     add_legend(cloud, loc="lower left")
     surface = figure.add_subplot(1, 3, 2, projection="3d")
     vertices = _turn_upright(ball.mesh.vertices_m - centre)

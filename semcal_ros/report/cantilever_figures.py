@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -36,7 +37,9 @@ from semcal_ros.applications.cantilever import (
 )
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.video import open_video
+from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length
+from semcal_ros.files.images.write import PixelScale
+from semcal_ros.files.video import open_video, shade
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -80,21 +83,23 @@ def write_poses_figure(agreed: Repeatability, file: Path) -> None:
 def write_strip_figure(
     images: Sequence[Sequence[NDArray[Any]]],
     series: Sequence[Series],
+    scales: Sequence[PixelScale],
     firsts: Sequence[int],
     file: Path,
 ) -> None:
     """Write :func:`plot_strip` completely or not at all; OSError if that fails."""
-    _write(plot_strip(images, series, firsts), file)
+    _write(plot_strip(images, series, scales, firsts), file)
 
 
 def write_bending_video(
     images: Sequence[Sequence[NDArray[Any]]],
     series: Sequence[Series],
+    scales: Sequence[PixelScale],
     poses: int | None,
     fps: float,
     file: Path,
 ) -> None:
-    """Write all frames with the line of the beam and its deflection, one series after the other.
+    """Write all frames with the line of the beam, its deflection and a scale bar, one series after the other.
 
     Parameters
     ----------
@@ -102,6 +107,8 @@ def write_bending_video(
         (h, w) grey images of the frames of each series.
     series
         What was measured in them.
+    scales
+        Pixel size of the images of each series.
     poses
         As for :func:`~semcal_ros.applications.cantilever.repeatability.group_frames`.
     fps
@@ -123,16 +130,18 @@ def write_bending_video(
     some = np.concatenate([pictures[0][::4, ::4].ravel() for pictures in images])
     low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
     count = sum(len(pictures) for pictures in images)
-    with open_video(file, (width, height), count, fps, (low, high)) as film:
+    with open_video(file, (width, height), count, fps) as film:
         assert film is not None
-        for pictures, one in zip(images, series, strict=True):
+        for pictures, one, scale in zip(images, series, scales, strict=True):
+            bar = choose_scale_bar(width, scale.size_m, scale.sigma_m)
             groups = enumerate(group_frames(len(pictures), poses), 1)
             pose_of = {k: number for number, group in groups for k in group}
             for k, frame in enumerate(one.frames):
                 nm, sigma = 1e9 * frame.deflection_m, 1e9 * frame.sigma_m
                 film.write(
-                    draw_deflection(pictures[k], frame, (low, high)),
+                    shade(draw_deflection(pictures[k], frame, (low, high)), (low, high)),
                     f"{one.magnification:g}x  pose {pose_of[k]}  {nm:.1f} +- {sigma:.1f} nm",
+                    bar,
                 )
 
 
@@ -183,9 +192,12 @@ def plot_poses(agreed: Repeatability) -> Figure:
 
 
 def plot_strip(
-    images: Sequence[Sequence[NDArray[Any]]], series: Sequence[Series], firsts: Sequence[int]
+    images: Sequence[Sequence[NDArray[Any]]],
+    series: Sequence[Series],
+    scales: Sequence[PixelScale],
+    firsts: Sequence[int],
 ) -> Figure:
-    """Plot the first, most bent and last pose at each magnification, with the centre line.
+    """Plot the first, most bent and last pose at each magnification, with the centre line and a scale bar.
 
     Parameters
     ----------
@@ -193,6 +205,8 @@ def plot_strip(
         Frames of each series.
     series
         What was measured.
+    scales
+        Pixel size of the images of each series.
     firsts
         First frame of each pose.
     """
@@ -201,10 +215,39 @@ def plot_strip(
     poses = sorted({0, most, len(firsts) - 1})[:_SHOWN_POSES]
     figure = create_figure(2.1 * len(poses), 2.2 * len(series))
     grid = figure.subplots(len(series), len(poses), squeeze=False)
-    for row, (pictures, one) in enumerate(zip(images, series, strict=True)):
+    for row, (pictures, one, scale) in enumerate(zip(images, series, scales, strict=True)):
         for column, pose in enumerate(poses):
-            _draw_frame(grid[row, column], pictures[firsts[pose]], one, firsts[pose], pose)
+            axes = grid[row, column]
+            _draw_frame(axes, pictures[firsts[pose]], one, firsts[pose], pose)
+            _draw_bar(axes, pictures[firsts[pose]].shape, scale)
     return figure
+
+
+def _draw_bar(axes: Axes, shape: tuple[int, ...], scale: PixelScale) -> None:
+    """Draw a scale bar into the lower right corner, white with a black edge."""
+    height, width = shape[:2]
+    bar = choose_scale_bar(width, scale.size_m)
+    x, y = 0.96 * width, 0.95 * height
+    edge = [Stroke(linewidth=2.4, foreground="black"), Normal()]
+    axes.plot(
+        [x - bar.length_px, x],
+        [y, y],
+        color="white",
+        linewidth=2.0,
+        path_effects=edge,
+        solid_capstyle="butt",
+    )
+    text = format_length(bar.length_m)
+    axes.text(
+        x,
+        y - 0.03 * height,
+        text,
+        ha="right",
+        va="bottom",
+        fontsize=6,
+        color="white",
+        path_effects=edge,
+    )
 
 
 def _draw_frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: int) -> None:

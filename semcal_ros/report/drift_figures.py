@@ -30,8 +30,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from semcal_ros.core.arrays import Array, Indices, Mask
-from semcal_ros.core.drift.estimates import DriftPath, DriftStatus, omit_numbers
+from semcal_ros.core.drift.estimates import DriftPath, DriftStatus
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -257,7 +258,7 @@ def _draw_key(axes: Axes, path: DriftPath, kinds: list[_Kind]) -> None:
     axes.set_axis_off()
     keyframes = sum(u.status is DriftStatus.KEYFRAME for u in path.updates)
     used = int(path.accepted.sum())
-    tracked = f"{used} of {len(path)} frames tracked, {keyframes} of them as keyframe"
+    tracked = f"{used} of {counted(len(path), 'frame')} tracked, {keyframes} of them as key frame"
     entries = [("o", "#2a788e", tracked)]
     entries += [(k.mark, k.color, _shorten(f"{len(k.frames)} not used: {k.text}")) for k in kinds]
     handles = [

@@ -49,7 +49,7 @@ class ActuatorFaults:
         values = np.array([*self.gain, self.turned_rad, *self.backlash_m])
         if not np.all(np.isfinite(values)) or min(self.gain) <= 0.0 or min(self.backlash_m) < 0.0:
             raise InvalidValueError(
-                f"{self}", expected="positive gains and play that is not negative"
+                f"{self}", expected="finite gains above 0, and finite play of 0 or more"
             )
 
 

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = ["DRIFTS", "NO_DRIFT", "Drift", "DriftFunction", "drift_preset"]
 
@@ -131,5 +132,9 @@ def drift_preset(name: str) -> Drift:
         If there is no such preset.
     """
     if name not in DRIFTS:
-        raise InvalidValueError(f"drift preset '{name}'", expected=f"one of {', '.join(DRIFTS)}")
+        raise InvalidValueError(
+            f"drift preset '{name}'",
+            expected=f"one of {', '.join(DRIFTS)}",
+            do=did_you_mean(name, DRIFTS),
+        )
     return DRIFTS[name]

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
@@ -243,7 +243,4 @@ class VirtualMicroscope:
 
 
 def _check_magnification(magnification: float) -> float:
-    g = float(magnification)
-    if not (math.isfinite(g) and g > 0.0):
-        raise InvalidValueError(f"magnification {magnification}", expected="a positive number")
-    return g
+    return check_positive(magnification, "magnification")

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
@@ -98,7 +99,11 @@ def specimen_for(
         return TargetSpecimen(), None
     if kind == "rough_target":
         return random_target(seed), None
-    raise InvalidValueError(f"specimen '{kind}'", expected=f"one of {', '.join(SPECIMEN_KINDS)}")
+    raise InvalidValueError(
+        f"specimen '{kind}'",
+        expected=f"one of {', '.join(SPECIMEN_KINDS)}",
+        do=did_you_mean(kind, SPECIMEN_KINDS),
+    )
 
 
 def _grid_of(square_m: float, grid: GridFaults | None, seed: int) -> ChessGrid:

@@ -21,6 +21,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
 from semcal_ros.synthetic.microscope import Residual, VirtualMicroscope
 
@@ -104,6 +105,8 @@ def preset(name: str) -> VirtualMicroscope:
     """
     if name not in PRESETS:
         raise InvalidValueError(
-            f"microscope preset '{name}'", expected=f"one of {', '.join(PRESETS)}"
+            f"microscope preset '{name}'",
+            expected=f"one of {', '.join(PRESETS)}",
+            do=did_you_mean(name, PRESETS),
         )
     return PRESETS[name]

@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.specimens.grid import GridFaults, square_for
 
@@ -168,7 +169,9 @@ def make_stage(
         If there is no such stage, a value is out of range, or a two-axis stage has an axis that misses.
     """
     if name not in STAGES:
-        raise InvalidValueError(f"stage '{name}'", expected=f"one of {', '.join(STAGES)}")
+        raise InvalidValueError(
+            f"stage '{name}'", expected=f"one of {', '.join(STAGES)}", do=did_you_mean(name, STAGES)
+        )
     stage = STAGES[name]
     if eucentric_error_m is not None:
         if stage.axis_rad is None and eucentric_error_m != 0.0:

@@ -30,9 +30,22 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
     calibrate_views,
 )
+from semcal_ros.core.calibration.nominal_scale import (
+    check_nominal_scale,
+    check_square_sides,
+    is_scale_far,
+)
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.calibration.views import (
+    FoundView,
+    GridView,
+    RejectedView,
+    SquareAssignment,
+    assign_squares,
+)
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, SemcalError
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
     collect_views,
@@ -49,6 +62,8 @@ from semcal_ros.workflows.inputs import (
     open_source,
     resolve_config,
 )
+from semcal_ros.workflows.provenance import describe_provenance
+from semcal_ros.workflows.workers import open_workers
 
 __all__ = [
     "RecordingCalibration",
@@ -60,8 +75,11 @@ __all__ = [
 
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
-# In octaves: with the right display width, the scale of a microscope is never this close to a factor of two.
-_TWICE = 0.12
+# What numerical code raises on degenerate views.
+_NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+# Views that must agree before a recording is refused without the others: three that are misread are not all misread
+# to the same scale.
+_FIRST_VIEWS = 3
 
 
 @dataclass(frozen=True)
@@ -88,15 +106,37 @@ class RecordingCalibration:
 _MOST_REFUSED = 0.5
 
 
-def _check_factor(factor: float, display_width_m: float) -> None:
-    """Refuse a scale that results from confusing the side of a square with the grid's period."""
-    if abs(abs(np.log2(factor)) - 1.0) < _TWICE:
-        raise CalibrationError(
-            f"images that show {factor:.3g} times the scale that squares_m and the display width of "
-            f"{display_width_m:g} m predict",
-            expected="squares_m to hold the sides of single squares, not the period of the grid",
-            do=f"correct squares_m, or if that is right, set display_width_m to {display_width_m / factor:.4g} m",
+def _check_scale(assignment: SquareAssignment, found: Sequence[FoundView], width_m: float) -> None:
+    """Refuse views whose scale is far from what their magnifications, on this display, predict."""
+    sizes_m = {width_m / (v.magnification * v.detection.image_size[0]) for v in found}
+    check_nominal_scale(
+        assignment.scale_factor,
+        display_width_m=width_m,
+        squares_m=[float(side) for side in assignment.square_m],
+        pixel_size_m=sizes_m.pop() if len(sizes_m) == 1 else None,
+    )
+
+
+class _FirstViews:
+    """Refuses a recording by its first views if their scale is far off whatever squares they show."""
+
+    def __init__(self, display_width_m: float, squares_m: Sequence[float]) -> None:
+        self._display_width_m = display_width_m
+        self._squares_m = np.asarray(squares_m, dtype=np.float64)
+        self._views: list[FoundView] = []
+
+    def add(self, view: FoundView) -> None:
+        self._views.append(view)
+        if len(self._views) != _FIRST_VIEWS:
+            return
+        spacing = np.array([v.detection.spacing_px for v in self._views])
+        width_px = np.array([v.detection.image_size[0] for v in self._views])
+        nominal = (
+            np.array([v.magnification for v in self._views]) * width_px / self._display_width_m
         )
+        if np.all(is_scale_far((spacing / nominal)[:, None] / self._squares_m)):
+            assignment = assign_squares(spacing, nominal, self._squares_m.tolist())
+            _check_scale(assignment, self._views, self._display_width_m)
 
 
 def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[str]:
@@ -107,8 +147,8 @@ def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) ->
         return []
     # The tilts that were not refused are wrong too, by less; they have pulled the scale with them.
     return [
-        f"scale: {refused} of {len(told)} views contradict the tilt of the stage: the stage is not used; check the "
-        "unit of its angles, and its stamps"
+        f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not used; "
+        "check the unit of its angles, and its stamps"
     ]
 
 
@@ -144,7 +184,7 @@ def options_for(
     return chosen
 
 
-def _name_untilted(
+def name_untilted(
     untilted: str | Sequence[str], found: Sequence[FoundView]
 ) -> str | tuple[str, ...]:
     """Return names of views for what a user may call them: by number or by file."""
@@ -181,19 +221,29 @@ def calibrate_found(
     """
     options = options or CalibrationOptions()
     if found:
-        options = replace(options, untilted=_name_untilted(options.untilted, found))
+        options = replace(options, untilted=name_untilted(options.untilted, found))
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
+    _check_scale(collected.assignment, collected.found, display_width_m)
     factor = collected.assignment.scale_factor
-    _check_factor(factor, display_width_m)
+    check_square_sides(factor, display_width_m)
 
     def calibrated(views: Sequence[GridView]) -> CalibrationResult:
-        return calibrate_views(
-            views,
-            image_size=collected.image_size,
-            display_width_m=display_width_m,
-            options=options,
-            on_stage=lambda name, part: on_stage(name, 0.95 * part),
-        )
+        try:
+            return calibrate_views(
+                views,
+                image_size=collected.image_size,
+                display_width_m=display_width_m,
+                options=options,
+                on_stage=lambda name, part: on_stage(name, 0.95 * part),
+            )
+        except SemcalError:
+            raise
+        except _NUMERIC as error:
+            raise CalibrationError(
+                f"views that cannot be solved for ({type(error).__name__}: {error})",
+                expected="views of a grid from different directions",
+                do="add tilted views, or leave out those that differ from the others",
+            ) from error
 
     result = calibrated(collected.views)
     contradiction = _find_contradiction(collected.views, result)
@@ -205,7 +255,7 @@ def calibrate_found(
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         warnings.append(
             f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "
-            "predicts: check display_width_m and squares_m in msg_configs"
+            "predicts: check --display-width and --squares (display_width_m and squares_m of the configuration)"
         )
     statistics = {
         **result.model.statistics,
@@ -229,11 +279,15 @@ def calibrate_recording(
     squares_sigma: float | None = None,
     magnification: float | None = None,
     options: CalibrationOptions | None = None,
+    pattern: str = "auto",
+    keep_images: bool = True,
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> RecordingCalibration:
     """Calibrate, and keep the views and residuals that a report shows.
 
-    Parameters and errors are those of :func:`calibrate`.
+    Parameters and errors are those of :func:`calibrate`. Without ``keep_images`` the images of the
+    views do not stay in memory, and a report shows none.
     """
     chosen = resolve_config(config)
     if display_width_m is not None:
@@ -242,11 +296,29 @@ def calibrate_recording(
         chosen = replace(chosen, squares_m=check_positives(squares_m, "squares_m"))
     if squares_sigma is not None:
         chosen = replace(chosen, squares_sigma=squares_sigma)
-    with open_source(source, chosen, magnification=magnification) as recording:
+
+    def show_stage(name: str, _fraction: float) -> None:
+        on_progress(f"adjusting: {name}", 0, None)
+
+    frames: dict[str, RecordedFrame] = {}
+
+    def note_frame(name: str, frame: RecordedFrame) -> None:
+        frames[name] = replace(frame, image=frame.image[:0])
+
+    with (
+        open_workers(dask) as workers,
+        open_source(source, chosen, magnification=magnification) as recording,
+    ):
         advance = count_frames(on_progress, "finding corners", recording.frame_count)
-        found, rejected = find_views(named_frames(recording), on_progress=advance)
+        found, rejected = find_views(
+            named_frames(recording, note_frame),
+            on_progress=advance,
+            workers=workers if workers.elsewhere else None,
+            keep_images=keep_images,
+            pattern=pattern,
+            on_found=_FirstViews(chosen.display_width_m, chosen.squares_m).add,
+        )
         notes = recording.notes
-    on_progress("adjusting", 0, None)
     done = calibrate_found(
         found,
         rejected,
@@ -254,8 +326,17 @@ def calibrate_recording(
         squares_m=chosen.squares_m,
         options=options_for(chosen, options),
         grid_certificate=chosen.grid_certificate,
+        on_stage=show_stage,
     )
-    return replace(done, notes=notes)
+    used = {view.name: frames[view.name] for view in done.result.views}
+    origin = describe_provenance(source, chosen, used)
+    model = replace(done.result.model, provenance=origin)
+    return replace(
+        done,
+        calibration=Calibration.from_model(model),
+        result=replace(done.result, model=model),
+        notes=notes,
+    )
 
 
 def calibrate(
@@ -272,6 +353,8 @@ def calibrate(
     residual: str = "auto",
     untilted: str | Sequence[str | int] = "auto",
     height_sigma_m: float = CalibrationOptions.height_sigma_m,
+    pattern: str = "auto",
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
@@ -279,7 +362,7 @@ def calibrate(
     Parameters
     ----------
     source
-        A bag, a folder of images of the chess grid, or an iterable of (image, magnification)
+        A bag, a folder of images of the grid, or an iterable of (image, magnification)
         tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3). Grey levels are
         processed as float32, float64 too: 24 bits, more than any detector has.
     config
@@ -295,6 +378,11 @@ def calibrate(
     method, options, breakpoints, residual, height_sigma_m
         As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
         is ``method_options``.
+    pattern
+        What the grid consists of: ``"chess"``, ``"dots"`` (also holes), ``"lines"`` (crossed), or
+        ``"auto"``. Of dots and lines, ``squares_m`` is the distance from one to the next.
+    dask
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -304,6 +392,9 @@ def calibrate(
         If the recording cannot be read.
     CalibrationError
         If its images do not allow a calibration.
+    UnusableCalibrationError
+        If their scale is off by more than a factor of 3 from what magnification, display width and squares predict,
+        or the adjustment did not converge.
 
     Examples
     --------
@@ -328,5 +419,8 @@ def calibrate(
             untilted if isinstance(untilted, str) else tuple(str(name) for name in untilted),
             height_sigma_m=height_sigma_m,
         ),
+        pattern=pattern,
+        keep_images=False,
+        dask=dask,
         on_progress=on_progress,
     ).calibration

@@ -34,6 +34,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.workers import open_workers
 
 __all__ = ["Evaluation", "MagnificationError", "evaluate"]
 
@@ -92,6 +93,8 @@ def evaluate(
     *,
     config: ConfigSource | None = None,
     magnification: float | None = None,
+    pattern: str = "auto",
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> Evaluation:
     """Fit a pose to each view of the grid, not the camera, and compare.
@@ -109,6 +112,10 @@ def evaluate(
         A ``msg_configs`` name or file; the default is ``generic``.
     magnification
         Magnification of a folder of ordinary images, which do not contain it.
+    pattern
+        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`.
+    dask
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -119,15 +126,25 @@ def evaluate(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model)
-    with open_source(source, microscope, magnification=magnification) as opened:
+    with (
+        open_workers(dask) as workers,
+        open_source(source, microscope, magnification=magnification) as opened,
+    ):
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
-        found, rejected = find_views(named_frames(opened), on_progress=advance)
+        found, rejected = find_views(
+            named_frames(opened),
+            on_progress=advance,
+            workers=workers if workers.elsewhere else None,
+            keep_images=False,
+            pattern=pattern,
+        )
     collected = collect_views(
         found,
         rejected,
         display_width_m=microscope.display_width_m,
         squares_m=microscope.squares_m,
     )
+    on_progress("fitting the views", 0, None)
     height_m = _height_sigma_m(model.statistics)
     fit = fit_poses(
         collected.views,

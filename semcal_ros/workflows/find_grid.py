@@ -16,15 +16,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain, islice, starmap
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
+from joblib import cpu_count
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
@@ -37,9 +37,17 @@ from semcal_ros.core.calibration.views import (
     ViewStatus,
     views_from_detections,
 )
-from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.corners import (
+    PATTERN_NAMES,
+    LatticeDetection,
+    LatticeStatus,
+    check_pattern,
+    find_lattice,
+)
 from semcal_ros.core.errors import CalibrationError, Rejection
-from semcal_ros.files.recordings import Recording
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFrame, Recording
+from semcal_ros.workflows.workers import Workers
 
 __all__ = [
     "CollectedViews",
@@ -60,6 +68,9 @@ _MUCH_LONGER, _AS_LONG = 3.0, 0.5
 # Fewer images are processed before other processes have started.
 _TOO_FEW_TO_SHARE = 12
 # In place of an image that is on its way.
+# Frames that this process takes itself where a grid can end the search, before it starts others that would not end
+# with it.
+_FIRST_HERE = 4
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 
 
@@ -100,13 +111,13 @@ class NamedFrame(NamedTuple):
     file_name: str = ""
 
 
-def _detect(name: str, image: NDArray[Any], magnification: float) -> FoundView | RejectedView:
+def detect_grid(
+    image: NDArray[Any], pattern: str = "auto"
+) -> LatticeDetection | Rejection[LatticeStatus]:
+    """Find the grid in an image; OpenCV works in one thread from now on."""
     # The images are the parallel work; threads inside OpenCV would only compete.
     cv2.setNumThreads(1)
-    detection = find_lattice(image)
-    if isinstance(detection, Rejection):
-        return RejectedView(name, magnification, detection, image)
-    return FoundView(name, magnification, image, detection)
+    return find_lattice(image, pattern=pattern)
 
 
 def count_visits(magnifications: Sequence[float], stamps_ns: Sequence[int | None]) -> list[int]:
@@ -127,10 +138,14 @@ def count_visits(magnifications: Sequence[float], stamps_ns: Sequence[int | None
     return [0, *(int(number) for number in np.cumsum(changed))][:count]
 
 
-def named_frames(recording: Recording) -> Iterator[NamedFrame]:
-    """Each usable frame of an open recording, with the name ``frame N``."""
+def named_frames(
+    recording: Recording,
+    on_frame: Callable[[str, RecordedFrame], object] = lambda _name, _frame: None,
+) -> Iterator[NamedFrame]:
+    """Each usable frame of an open recording, with the name ``frame N``; ``on_frame`` is told of each."""
     for index, frame in enumerate(recording.frames()):
         grey = to_gray(frame.image, frame.encoding)
+        on_frame(f"frame {index}", frame)
         yield NamedFrame(
             f"frame {index}",
             grey,
@@ -146,6 +161,10 @@ def find_views(
     *,
     on_progress: Progress | None = None,
     processes: int | None = None,
+    workers: Workers | None = None,
+    keep_images: bool = True,
+    pattern: str = "auto",
+    on_found: Callable[[FoundView], object] | None = None,
 ) -> tuple[list[FoundView], list[RejectedView]]:
     """Find the grid in frames, on all cores.
 
@@ -153,30 +172,56 @@ def find_views(
     ----------
     frames
         In the order of the recording, with or without a grid: they determine the visits. They are
-        taken a few at a time. Their images stay in the results, which a report shows.
+        taken a few at a time.
     on_progress
         Called with 1 after each frame.
     processes
         Number of processes; one per core without. 1 works in this process.
+    workers
+        Where to work, instead.
+    keep_images
+        Whether the images stay in the results, for a report.
+    pattern
+        What the grid consists of, as in :func:`~semcal_ros.core.corners.find_lattice`.
+    on_found
+        Called with each grid as it is found, before its stage and visit are known. What it raises ends the search.
     """
+    check_pattern(pattern)
     views: list[FoundView | RejectedView] = []
     origins: list[NamedFrame] = []
+    under_way: deque[NDArray[Any]] = deque()
 
-    def pictures() -> Iterator[tuple[str, NDArray[Any], float]]:
+    def pictures() -> Iterator[tuple[NDArray[Any], str]]:
         for frame in frames:
             origin = frame if isinstance(frame, NamedFrame) else NamedFrame(*frame)
             origins.append(origin._replace(image=_NO_IMAGE))
-            yield origin.name, origin.image, origin.magnification
+            under_way.append(origin.image)
+            yield origin.image, pattern
 
     iterator = pictures()
-    first = list(islice(iterator, _TOO_FEW_TO_SHARE))
-    if len(first) < _TOO_FEW_TO_SHARE:
-        processes = 1
-    work = Parallel(n_jobs=processes or cpu_count(), return_as="generator")
+    if workers is None:
+        first = list(islice(iterator, _TOO_FEW_TO_SHARE))
+        few = len(first) < _TOO_FEW_TO_SHARE
+        workers = Workers(1 if few else processes or cpu_count())
+        iterator = chain(first, iterator)
+
+    def detect(shared: Workers = workers) -> Iterator[LatticeDetection | Rejection[LatticeStatus]]:
+        if on_found is not None:
+            yield from starmap(detect_grid, islice(iterator, _FIRST_HERE))
+        yield from shared.starmap(detect_grid, iterator)
+
     threads = cv2.getNumThreads()
     try:
-        for view in work(delayed(_detect)(*picture) for picture in chain(first, iterator)):
-            views.append(view)
+        for detection in detect():
+            origin, image = origins[len(views)], under_way.popleft()
+            kept = image if keep_images else None
+            if isinstance(detection, Rejection):
+                views.append(RejectedView(origin.name, origin.magnification, detection, kept))
+            else:
+                view = FoundView(origin.name, origin.magnification, kept, detection)
+                views.append(view)
+                if on_found is not None:
+                    on_found(view)
             if on_progress is not None:
                 on_progress(1)
     finally:
@@ -206,12 +251,31 @@ def collect_views(
     """
     if not found:
         reasons = Counter(r.reason for r in rejected).most_common(1)
+        other_pattern = any(r.rejection.status is LatticeStatus.OTHER_PATTERN for r in rejected)
         raise CalibrationError(
-            f"no usable view among {len(rejected)} images"
+            f"no usable view among {counted(len(rejected), 'image')}"
             + (f" (mostly: {reasons[0][0]})" if reasons else ""),
-            expected="images of a chess grid",
-            do="check focus, contrast, and that the grid fills the image",
+            expected="images of a grid: a chess board, dots or crossed lines",
+            do="choose --pattern auto, or the right images"
+            if other_pattern
+            else "check focus, contrast, and that the grid fills the image",
         )
+    # A recording shows one grid. A view in which another pattern was seen was misread.
+    pattern = Counter(v.detection.pattern for v in found).most_common(1)[0][0]
+    misread = [
+        RejectedView(
+            v.name,
+            v.magnification,
+            Rejection(
+                LatticeStatus.OTHER_PATTERN,
+                f"{PATTERN_NAMES[v.detection.pattern]}, not {PATTERN_NAMES[pattern]} as in most images",
+            ),
+            v.image,
+        )
+        for v in found
+        if v.detection.pattern != pattern
+    ]
+    found = [v for v in found if v.detection.pattern == pattern]
     sizes = Counter(v.detection.image_size for v in found)
     image_size = sizes.most_common(1)[0][0]
     same = [v for v in found if v.detection.image_size == image_size]
@@ -238,15 +302,17 @@ def collect_views(
     ]
     if 2 * len(odd) > len(same):
         raise CalibrationError(
-            f"{len(odd)} of {len(same)} views whose squares have none of the known sizes "
+            f"{len(odd)} of {counted(len(same), 'view')} whose squares have none of the known sizes "
             f"({odd[0].name} at {odd[0].magnification:g}: {odd[0].reason})",
             expected="views of a grid whose squares have the sides squares_m",
-            do="correct squares_m in msg_configs, or the recorded magnifications",
+            do="correct --squares (squares_m of the configuration), or the recorded magnifications",
         )
     if odd:
         same = [v for v, misfit in zip(same, misfits, strict=True) if not misfit]
         views, assignment = _assign_squares(same, display_width_m, squares_m)
-    return CollectedViews(views, tuple(same), (*rejected, *other, *odd), assignment, image_size)
+    return CollectedViews(
+        views, tuple(same), (*rejected, *misread, *other, *odd), assignment, image_size
+    )
 
 
 def _assign_squares(
@@ -271,5 +337,5 @@ def _explain_misfit(apparent_m: float, squares_m: Sequence[float]) -> Rejection[
     return Rejection(
         ViewStatus.UNKNOWN_SQUARES,
         f"according to the other views its squares are {_format_micrometres([apparent_m])} um, but squares_m"
-        f" has {_format_micrometres(squares_m)} um: wrong magnification, or a size missing in squares_m",
+        f" has {_format_micrometres(squares_m)} um: wrong magnification, or a size missing in --squares",
     )

@@ -26,7 +26,7 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftSettings, DriftUpdate
 from semcal_ros.core.drift.frame_time import (
     SHEAR_OF_SHIFT_DISTORTED,
     SHEAR_OF_SHIFT_RECTIFIED,
@@ -79,7 +79,7 @@ class DriftFollower:
 
     def __init__(self, *, hindsight: bool = True) -> None:
         self.history = DriftHistory() if hindsight else None
-        self.tracker = DriftTracker(history=self.history)
+        self.tracker = DriftTracker(DriftSettings(similarity=True), history=self.history)
         self.updates: list[DriftUpdate] = []
         self._smoothed: DriftPath | None = None
 

@@ -31,7 +31,7 @@ from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.recordings import RecordedFrame, Recording, open_recording
+from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, Recording, open_recording
 
 __all__ = [
     "CalibrationSource",
@@ -47,9 +47,9 @@ __all__ = [
     "resolve_config",
 ]
 
-#: A bag, a folder of images, or images in memory: (image, magnification) or (image, magnification,
-#: time in s of its stamp), in the order of time.
-Source = str | os.PathLike[str] | Iterable[tuple[Any, ...]]
+#: A bag or image files, with :class:`.RecordedFiles` where they do not say everything themselves; or images in
+#: memory: (image, magnification) or (image, magnification, time in s of its stamp), in the order of time.
+Source = str | os.PathLike[str] | RecordedFiles | Iterable[tuple[Any, ...]]
 #: A calibration, or its file.
 CalibrationSource = Calibration | str | os.PathLike[str]
 #: A configuration, or the name or file of one.
@@ -191,13 +191,13 @@ def open_source(
 
     Raises
     ------
-    BagError, TiffError
+    BagError
         If the recording cannot be read.
     InvalidValueError
         If an image in memory cannot be used.
     """
-    if isinstance(source, (str, os.PathLike)):
-        return open_recording(Path(source), config, magnification=magnification)
+    if isinstance(source, (str, os.PathLike, RecordedFiles)):
+        return open_recording(source, config, magnification=magnification)
     if magnification is not None:
         raise InvalidValueError(
             "a magnification stated for images in memory", expected="one beside each image"
@@ -205,7 +205,7 @@ def open_source(
     if not isinstance(source, Iterable):
         raise InvalidValueError(
             f"a source of type {type(source).__name__}",
-            expected="a path, or (image, magnification) tuples",
+            expected="a path, RecordedFiles, or (image, magnification) tuples",
         )
     return _ImagesInMemory(source, config)
 

@@ -38,8 +38,8 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
-from semcal_ros.files.recordings import RecordedFrame
-from semcal_ros.files.tables import write_csv
+from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
+from semcal_ros.files.tables import write_table
 from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -124,11 +124,15 @@ class CantileverMeasurement:
     poses: int | None
     notes: tuple[str, ...]
 
-    def save_csv(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table of ``semcal measure cantilever``, one row for each frame.
+
+        The suffix is ``.csv``, ``.parquet`` or ``.xlsx``.
 
         Raises
         ------
+        InvalidValueError
+            If it is another one, or its library is missing.
         OSError
             If the file cannot be written; an existing one is untouched.
         """
@@ -150,11 +154,11 @@ class CantileverMeasurement:
             for one in self.series
             for k, frame in enumerate(one.measured.frames)
         )
-        write_csv(Path(path), CANTILEVER_COLUMNS, rows)
+        write_table(Path(path), CANTILEVER_COLUMNS, rows)
 
 
 def measure_cantilever(
-    source: Source | Sequence[str | os.PathLike[str]],
+    source: Source | Sequence[str | os.PathLike[str] | RecordedFiles],
     *,
     calibration: CalibrationSource,
     length_m: float,
@@ -213,11 +217,12 @@ def measure_cantilever(
         from semcal_ros import measure_cantilever
         bending = measure_cantilever("bending", calibration="jsm820.yaml", length_m=35e-6)
         bending.repeatability.deflection_m          # (magnifications, poses)
-        bending.save_csv("bending.csv")
+        bending.save("bending.csv")
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
-    runs, notes = _read(_list_sources(source), model, microscope, magnification)
+    runs, notes = _read(_list_sources(source), model, microscope, magnification, on_progress)
+    _check_counts(runs)
     ends = _pair_ends(bases, tips, len(runs))
     total = 2 * sum(len(run.images) for run in runs)
     advance = count_frames(on_progress, "bending", total)
@@ -270,14 +275,17 @@ class _Run:
         self.times_s.append(start_time_s(frame, first_ns, microscope))
 
 
-def _list_sources(source: Source | Sequence[str | os.PathLike[str]]) -> list[Source]:
+_PATHS = (str, os.PathLike, RecordedFiles)
+
+
+def _list_sources(
+    source: Source | Sequence[str | os.PathLike[str] | RecordedFiles],
+) -> list[Source]:
     """Recordings, each on its own; images in memory are one."""
-    if isinstance(source, (str, os.PathLike)):
-        return [source]
-    if not isinstance(source, Iterable):
+    if isinstance(source, _PATHS) or not isinstance(source, Iterable):
         return [source]
     entries = list(source)
-    paths = [entry for entry in entries if isinstance(entry, (str, os.PathLike))]
+    paths = [entry for entry in entries if isinstance(entry, _PATHS)]
     if paths and len(paths) == len(entries):
         return list(paths)
     if paths:
@@ -292,6 +300,7 @@ def _read(
     model: Calibration,
     microscope: MicroscopeConfig,
     magnification: float | None,
+    on_progress: OnProgress,
 ) -> tuple[list[_Run], list[str]]:
     """Frames by recording and magnification, in the order in which these first appear."""
     found: dict[tuple[Path, str], _Run] = {}
@@ -299,7 +308,9 @@ def _read(
     for source in sources:
         with open_source(source, microscope, magnification=magnification) as opened:
             path = opened.path
+            advance = count_frames(on_progress, "reading", opened.frame_count)
             for frame in opened.frames():
+                advance(1)
                 label = f"{frame.magnification:.6g}"
                 if (path, label) not in found:
                     camera = camera_for(frame, model, microscope)
@@ -319,6 +330,17 @@ def _read(
                     )
             notes += [f"{path}: {note}" for note in opened.notes]
     return list(found.values()), notes
+
+
+def _check_counts(runs: Sequence[_Run]) -> None:
+    """Refuse a magnification with a reference only: nothing bends in it."""
+    for run in runs:
+        if len(run.images) < 2:
+            raise BagError(
+                f"{run.recording}: 1 frame at {run.camera.magnification:g}x",
+                expected="2 frames or more at each magnification: the first is the reference without a load",
+                do="record the cantilever once without a load and then under it, at the same magnification",
+            )
 
 
 def _pair_ends(

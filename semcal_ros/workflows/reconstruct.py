@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from semcal_ros.applications.reconstruction import reconstruct as reconstruct_st
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.arrays import check_positive
+from semcal_ros.core.wording import counted
 from semcal_ros.files.meshes import UNITS_PER_M, save_cloud, save_mesh
 from semcal_ros.files.recordings import Recording
 from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
@@ -49,6 +50,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.workers import open_workers
 
 __all__ = ["Reconstruction", "describe_departure", "reconstruct"]
 
@@ -156,6 +158,7 @@ def reconstruct(
     spacing_px: float = 5.0,
     keyframes: int = 150,
     height_sigma_m: float = 10e-6,
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> Reconstruction:
     """Reconstruct a ball that turns: follow features, adjust points and poses, fit and mesh.
@@ -176,6 +179,9 @@ def reconstruct(
         Largest number of keyframes used; they are spread evenly.
     height_sigma_m
         1-sigma of the height above or below the plane of the calibration, m.
+    dask
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers compare the patches.
+        Features are followed here.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -196,22 +202,26 @@ def reconstruct(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
-    tracker = SequenceTracker(TrackerSettings(spacing_px=spacing_px))
+    tracker = SequenceTracker(TrackerSettings(spacing_px=spacing_px), keep_images=False)
     check_positive(keyframes, "keyframes =")
     if height_sigma_m != 0.0:
         check_positive(height_sigma_m, "height_sigma_m =")
-    with open_source(source, microscope) as opened:
-        outside = _track(opened, model, tracker, on_progress)
-        notes = list(opened.notes)
-    structure = reconstruct_structure(
-        _spread_evenly(tracker.finish(), keyframes),
-        microscope.scan,
-        on_step=lambda step: on_progress(step, 0, None),
-    )
+    with open_workers(dask) as workers:
+        with open_source(source, microscope) as opened:
+            outside = _track(opened, model, tracker, on_progress)
+            notes = list(opened.notes)
+            on_progress("reading keyframes", 0, None)
+            chosen = _read_images(opened, _spread_evenly(tracker.finish(), keyframes))
+        structure = reconstruct_structure(
+            chosen,
+            microscope.scan,
+            on_step=lambda step: on_progress(step, 0, None),
+            starmap=workers.starmap,
+        )
     on_progress("measuring the ball", 0, None)
     ball = measure_ball(structure, height_sigma_m=height_sigma_m)
     if outside:
-        notes.append(f"{outside} frames are outside the calibrated range")
+        notes.append(f"{counted(outside, 'frame is', 'frames are')} outside the calibrated range")
     if not ball.roundness.is_ball:
         notes.append(describe_departure(structure, ball))
     notes += _list_doubts(structure, microscope.scan is not None)
@@ -240,6 +250,19 @@ def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyfr
         return keyframes
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, most).round().astype(int))
     return [keyframes[int(k)] for k in chosen]
+
+
+def _read_images(opened: Recording, keyframes: list[TrackKeyframe]) -> list[TrackKeyframe]:
+    """Read the images of keyframes, which would not all fit into memory before they are chosen."""
+    wanted = {keyframe.index: number for number, keyframe in enumerate(keyframes)}
+    last = max(wanted, default=-1)
+    filled = list(keyframes)
+    for index, frame in zip(range(last + 1), opened.frames(), strict=False):
+        number = wanted.get(index)
+        if number is not None:
+            image = to_gray(frame.image, frame.encoding).copy()
+            filled[number] = replace(keyframes[number], image=image)
+    return filled
 
 
 def describe_departure(structure: Structure, ball: Ball) -> str:

@@ -17,11 +17,12 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from semcal_ros.bridge.names import absolute_namespace
 from semcal_ros.calibration import Calibration
@@ -29,9 +30,22 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.corrected import CorrectedBagWriter
 from semcal_ros.files.bags.writer import BagWriter
+from semcal_ros.files.images.image_file import is_image_file
+from semcal_ros.files.images.write import (
+    TIFF_SUFFIXES,
+    TiffStackWriter,
+    open_image_folder,
+    open_tiff_stack,
+    pixel_scale,
+    write_image,
+)
+from semcal_ros.files.recordings import RecordedFrame, Recording
+from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
@@ -50,6 +64,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.workers import open_workers
 
 __all__ = ["RectifiedFrame", "RectifiedRecording", "rectify"]
 
@@ -85,9 +100,9 @@ class RectifiedRecording:
     frame_count
         Number of frames.
     output
-        The bag that was written, or None.
+        The bag, file or folder that was written, or None.
     frames
-        The frames themselves; empty where they were written to a bag.
+        The frames themselves; empty where they were written.
     states
         Number of frames by the kind of drift, the most frequent first; empty where it was left in.
     extrapolated
@@ -120,6 +135,8 @@ def rectify(
     interpolation: str = "linear",
     namespace: str = "/sem",
     overwrite: bool = False,
+    scale_bar: bool = False,
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> RectifiedRecording:
     """Undo distortion and drift of each frame in one interpolation.
@@ -131,8 +148,10 @@ def rectify(
     source
         A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
     output
-        Bag to make, with camera_info and projection_stamped of each frame; without it, the frames are
-        returned, which takes the memory of all of them.
+        What to make, by its name: ``x.tif``, one TIFF of all frames, which must have one magnification;
+        ``x/``, a folder of TIFFs; ``x.png`` of a single frame; else a bag, with camera_info and
+        projection_stamped of each frame. TIFFs hold pixel size, times and conditions, in the depth of the
+        recording. Without it, the frames are returned, which takes the memory of all of them.
     calibration
         A calibration or its file.
     config
@@ -146,20 +165,27 @@ def rectify(
     namespace
         Of the topics in the bag.
     overwrite
-        Whether to replace an existing bag, once the new one is complete.
+        Whether to replace an existing bag or folder, once the new one is complete.
+    scale_bar
+        Whether to append a strip with a scale bar and its 1-sigma below each picture.
+    dask
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers resample the frames.
+        The drift is measured here.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
     Raises
     ------
     SemcalError
-        If calibration, configuration or recording cannot be read, or the bag exists.
+        If calibration, configuration or recording cannot be read, the output exists, or it cannot hold the
+        frames.
 
     Examples
     --------
     ::
 
         from semcal_ros import rectify
+        rectify("tiffs", "corrected/", calibration="jsm820.yaml")
         rectify("recordings/zoom", "zoom_rect", calibration="jsm820.yaml")
         flat = rectify("recordings/zoom", calibration="jsm820.yaml").images
     """
@@ -168,38 +194,181 @@ def rectify(
     follower = DriftFollower(hindsight=microscope.scan is None) if drift else None
     rectifier = Rectifier(interpolation)
     topics = absolute_namespace(namespace)
+    kind = None if output is None else _choose_kind(output, scale_bar)
     target = None if output is None else Path(output)
     frames: list[RectifiedFrame] = []
     states: Counter[str] = Counter()
-    extrapolated, first_ns, count = 0, None, 0
+    extrapolated, count = 0, 0
     with ExitStack() as open_files:
+        workers = open_files.enter_context(open_workers(dask))
         opened = open_files.enter_context(open_source(source, microscope))
-        bag = None
-        if target is not None:
-            writer = open_files.enter_context(BagWriter(target, overwrite=overwrite))
-            bag = CorrectedBagWriter(writer, topics, model.dumps())
+        write: _Write | None = None
+        if kind is not None and target is not None:
+            if kind == "bag":
+                writer = open_files.enter_context(BagWriter(target, overwrite=overwrite))
+                write = CorrectedBagWriter(writer, topics, model.dumps()).write
+            else:
+                write = _open_pictures(open_files, kind, target, opened, overwrite, scale_bar)
         advance = count_frames(on_progress, "rectifying", opened.frame_count)
-        for frame in opened.frames():
-            first_ns = frame.stamp_ns if first_ns is None else first_ns
-            camera = camera_for(frame, model, microscope)
+        under_way: deque[_Followed] = deque()
+
+        def orders() -> Iterator[tuple[object, ...]]:
+            for followed in _follow(opened, model, microscope, follower):
+                under_way.append(followed)
+                raster = None if followed.update is None else followed.update.raster
+                image = followed.frame.image
+                yield rectifier, image, followed.camera, raster, microscope.scan
+
+        for image in workers.starmap(Rectifier.rectify, orders()):
+            frame, camera, update = under_way.popleft()
             extrapolated += not camera.in_range
-            update = None
-            if follower is not None:
-                time_s = start_time_s(frame, first_ns, microscope)
-                update = follower.update(frame, time_s, camera, microscope.scan)
+            if update is not None:
                 states[update.kind] += 1
-            image = rectifier.rectify(
-                frame.image, camera, None if update is None else update.raster, microscope.scan
-            )
-            if bag is None:
+            if write is None:
                 frames.append(RectifiedFrame(image, frame.stamp_ns, camera.rectified, update))
             else:
-                bag.write(frame, image, camera, update)
+                write(frame, image, camera, update)
             count += 1
             advance(1)
+        on_progress("finishing", 0, None)
         notes = (*opened.notes, *_note_timing(microscope, follower, model))
     kinds = dict(states.most_common())
     return RectifiedRecording(count, target, tuple(frames), kinds, extrapolated, notes)
+
+
+_Write = Callable[[RecordedFrame, AnyImage, ScanCamera, "DriftUpdate | None"], None]
+
+
+def _choose_kind(output: str | os.PathLike[str], scale_bar: bool) -> str:
+    """What the name of an output asks for: ``tiff``, ``folder``, ``png`` or ``bag``."""
+    text = os.fspath(output)
+    path = Path(text)
+    if text.endswith("/"):
+        return "folder"
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        return "tiff"
+    if path.suffix.lower() == ".png":
+        return "png"
+    if is_image_file(path) or path.suffix.lower() in _OTHER_SUFFIXES:
+        raise InvalidValueError(
+            f"output {text} for corrected frames",
+            expected="x.tif, a folder of TIFFs x/, x.png of one frame, or a bag x without a suffix",
+            do="choose one of these names",
+        )
+    if scale_bar:
+        raise InvalidValueError(
+            f"a scale bar in the bag {text}",
+            expected="pictures, such as x.tif, x/ or x.png",
+            do="leave --scale-bar out, or choose one of these names",
+        )
+    return "bag"
+
+
+# What a bag is not called by mistake: its files, and what other commands write.
+_OTHER_SUFFIXES = (*TABLE_SUFFIXES, ".mcap", ".db3", ".yaml", ".json", ".html", ".svg", ".pdf")
+
+
+def _open_pictures(
+    open_files: ExitStack,
+    kind: str,
+    target: Path,
+    opened: Recording,
+    overwrite: bool,
+    scale_bar: bool,
+) -> _Write:
+    """Open a file or a folder of pictures, and return how a frame is written."""
+    if kind == "png":
+        if opened.frame_count != 1:
+            raise InvalidValueError(
+                f"{target} for {counted(opened.frame_count, 'frame')}",
+                expected="one frame for a PNG",
+                do="write x.tif, or a folder of TIFFs: x/",
+            )
+
+        def write_one(
+            frame: RecordedFrame, image: AnyImage, camera: ScanCamera, _: DriftUpdate | None
+        ) -> None:
+            write_image(target, _as_rgb(image, frame), pixel_scale(camera), databar=scale_bar)
+
+        return write_one
+    if kind == "folder":
+        folder = open_files.enter_context(
+            open_image_folder(target, overwrite=overwrite, databar=scale_bar)
+        )
+
+        def write_file(
+            frame: RecordedFrame, image: AnyImage, camera: ScanCamera, _: DriftUpdate | None
+        ) -> None:
+            folder.write(
+                _as_rgb(image, frame),
+                frame.stamp_ns,
+                pixel_scale(camera),
+                source_name=frame.file_name,
+                notes=_describe_frame(frame, camera),
+            )
+
+        return write_file
+    stack: TiffStackWriter | None = None
+
+    def write_page(
+        frame: RecordedFrame, image: AnyImage, camera: ScanCamera, _: DriftUpdate | None
+    ) -> None:
+        nonlocal stack
+        if stack is None:
+            stack = open_files.enter_context(
+                open_tiff_stack(
+                    target,
+                    expected_bytes=opened.frame_count * image.nbytes,
+                    databar=scale_bar,
+                    notes=_describe_frame(frame, camera),
+                )
+            )
+        stack.write(_as_rgb(image, frame), frame.stamp_ns, pixel_scale(camera))
+
+    return write_page
+
+
+def _as_rgb(image: AnyImage, frame: RecordedFrame) -> AnyImage:
+    return image[..., ::-1] if frame.encoding.startswith("bgr") else image
+
+
+def _describe_frame(frame: RecordedFrame, camera: ScanCamera) -> dict[str, object]:
+    """What a picture says about itself, in SI units."""
+    said: dict[str, object] = {
+        "magnification": frame.magnification,
+        "in_calibrated_range": camera.in_range,
+    }
+    if frame.conditions is not None:
+        # By themselves: the maker's pixel size is not that of the corrected picture.
+        known = frame.conditions.conditions().items()
+        said["conditions"] = {name: value for name, value in known if value not in (None, "")}
+    return said
+
+
+class _Followed(NamedTuple):
+    """A frame, its camera, and its drift where that is removed."""
+
+    frame: RecordedFrame
+    camera: ScanCamera
+    update: DriftUpdate | None
+
+
+def _follow(
+    opened: Recording,
+    model: Calibration,
+    microscope: MicroscopeConfig,
+    follower: DriftFollower | None,
+) -> Iterator[_Followed]:
+    """Read the frames, and measure their drift."""
+    first_ns = None
+    for frame in opened.frames():
+        first_ns = frame.stamp_ns if first_ns is None else first_ns
+        camera = camera_for(frame, model, microscope)
+        update = None
+        if follower is not None:
+            time_s = start_time_s(frame, first_ns, microscope)
+            update = follower.update(frame, time_s, camera, microscope.scan)
+        yield _Followed(frame, camera, update)
 
 
 def _note_timing(

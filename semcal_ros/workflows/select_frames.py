@@ -35,6 +35,7 @@ from semcal_ros.workflows.follow_drift import (
     estimate_timing,
     start_time_s,
 )
+from semcal_ros.workflows.inputs import OnProgress, count_frames, ignore_progress
 
 __all__ = ["FrameSelection", "select_frames"]
 
@@ -100,7 +101,7 @@ def select_frames(
     drift: bool = True,
     levels: bool = False,
     on_first: Callable[[RecordedFrame], object] = lambda _frame: None,
-    on_frame: Callable[[int], object] = lambda _frames: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> FrameSelection:
     """Read a recording for the first time: choose its frames and track their drift.
 
@@ -123,8 +124,8 @@ def select_frames(
         Whether black and white are wanted.
     on_first
         Called with the first chosen frame, to refuse it before any work is done.
-    on_frame
-        Called with 1 after each frame that was read, to show progress.
+    on_progress
+        Called with the stage, the number of frames done, and that of all frames.
 
     Raises
     ------
@@ -133,12 +134,12 @@ def select_frames(
         runs backwards.
     """
     reading = _Reading(opened, config, calibration, at, drift, levels)
-    taken, selection = reading.run(on_first, on_frame)
+    taken, selection = reading.run(on_first, on_progress)
     if taken.follower is None:
         return selection
     timed, note = estimate_timing(config, taken.follower, calibration)
     if timed is not config:
-        _, selection = replace(reading, config=timed).run(on_first, on_frame)
+        _, selection = replace(reading, config=timed).run(on_first, on_progress)
     return replace(selection, timing_note=note)
 
 
@@ -166,14 +167,16 @@ class _Reading:
     def run(
         self,
         on_first: Callable[[RecordedFrame], object],
-        on_frame: Callable[[int], object],
+        on_progress: OnProgress,
     ) -> tuple[_Taken, FrameSelection]:
         counts: Counter[str] = Counter()
         wanted = None if self.at is None else _format_magnification(self.at)
         taken = _Taken(DriftFollower() if self.drift else None)
         first: RecordedFrame | None = None
+        stage = "drift" if self.drift else "reading"
+        advance = count_frames(on_progress, stage, self.opened.frame_count)
         for index, frame in enumerate(self.opened.frames()):
-            on_frame(1)
+            advance(1)
             label = _format_magnification(frame.magnification)
             counts[label] += 1
             if label != (wanted or label) or (wanted is None and len(counts) > 1):
@@ -187,6 +190,8 @@ class _Reading:
             self._take(taken, index, frame, first)
         if first is None or (wanted is None and len(counts) > 1):
             self._refuse_magnifications(counts)
+        if self.drift:
+            on_progress("smoothing", 0, None)
         return taken, self._select(taken, first)
 
     def _take(self, taken: _Taken, index: int, frame: RecordedFrame, first: RecordedFrame) -> None:

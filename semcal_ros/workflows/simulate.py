@@ -23,6 +23,7 @@ from pathlib import Path
 
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
@@ -101,7 +102,11 @@ def plan_recording(
         For an unknown kind or name, or the wrong number of magnifications.
     """
     if kind not in PLAN_KINDS:
-        raise InvalidValueError(f"plan {kind!r}", expected="one of " + ", ".join(PLAN_KINDS))
+        raise InvalidValueError(
+            f"plan {kind!r}",
+            expected="one of " + ", ".join(PLAN_KINDS),
+            do=did_you_mean(kind, PLAN_KINDS),
+        )
     chosen = check_positives(magnifications, "magnifications")
     wanted = _MAGNIFICATIONS.get(kind, len(chosen))
     if chosen and len(chosen) != wanted:

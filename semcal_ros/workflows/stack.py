@@ -17,24 +17,31 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.arrays import Mask, check_positive
+from semcal_ros.core.arrays import AnyImage, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import BagError, InvalidValueError
-from semcal_ros.core.rectification.stack import Stack, StackedImage
-from semcal_ros.files.grey_images import GREY_SUFFIXES, TIFF_SUFFIXES, write_grey_image
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.stack import Stack, StackedImage, StackSums
+from semcal_ros.core.wording import counted, omit_numbers
+from semcal_ros.files.images.scale_bar import choose_scale_bar
+from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES, pixel_scale, write_image
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.files.video import VideoWriter, check_video, open_video
+from semcal_ros.files.video import check_video, open_video, shade
 from semcal_ros.workflows.follow_drift import camera_for
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -48,8 +55,13 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 from semcal_ros.workflows.select_frames import FrameSelection, select_frames
+from semcal_ros.workflows.workers import open_workers
 
 __all__ = ["StackResult", "stack"]
+
+# Frames that are added up by themselves before their sums are added to the others'. Of 8-bit
+# frames, so many have the size of their sums, which come back from a cluster.
+_FRAMES_PER_PART = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,28 +109,56 @@ class StackResult:
         return 0 if self.path is None else int((self.path.accepted & ~self.used).sum())
 
     @property
+    def reasons(self) -> Mapping[str, int]:
+        """Number of frames left out by the reason, the most frequent first."""
+        if self.path is None:
+            return {}
+        left_out = Counter(
+            omit_numbers(update.reason) or "after tracking was lost"
+            for update, used in zip(self.path.updates, self.used, strict=True)
+            if not used
+        )
+        return dict(left_out.most_common())
+
+    @property
     def typical_error(self) -> float | None:
         """Median of the standard error over the pixels, grey levels; None where there is none."""
         error = self.image.standard_error
         known = np.isfinite(error)
         return float(np.median(error[known])) if known.any() else None
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, scale_bar: bool = False) -> None:
         """Write the mean: ``.tif`` (32-bit, with the size of its square pixels) or ``.png`` (as deep as the
         recording).
+
+        Parameters
+        ----------
+        path
+            The file.
+        scale_bar
+            Whether to append a strip with a scale bar and its 1-sigma.
 
         Raises
         ------
         InvalidValueError
             If the suffix is not one of these, or a PNG cannot hold the grey levels.
-        OSError
+        OSError, BagError
             If the file cannot be written; an existing one is untouched.
         """
-        write_grey_image(Path(path), self.image.mean, self.camera.pixel_size_m, self.dtype)
+        file, levels = Path(path), self.image.mean
+        if file.suffix.lower() == ".png" and self.dtype.kind == "u":
+            top = np.iinfo(self.dtype).max
+            levels = np.clip(np.rint(np.nan_to_num(levels)), 0, top).astype(self.dtype)
+        self._write(file, levels, scale_bar)
 
     def save_sigma(self, path: str | os.PathLike[str]) -> None:
         """Write the standard error of the mean to a ``.tif``; raises as :meth:`save`."""
-        write_grey_image(Path(path), self.image.standard_error, self.camera.pixel_size_m)
+        self._write(Path(path), self.image.standard_error, scale_bar=False)
+
+    def _write(self, path: Path, image: AnyImage, scale_bar: bool) -> None:
+        scale = pixel_scale(self.camera)
+        notes = {"magnification": self.camera.magnification, "frames": self.image.frames}
+        write_image(path, image, scale, stamp_ns=self.stamps_ns[0], databar=scale_bar, notes=notes)
 
 
 def stack(
@@ -135,6 +175,8 @@ def stack(
     fps: float = 10.0,
     output: str | os.PathLike[str] | None = None,
     sigma: str | os.PathLike[str] | None = None,
+    scale_bar: bool = False,
+    dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> StackResult:
     """Average frames, each shifted to the specimen's position in the first frame.
@@ -164,6 +206,11 @@ def stack(
     output, sigma
         Files of the average and of its standard error, as :meth:`StackResult.save` and
         :meth:`StackResult.save_sigma` write them.
+    scale_bar
+        Whether the average gets a strip with a scale bar; the video has one in any case.
+    dask
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers resample and add up
+        the frames. The drift is measured here.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -191,9 +238,12 @@ def stack(
         check_video(film_path, fps)
     if at is not None:
         at = check_positive(at, "at =")
-    _check_suffix(output, GREY_SUFFIXES)
+    _check_suffix(output, IMAGE_SUFFIXES)
     _check_suffix(sigma, TIFF_SUFFIXES)
-    with open_source(source, microscope, magnification=magnification) as opened:
+    with (
+        open_workers(dask) as workers,
+        open_source(source, microscope, magnification=magnification) as opened,
+    ):
         selection = select_frames(
             opened,
             microscope,
@@ -202,16 +252,35 @@ def stack(
             drift=drift,
             levels=film_path is not None,
             on_first=lambda frame: _check_output(output, frame),
-            on_frame=count_frames(on_progress, "drift" if drift else "reading", opened.frame_count),
+            on_progress=on_progress,
         )
         used = _choose_usable(selection)
         summed = Stack(selection.size, interpolation)
         grey = _choose_video_levels(selection)
-        with open_video(film_path, selection.size, len(selection.indices), fps, grey) as film:
-            _add_frames(opened, model, selection, used, summed, film, on_progress)
+        count = len(selection.indices)
+        with open_video(film_path, selection.size, count, fps) as film:
+            advance = count_frames(on_progress, "averaging", int(used.sum()))
+            frames = _read_chosen(opened, model, selection, used, film is not None)
+            levels = None if film is None else grey
+            scale = pixel_scale(selection.camera)
+            bar = choose_scale_bar(selection.size[0], scale.size_m, scale.sigma_m)
+            # In this process, a part is read frame by frame while it is added up.
+            orders = (
+                (list(part) if workers.elsewhere else part, selection.config.scan)
+                + (selection.size, interpolation, levels)
+                for _, part in groupby(frames, lambda frame: frame.number // _FRAMES_PER_PART)
+            )
+            for sums, images in workers.starmap(add_part, orders):
+                summed.merge(sums)
+                for number, image in images:
+                    assert film is not None
+                    caption = _format_caption(selection.times_s, number, bool(used[number]))
+                    film.write(image, caption, bar)
+                advance(sums.frames)
         notes = opened.notes
     if selection.timing_note:
         notes = (*notes, selection.timing_note)
+    on_progress("finishing", 0, None)
     result = StackResult(
         summed.result(),
         selection.camera.rectified,
@@ -227,7 +296,7 @@ def stack(
     if sigma is not None:
         result.save_sigma(sigma)
     if output is not None:
-        result.save(output)
+        result.save(output, scale_bar=scale_bar)
     return result
 
 
@@ -256,7 +325,7 @@ def _choose_usable(selection: FrameSelection) -> Mask:
     usable = selection.path.trusted
     if not usable.any():
         raise BagError(
-            f"{len(usable)} frames, none of them with a known drift; the first: "
+            f"{counted(len(usable), 'frame')}, none of them with a known drift; the first: "
             f"{selection.path[0].status_text}",
             expected="a specimen with structure",
             do="check with `semcal drift`, or average the frames where they are with --no-drift",
@@ -264,30 +333,56 @@ def _choose_usable(selection: FrameSelection) -> Mask:
     return usable
 
 
-def _add_frames(
+class _Frame(NamedTuple):
+    """A chosen frame: its number among them, and what it needs to be added."""
+
+    number: int
+    image: NDArray[Any]
+    camera: ScanCamera
+    drift: RasterDrift | None
+    used: bool
+
+
+def _read_chosen(
     opened: Recording,
     model: Calibration | None,
     selection: FrameSelection,
     used: Mask,
-    summed: Stack,
-    film: VideoWriter | None,
-    on_progress: OnProgress,
-) -> None:
+    unused_too: bool,
+) -> Iterator[_Frame]:
+    """Read the chosen frames, of which a video shows those, too, that are not used."""
     number_of = {index: number for number, index in enumerate(selection.indices)}
-    advance = count_frames(on_progress, "averaging", opened.frame_count)
     for index, frame in enumerate(opened.frames()):
-        advance(1)
         number = number_of.get(index)
-        if number is None or (film is None and not used[number]):
+        if number is None or not (used[number] or unused_too):
             continue
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        image, valid = summed.rectify(grey, camera, drift, selection.config.scan)
-        if used[number]:
+        yield _Frame(number, grey, camera, drift, bool(used[number]))
+
+
+def add_part(
+    frames: Iterable[_Frame],
+    scan: ScanTiming | None,
+    size: tuple[int, int],
+    interpolation: str,
+    levels: tuple[float, float] | None,
+) -> tuple[StackSums, list[tuple[int, NDArray[np.uint8]]]]:
+    """Add up some frames, away from all others.
+
+    Returns
+    -------
+    Their sums; number and image of each for a video, where ``levels`` are shown as black and white.
+    """
+    summed, images = Stack(size, interpolation), []
+    for frame in frames:
+        image, valid = summed.rectify(frame.image, frame.camera, frame.drift, scan)
+        if frame.used:
             summed.add(image, valid)
-        if film is not None:
-            film.write(image, _format_caption(selection.times_s, number, bool(used[number])))
+        if levels is not None:
+            images.append((frame.number, shade(image, levels)))
+    return summed.sums(), images
 
 
 def _choose_video_levels(selection: FrameSelection) -> tuple[float, float]:

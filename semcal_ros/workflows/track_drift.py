@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.estimates import DriftEstimate, DriftPath, DriftPredictor
 from semcal_ros.files.recordings import Recording
-from semcal_ros.files.tables import DRIFT_COLUMNS, write_csv
+from semcal_ros.files.tables import DRIFT_COLUMNS, SIMILARITY_COLUMNS, write_table
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
@@ -86,28 +86,51 @@ class DriftTrack:
     def forecast(self, after_s: float) -> DriftEstimate:
         """Forecast the drift ``after_s`` seconds after the last frame.
 
+        Its covariance is infinite if no drift was measured.
+
         Raises
         ------
         InvalidValueError
             If that is negative or not finite.
         """
-        return self.predictor.at(float(self.path.time_s[-1]) + after_s)
+        forecast = self.predictor.at(float(self.path.time_s[-1]) + after_s)
+        if self.path.followed:
+            return forecast
+        return replace(forecast, covariance=np.diag(np.full(4, np.inf)))
 
-    def save_csv(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table of ``semcal drift``.
+
+        The suffix is ``.csv``, ``.parquet`` or ``.xlsx``.
 
         Raises
         ------
+        InvalidValueError
+            If it is another one, or its library is missing.
         OSError
             If the file cannot be written; an existing one is untouched.
         """
         drift = self.path
         sigma_m = drift.sigma_m
-        rows = (
+        rows: list[tuple[object, ...]] = [
             (stamp_ns, *drift.drift_m[k], *sigma_m[k], *drift.drift_px[k], drift[k].status_text)
             for k, stamp_ns in enumerate(self.stamps_ns)
-        )
-        write_csv(Path(path), DRIFT_COLUMNS, rows)
+        ]
+        columns: tuple[str, ...] = DRIFT_COLUMNS
+        if drift.turns:
+            columns += SIMILARITY_COLUMNS
+            pairs = zip(drift.similarity[:, :2], drift.similarity_sigma, strict=True)
+            turns = [np.column_stack(pair).ravel() for pair in pairs]
+            rows = [(*row, *turn) for row, turn in zip(rows, turns, strict=True)]
+        write_table(Path(path), columns, rows)
+
+
+def _describe_similarity(path: DriftPath) -> str:
+    """Describe the rotation and the scale of the last frame."""
+    (angle, log_scale), sigma = path.similarity[-1, :2], path.similarity_sigma[-1]
+    turn = f"{np.degrees(angle):.4f} +- {np.degrees(sigma[0]):.4f} deg"
+    scale = f"{100.0 * log_scale:.3f} +- {100.0 * sigma[1]:.3f} %"
+    return f"the image turned by {turn} and grew by {scale} from the first frame to the last"
 
 
 def track_drift(
@@ -151,22 +174,27 @@ def track_drift(
         from semcal_ros import track_drift
         track = track_drift("recordings/gold", calibration="jsm820.yaml")
         track.path.drift_m, track.path.sigma_m      # (n, 2), m
-        track.save_csv("drift.csv")
+        track.save("drift.csv")
     """
     model = resolve_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
     with open_source(source, microscope) as opened:
         stamps_ns, follower = _follow(opened, model, microscope, on_progress)
+        on_progress("smoothing", 0, None)
         timed, note = estimate_timing(microscope, follower, model)
         if timed is not microscope and live:
             note += f"; {GIVE_FRAME_TIME}"  # live, this could not have been known
         elif timed is not microscope:
             microscope = timed
             stamps_ns, follower = _follow(opened, model, microscope, on_progress)
+            on_progress("smoothing", 0, None)
         notes = [*opened.notes, *([note] if note else [])]
+    path = _state_ignorance(follower.path(live=live))
+    if path.turns:
+        notes.append(_describe_similarity(path))
     return DriftTrack(
         tuple(stamps_ns),
-        follower.path(live=live),
+        path,
         dict(Counter(update.kind for update in follower.updates).most_common()),
         follower.tracker.predictor(),
         microscope,
@@ -174,9 +202,22 @@ def track_drift(
     )
 
 
+def _state_ignorance(path: DriftPath) -> DriftPath:
+    """Make the covariance infinite where no frame was matched: the filter's is that of a typical drift only."""
+    if path.followed:
+        return path
+    unknown = np.diag(np.full(4, np.inf))
+    return DriftPath(
+        [
+            update if trusted else replace(update, covariance=unknown)
+            for update, trusted in zip(path.updates, path.trusted, strict=True)
+        ]
+    )
+
+
 def describe_rate(path: DriftPath) -> str:
-    """Describe the drift rate at the last frame with its 1-sigma in nm/s; empty for a single frame."""
-    if len(path) < 2:
+    """Describe the drift rate at the last frame with its 1-sigma in nm/s; empty where none was measured."""
+    if not path.followed:
         return ""
     x, y = _format_lengths(path.velocity_m_s[-1], path.velocity_sigma_m_s[-1])
     return f"final drift rate: x {x}, y {y} nm/s"

@@ -32,7 +32,13 @@ from semcal_ros.bridge.calibration_text import (
     fill_calibration_text,
 )
 from semcal_ros.bridge.camera_info import fill_camera_info
-from semcal_ros.bridge.drift import UNKNOWN_VARIANCE, fill_drift, fill_drift_velocity
+from semcal_ros.bridge.drift import (
+    UNKNOWN_VARIANCE,
+    fill_drift,
+    fill_drift_velocity,
+    rotation_of,
+    rotation_rate_of,
+)
 from semcal_ros.bridge.fields import new_nested
 from semcal_ros.bridge.headers import (
     fill_header,
@@ -44,6 +50,7 @@ from semcal_ros.bridge.projection import fill_projection, projection_from_messag
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message
+from tests.helpers.drift_scenes import make_drift_update
 
 New = Callable[[str], Any]
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -158,6 +165,32 @@ def test_drift_velocity(new: New, header: Any) -> None:
     np.testing.assert_array_equal(matrix[:2, :2], COVARIANCE[2:, 2:])
     fill_drift_velocity(message, [3e-10, 4e-10], COVARIANCE[2:, 2:], header)
     np.testing.assert_array_equal(np.reshape(message.twist.covariance, (6, 6)), matrix)
+
+
+def test_a_specimen_that_turns_does_so_about_z(new: New, header: Any) -> None:
+    update = make_drift_update(
+        similarity=np.array([0.02, 1e-3, 3e-4, 1e-5]),
+        similarity_covariance=np.diag([4e-8, 1e-8, 9e-10, 1e-10]),
+    )
+    message = new(POSE)
+    fill_drift(message, update.drift_m, COVARIANCE, header, rotation_of(update))
+    message = through_the_wire(message)
+    orientation = message.pose.pose.orientation
+    assert (orientation.x, orientation.y) == (0.0, 0.0)
+    assert (orientation.z, orientation.w) == pytest.approx((np.sin(0.01), np.cos(0.01)))
+    assert np.diag(np.reshape(message.pose.covariance, (6, 6)))[2:] == pytest.approx(
+        [UNKNOWN_VARIANCE] * 3 + [4e-8]
+    )
+    message = new(TWIST)
+    fill_drift_velocity(message, [0.0, 0.0], COVARIANCE, header, rotation_rate_of(update))
+    message = through_the_wire(message)
+    assert message.twist.twist.angular.z == pytest.approx(3e-4)
+    assert message.twist.covariance[35] == pytest.approx(9e-10)
+
+
+def test_a_rotation_that_was_not_found_is_none() -> None:
+    update = make_drift_update(similarity_covariance=np.diag([1e-8, 1e-8, np.inf, np.inf]))
+    assert rotation_of(update) is None and rotation_rate_of(update) is None
 
 
 @pytest.mark.parametrize(

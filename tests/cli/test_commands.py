@@ -166,6 +166,15 @@ def test_info_counts(folder, capsys):
     assert "/sem/image_raw" in out
     assert "4 frames" in out
     assert "4 magnifications, 500 to 2000" in out
+    assert "scale: recorded magnifications, display width 0.12 m" in out
+    assert "interval: median" in out and "grey levels:" in out
+    capsys.readouterr()
+    assert run("info", folder / "zoom", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [s["frames"] for s in found["settings"]] == [1, 1, 1, 1]
+    assert found["settings"][0]["pixel_size_m"] == pytest.approx(
+        found["display_width_m"] / 500 / 512
+    )
 
 
 @pytest.mark.slow
@@ -212,7 +221,7 @@ def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     assert "missing" in refused(capsys, "rectify", folder / "grid").lower()
     assert "not valid YAML" in refused(capsys, "at", _file(tmp_path / "a.yaml", "a: [1"), 100)
     assert "not a calibration" in refused(capsys, "at", _file(tmp_path / "b.yaml", "a: 1"), 100)
-    newer = cal.read_text().replace("version: 1", "version: 2")
+    newer = cal.read_text().replace("\nversion: 2\n", "\nversion: 999\n")
     assert "update" in refused(capsys, "at", _file(tmp_path / "n.yaml", newer), 100)
     assert "folder" in refused(
         capsys, "calibrate", folder / "grid", "-o", tmp_path / "x" / "c.yaml"
@@ -295,7 +304,7 @@ def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
     ("options", "reason"),
     [
         (("--height-sigma", "10 furlongs"), "is not a length such as 10um"),
-        (("--height-sigma", "-1um"), "is not a length such as 10um"),
+        (("--height-sigma", "-1um"), "'-1um' is not 0 or above"),
         (("--squares-sigma", "0.5"), "0.5 is not in the range"),
         (("--untilted", "99"), "untilted '99'; expected numbers or file names of frames"),
     ],
@@ -304,6 +313,17 @@ def test_what_a_calibration_knows_beforehand_is_checked(folder, tmp_path, capsys
     command = ("calibrate", folder / "grid", "-o", tmp_path / "cal.yaml", *options)
     assert reason in refused(capsys, *command)
     assert not (tmp_path / "cal.yaml").exists()
+
+
+def test_units_far_off_give_status_1_one_line_and_no_file(folder, tmp_path, capsys):
+    written = tmp_path / "cal.yaml", tmp_path / "cal.html"
+    outputs = ("-o", written[0], "--report", written[1])
+    assert run("calibrate", folder / "grid", *outputs, "--display-width", "60m") == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.strip().splitlines()
+    assert "a display width of 60m and squares of" in line
+    assert not any(path.exists() for path in written)
 
 
 @pytest.mark.slow
@@ -343,7 +363,7 @@ def test_evaluate_says_how_far_nm_per_pixel_is_off(folder, tmp_path, capsys):
     [
         (("--stage", "three-axis"), "three-axis"),
         (("--eucentric-error", "wide"), "'wide' is not a length such as 10um"),
-        (("--eucentric-error", "-10um"), "'-10um' is not a length such as 10um"),
+        (("--eucentric-error", "-10um"), "'-10um' is not 0 or above"),
         (("--eucentric-error", "2cm"), "'2cm' is not a length such as 10um"),
         (("--eucentric-error", "20mm"), "misses the specimen by 20000 and 0 um"),
         (

@@ -601,7 +601,7 @@ def test_without_ros_it_says_so_and_checks_the_rest(
     assert status == 1
     lines = output.splitlines()
     # Problems first, after the counts.
-    assert lines[0].startswith("1 problems, ")
+    assert lines[0].startswith("1 problem, ")
     levels = [line.split(maxsplit=1)[0] for line in lines[1:] if not line.startswith(" ")]
     assert levels == sorted(levels, key=["problem", "note", "ok"].index)
     assert set(levels) == {"problem", "note", "ok"}
@@ -674,7 +674,7 @@ def test_what_is_wrong_with_a_recording_is_named(
     write_recording(path, [1000.0, 2000.0], size=32, lead_s=-0.001)
     status, output = doctor(capsys, str(path), "--config", "virtual_sem")
     assert status == 0
-    assert "note     magnification: 1 images come before the first one" in output
+    assert "note     magnification: 1 image comes before the first one" in output
     status, output = doctor(capsys, str(path), "--config", "pixel_size_nm")
     assert status == 1
     first = output.splitlines()[1]

@@ -22,6 +22,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import av
 import cv2
@@ -39,6 +40,7 @@ from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.workflows.track_drift import describe_rate
+from tests.files.tiff.test_to_bag import write_tescan
 from tests.helpers.drift_scenes import make_drift_update
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
@@ -158,7 +160,9 @@ def test_plots_are_refused_before_any_work(gold, tmp_path, capsys):
     assert "folder" in refused(
         capsys, "drift", gold, "-o", table, "--plot", tmp_path / "no" / "d.png"
     )
-    assert "another output" in refused(capsys, "drift", gold, "-o", "d.png", "--plot", "d.png")
+    assert "another output" in refused(capsys, "stack", gold, "-o", "m.tif", "--sigma", "m.tif")
+    suffixes = "a name that ends in .csv, .parquet, .xlsx"
+    assert suffixes in refused(capsys, "drift", gold, "-o", tmp_path / "d.png")
     assert not list(tmp_path.iterdir())
 
 
@@ -198,13 +202,16 @@ def test_the_pixel_size_is_in_the_tiff(gold, tmp_path, capsys):
     out = tmp_path / "mean.tiff"
     assert run("stack", gold, "--calibration", tmp_path / "cal.yaml", "-o", out) == 0
     with tifffile.TiffFile(out) as file:
-        assert file.is_imagej and file.imagej_metadata["unit"] == "um"
-        tags = file.pages[0].tags
-        per_um = [np.divide(*tags[name].value) for name in ("XResolution", "YResolution")]
-        assert file.pages[0].dtype == np.float32 and file.pages[0].shape == (SIZE, SIZE)
+        page = file.pages[0]
+        # The resolution tags are what ImageJ reads, OME-XML what Bio-Formats does.
+        assert page.tags["ResolutionUnit"].value == 3  # cm
+        per_cm = [np.divide(*page.tags[name].value) for name in ("XResolution", "YResolution")]
+        assert page.dtype == np.float32 and page.shape == (SIZE, SIZE)
+        stated = float(re.search('PhysicalSizeX="([^"]+)"', file.ome_metadata)[1])
     # The 96 px of the calibration and the 160 px of the frames show the same field.
-    expected = 1e6 * np.array(model.at(G).rectified.pixel_size_m) * 96 / SIZE
-    np.testing.assert_allclose(1 / np.array(per_um), expected, rtol=1e-6)
+    expected = np.array(model.at(G).rectified.pixel_size_m) * 96 / SIZE
+    np.testing.assert_allclose(0.01 / np.array(per_cm), expected, rtol=1e-6)
+    assert stated == pytest.approx(1e6 * expected[0], rel=1e-9)
 
 
 def test_frames_without_drift_are_left_out(blanked, tmp_path, capsys):
@@ -303,7 +310,7 @@ def test_frames_of_another_size_are_left_out(gold, tmp_path, capsys):
     assert run("stack", mixed, "-o", tmp_path / "m.tif") == 0
     captured = capsys.readouterr()
     assert f"{FRAMES - 1} of {FRAMES - 1} frames averaged" in captured.out
-    assert "note: 1 frames of another size" in captured.err
+    assert "note: 1 frame of another size" in captured.err
 
 
 def test_after_a_move_of_the_stage_nothing_is_averaged(tmp_path, capsys):
@@ -478,3 +485,81 @@ def test_help_has_an_example(capsys):
     assert "semcal stack recordings/gold" in capsys.readouterr().out
     assert run("--help") == 0
     assert "  stack " in capsys.readouterr().out
+
+
+def test_the_video_of_a_drift_shows_it_and_its_correction(gold, tmp_path):
+    """The right half stands still, the left one does not."""
+    video = tmp_path / "d.avi"
+    common = ("drift", gold, "--config", "virtual_sem", "-o", tmp_path / "d.csv")
+    assert run(*common, "--video", video) == 0
+    frames = np.stack(_frames(video)).astype(np.float64)
+    if frames.ndim == 4:
+        frames = frames[..., 0]
+    assert len(frames) == FRAMES
+    inner = slice(30, SIZE - 60)  # above the caption and the bar
+    left, right = frames[:, inner, 30 : SIZE - 30], frames[:, inner, -SIZE + 30 : -30]
+    changes = [float(np.std(half - half[0], axis=0)[...].mean()) for half in (left, right)]
+    # What remains on the right is noise.
+    assert changes[0] > 1.3 * changes[1]
+
+
+def test_corrected_pictures_are_those_of_the_bag(gold, tmp_path, capsys):
+    make_calibration().save(tmp_path / "cal.yaml")
+    common = ("rectify", gold, "--calibration", tmp_path / "cal.yaml", "--config", "virtual_sem")
+    assert run(*common, "-o", tmp_path / "bag") == 0
+    with open_bag(tmp_path / "bag") as bag:
+        messages = [m.message for m in bag.messages(["/sem/image_rect"])]
+    images = [image_from_message(message) for message in messages]
+    assert run(*common, "-o", tmp_path / "all.tif", "--scale-bar") == 0
+    with tifffile.TiffFile(tmp_path / "all.tif") as file:
+        pages, said = file.asarray(), file.ome_metadata
+    assert pages.dtype == np.uint8
+    # The databar stands below; the picture is what it is in the bag.
+    np.testing.assert_array_equal(pages[:, :SIZE], images)
+    assert pages.shape[1] > SIZE
+    # As long as nothing is known about more pixels than the calibration's.
+    expected_m = make_calibration().at(G).resized(SIZE, SIZE).rectified.pixel_size_m[0]
+    stated = float(re.search('PhysicalSizeX="([^"]+)"', said)[1])
+    assert stated == pytest.approx(1e6 * expected_m, rel=1e-9)
+    times = [float(t) for t in re.findall('DeltaT="([^"]+)"', said)]
+    start_ns = stamp_ns_from_msg(messages[0].header)
+    expected_s = [1e-9 * (stamp_ns_from_msg(m.header) - start_ns) for m in messages]
+    assert times == pytest.approx(expected_s)
+    # The pictures are a recording again: the same field, without the databar.
+    capsys.readouterr()
+    assert run("info", tmp_path / "all.tif") == 0
+    assert f"{FRAMES} x {SIZE} x {SIZE} mono8" in capsys.readouterr().out
+    assert run(*common, "-o", f"{tmp_path}/pictures/") == 0
+    files = sorted((tmp_path / "pictures").iterdir())
+    np.testing.assert_array_equal([tifffile.imread(f) for f in files], images)
+
+
+def test_a_corrected_file_says_its_own_pixel_size_and_how_it_was_taken(tmp_path):
+    write_tescan(tmp_path / "t.tif", 50e-9, (96, 96), "10:00:00", angles="HV=15000.0\n")
+    calibration = make_calibration()
+    calibration.save(tmp_path / "cal.yaml")
+    common = ("rectify", tmp_path / "t.tif", "--calibration", tmp_path / "cal.yaml")
+    assert run(*common, "-o", f"{tmp_path}/out/", "--no-drift") == 0
+    with tifffile.TiffFile(tmp_path / "out" / "t.tif") as file:
+        text = ElementTree.fromstring(file.ome_metadata)
+    said = json.loads(next(e.text for e in text.iter() if e.tag.endswith("Description")))
+    g = calibration.display_width_m / (96 * 50e-9)
+    assert said["pixel_size_m"] == pytest.approx(calibration.at(g).rectified.pixel_size_m[0])
+    assert said["conditions"]["acceleration_voltage_v"] == 15000.0
+    assert said["conditions"]["maker"] == "tescan"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("x.mcap", "expected x.tif, a folder of TIFFs x/"),
+        ("x.jpg", "expected x.tif, a folder of TIFFs x/"),
+        ("x.png", "x.png for 9 frames; expected one frame for a PNG"),
+        ("bag", "a scale bar in the bag"),
+    ],
+)
+def test_names_that_contradict_are_refused(gold, tmp_path, capsys, name, reason):
+    make_calibration().save(tmp_path / "cal.yaml")
+    more = ("-o", tmp_path / name, "--scale-bar")
+    assert reason in refused(capsys, "rectify", gold, "--calibration", tmp_path / "cal.yaml", *more)
+    assert not (tmp_path / name).exists()

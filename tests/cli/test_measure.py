@@ -19,7 +19,6 @@ from __future__ import annotations
 import csv
 import struct
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -162,6 +161,13 @@ def test_a_folder_of_tiffs(bits, images, calibration, tmp_path, capsys):
         assert row["drift_status"] == "tracked"
 
 
+def test_a_single_frame_is_refused_in_one_line(images, calibration, tmp_path, capsys):
+    one = recorded(tmp_path / "one", PLAN, images, (0,))
+    command = ("measure", "cantilever", one, "--calibration", calibration, *LENGTH)
+    line = refused(capsys, *command, "--config", "virtual_sem", "-o", tmp_path / "d.csv")
+    assert "one: 1 frame at 6450x; expected 2 frames or more" in line
+
+
 def test_recordings_of_their_own_and_clicks(bag, images, calibration, tmp_path, capsys):
     """One recording per magnification, the larger one first; base and tip given for each."""
     large = recorded(tmp_path / "large", PLAN, images, (1, 3))
@@ -198,7 +204,7 @@ def test_what_is_refused(bag, calibration, tmp_path, capsys):
 
 
 def test_a_recording_without_a_cantilever(calibration, tmp_path, capsys):
-    blank = {0: np.full((SIZE, SIZE), 90, np.uint8)}
-    bag = recorded(tmp_path / "blank", replace(PLAN, frames=PLAN.frames[:1]), blank, (0,))
+    blank = dict.fromkeys((0, 2), np.full((SIZE, SIZE), 90, np.uint8))
+    bag = recorded(tmp_path / "blank", PLAN, blank, (0, 2))
     command = ("measure", "cantilever", bag, "--calibration", calibration, *LENGTH)
     assert "no strip in the image" in refused(capsys, *command, "-o", tmp_path / "d.csv")

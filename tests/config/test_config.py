@@ -237,6 +237,8 @@ def test_without_scan_a_frame_is_an_instant() -> None:
         ("scan.frame_time_s", 0),
         ("scan.frame_time_s", float("nan")),
         ("scan.averages", 0),
+        ("scan.line_averages", 0),
+        ("scan.recursive_averages", 1.5),
         ("scan.flyback_fraction", 1),
         ("scan.flyback_fraction", float("nan")),
         ("squares_m", []),

@@ -205,6 +205,10 @@ class Soak:
 
     def _unplug(self, name: str) -> None:
         assert self.network is not None
+        # Fast DDS never uses a network that was down when its process started.
+        for node in self._nodes:
+            if node.startswith(f"/{name}/"):
+                self._until(lambda n=node: self._watch.states(n), f"{node} to report")
         self.network.plug(name, connected=False)
         self._stream(UNPLUGGED_S)
         self.network.plug(name, connected=True)
@@ -214,6 +218,9 @@ class Soak:
         assert node.alive(), f"{name}: {node.output}"
         assert "Traceback" not in node.output, node.output
         node.kill()
+        # What it said last is still on its way.
+        self.peer.spin(FRAME_PERIOD_S)
+        self._watch.forget()
         node.start_again()
         self.restarts[name] += 1
         self._memory.pop(name, None)
@@ -303,7 +310,12 @@ class Soak:
             k.node: [m.header.stamp.nanosec for m in v][-8:] for k, v in self._outputs.items()
         }
         states = {name: self._watch.latest(name).get("message") for name in self._nodes}
-        return f"newest {newest}; {states}; {self.history[-12:]}"
+        silent = {
+            name: (node.alive(), node.output[-600:])
+            for name, node in self._nodes.items()
+            if states[name] is None
+        }
+        return f"newest {newest}; {states}; {self.history[-12:]}; silent: {silent}"
 
     def _comes_through(self) -> bool:
         wanted = set(range(self._number - QUIET_FRAMES, self._number))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -138,7 +139,11 @@ def test_a_workspace_has_all_executables_in_its_folder(
     assert (prefix / "share/ament_index/resource_index/packages/semcal_ros").is_file()
     # rosdep provides the dependencies, under names that pip does not know; those of tests are optional.
     (egg,) = (prefix / "lib").glob("python*/site-packages/*.egg-info")
-    assert (egg / "requires.txt").read_text(encoding="utf-8").strip().startswith("[test]")
+    asked = (egg / "requires.txt").read_text(encoding="utf-8").strip()
+    assert asked.startswith("[")
+    assert set(re.findall(r"(?m)^\[(.+)\]$", asked)) == set(
+        PYPROJECT["project"]["optional-dependencies"]
+    )
 
 
 def test_colcon_can_read_what_setup_py_says(source: Path) -> None:

@@ -402,7 +402,7 @@ def test_arguments_reach_every_node(run: Run) -> None:
             assert node.ros_arguments == ["--log-level", "debug"]
             assert node.parameters["config"] == "jsm820"
             assert node.parameters["use_sim_time"] is True
-            has_calibration = node.executable not in {"drift_compensator", "calibration_server"}
+            has_calibration = node.executable != "drift_compensator"
             # A file whose name is a number is a name all the same.
             assert node.parameters.get("calibration") == ("2024" if has_calibration else None)
 

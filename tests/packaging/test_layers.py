@@ -62,12 +62,13 @@ CORE_MAY_IMPORT = {
     "errors": set(),
     "arrays": {"errors"},
     "caches": set(),
+    "wording": set(),
     "camera": {"errors", "arrays"},
     "corners": {"errors", "arrays"},
     "registration": {"errors", "arrays", "caches"},
     "rectification": {"errors", "arrays", "caches", "camera"},
-    "calibration": {"errors", "arrays", "camera", "corners"},
-    "drift": {"errors", "arrays", "caches", "camera", "registration", "rectification"},
+    "calibration": {"errors", "arrays", "wording", "camera", "corners"},
+    "drift": {"errors", "arrays", "wording", "caches", "camera", "registration", "rectification"},
 }
 # Layer -> distributions it may import beside the standard library.
 THIRD_PARTY = {

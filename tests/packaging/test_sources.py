@@ -128,7 +128,11 @@ def test_the_executables_are_the_modules_with_a_main() -> None:
 
 def _declared() -> set[str]:
     """Names of the distributions that pyproject.toml asks for, in lower case."""
-    return {re.split(r"[\s<>=!;\[]", d)[0].lower() for d in PYPROJECT["project"]["dependencies"]}
+    return _names(PYPROJECT["project"]["dependencies"])
+
+
+def _names(requirements: list[str]) -> set[str]:
+    return {re.split(r"[\s<>=!;\[]", requirement)[0].lower() for requirement in requirements}
 
 
 def test_every_import_is_declared_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +142,9 @@ def test_every_import_is_declared_and_nothing_else(monkeypatch: pytest.MonkeyPat
     standard = sys.stdlib_module_names | {"semcal_ros", "compression"}  # the latter: Python 3.14
     imported = {name.partition(".")[0] for path in MODULES for name in runtime_imports(path)}
     needed = {n for n in imported - standard if not ROS.fullmatch(n)}
-    assert {home.lower() for n in needed for home in homes[n]} == _declared()
+    extras = PYPROJECT["project"]["optional-dependencies"]
+    optional = set().union(*(_names(extras[name]) for name in extras.keys() - {"test"}))
+    assert {home.lower() for n in needed for home in homes[n]} == _declared() | optional
 
 
 def test_declared_dependencies_have_exact_versions() -> None:

@@ -148,7 +148,7 @@ def test_frames_that_were_not_used_are_counted_by_reason_and_marked_in_each_plot
     path = sample(reasons=REASONS)
     figure = plot_drift(path)
     key = key_of(figure)
-    assert key[0] == "33 of 40 frames tracked, 1 of them as keyframe"
+    assert key[0] == "33 of 40 frames tracked, 1 of them as key frame"
     assert key[1] == "2 not used: image: blank (all pixels at …)"
     assert key[-1] == "3 not used: other reasons"
     assert sum(int(text.split()[0]) for text in key[1:]) == len(REASONS)
@@ -164,7 +164,7 @@ def test_frames_that_were_not_used_are_counted_by_reason_and_marked_in_each_plot
 
 
 def test_nothing_is_marked_where_all_were_used():
-    assert key_of(plot_drift(sample())) == ["40 of 40 frames tracked, 1 of them as keyframe"]
+    assert key_of(plot_drift(sample())) == ["40 of 40 frames tracked, 1 of them as key frame"]
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_the_pusher_touches_and_does_not_cover_the_beam():
 
 
 def test_impossible_beams_are_refused():
-    with pytest.raises(InvalidValueError, match="positive sizes"):
+    with pytest.raises(InvalidValueError, match="finite sizes above 0"):
         CantileverScene(length_m=0.0)
     with pytest.raises(InvalidValueError, match="tenth of the length"):
         CantileverScene(deflection_m=5e-6)

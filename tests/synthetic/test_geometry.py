@@ -266,7 +266,7 @@ def test_a_plane_seen_edge_on_is_refused() -> None:
 
 @pytest.mark.parametrize("g", [0.0, -100.0, math.nan, math.inf])
 def test_magnifications_without_meaning_are_refused(g: float) -> None:
-    with pytest.raises(InvalidValueError, match="positive number"):
+    with pytest.raises(InvalidValueError, match="finite number greater than 0"):
         preset("jsm820").camera_at(g)
 
 

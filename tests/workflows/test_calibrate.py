@@ -29,13 +29,16 @@ from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import StageConfig, StageSigmas, load_config
 from semcal_ros.core.calibration.calibrate import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 from semcal_ros.workflows import calibrate as workflow
 from semcal_ros.workflows.calibrate import calibrate_found, calibrate_recording, options_for
 from semcal_ros.workflows.find_grid import collect_views, count_visits, find_views
+from tests.helpers.corner_boards import Board
+from tests.helpers.dot_grids import PatternBoard
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 PLAN = calibration_plan(
@@ -45,6 +48,11 @@ PLAN = calibration_plan(
     detector=Detector(),
     seed=3,
 )
+
+
+def _numbers(calibration):
+    """The text of the file without its date."""
+    return replace(calibration, provenance=Provenance()).dumps()
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +95,7 @@ def test_calibrate_takes_images_in_memory(frames):
 def test_colour_images_are_read_by_their_luma(frames):
     grey = [(image, g) for name, image, g in frames if name != "blank" and g == 1000.0]
     colour = [(np.dstack([image] * 3), g) for image, g in grey]
-    assert calibrate(colour).dumps() == calibrate(grey).dumps()
+    assert _numbers(calibrate(colour)) == _numbers(calibrate(grey))
 
 
 def test_no_grid_at_all_is_refused_with_the_commonest_reason():
@@ -96,6 +104,23 @@ def test_no_grid_at_all_is_refused_with_the_commonest_reason():
         CalibrationError, match=r"no usable view among 3 images .mostly: the image is blank"
     ):
         calibrate([(blank, 1000.0)] * 3)
+
+
+def test_the_pattern_of_most_views_is_that_of_the_grid():
+    rng = np.random.default_rng(0)
+    turned = [PatternBoard(20.0, turn_deg=turn, noise=4.0).picture(rng) for turn in (5.0, 25.0)]
+    chess = Board(20.0, electrons=60.0, width=240, height=200).render(rng)
+    frames = [(f"{i}", image, 1000.0) for i, image in enumerate([*turned, chess])]
+    found, rejected = find_views(frames, processes=1)
+    assert [v.detection.pattern for v in found] == ["dots", "dots", "chess"]
+    collected = collect_views(found, rejected, display_width_m=0.12, squares_m=[8e-6])
+    assert [v.name for v in collected.found] == ["0", "1"]
+    assert [v.reason for v in collected.rejected] == ["a chess board, not dots as in most images"]
+
+    found, rejected = find_views(frames, processes=1, pattern="lines")
+    assert not found
+    with pytest.raises(CalibrationError, match=r"dots, not crossed lines.*--pattern auto"):
+        collect_views(found, rejected, display_width_m=0.12, squares_m=[8e-6])
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +183,29 @@ def test_periods_in_place_of_sides_are_refused(found, factor):
     # The other explanation is named too: then the display would be so wide.
     (width,) = re.findall(r"display_width_m to ([\d.]+) m", str(error.value))
     assert float(width) == pytest.approx(0.12 * factor, rel=0.06)
+
+
+@pytest.mark.parametrize("wrong", [600.0, 1.0 / 600.0])
+def test_units_far_off_end_the_search_for_the_grid(frames, wrong):
+    """After three views, whatever the number of the others; what is told fits."""
+    looked = []
+
+    def search(width_m, squares_m):
+        looked.clear()
+        calibrate(
+            [(image, g) for name, image, g in frames if name != "blank" and g == 1000.0],
+            display_width_m=width_m,
+            squares_m=squares_m,
+            on_progress=lambda stage, done, _all: looked.append(done) if "corners" in stage else 0,
+        )
+
+    with pytest.raises(UnusableCalibrationError, match="--display-width") as error:
+        search(0.12 * wrong, [10e-6])
+    assert max(looked) < 3
+    (side,) = re.findall(r"--squares ([\d.]+[mun]*m) ", str(error.value))
+    number, unit = re.fullmatch(r"([\d.]+)(\w+)", side).groups()
+    side_m = float(number) * {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}[unit]
+    assert side_m == pytest.approx(10e-6 * wrong, rel=0.1)
 
 
 def test_squares_of_no_known_size_are_refused(found):
@@ -275,7 +323,11 @@ def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
     plain = calibrate_recording(_recorded(tmp_path / "plain", only=1000.0), options=off)
     wrong = _recorded(tmp_path / "wrong", lambda i: {"tilt": 10.0 * i}, only=1000.0)
     done = calibrate_recording(wrong, options=off)
-    assert done.calibration.dumps() == plain.calibration.dumps()
+    assert _numbers(done.calibration) == _numbers(plain.calibration)
+    origin = done.calibration.provenance
+    assert (origin.recording, origin.configuration) == ("wrong", "generic")
+    assert origin.views == tuple(view.name for view in done.result.views)
+    assert done.result.model.provenance == origin
     assert any("looks like degrees" in note for note in done.notes)
     # Small angles in degrees could be radians: only the views tell.
     tilted = _recorded(tmp_path / "small", lambda _: {"tilt": 1.0}, only=1000.0)
@@ -319,7 +371,9 @@ def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
     # The first two of the four frames of each visit.
     every = workflow.named_frames
     monkeypatch.setattr(
-        workflow, "named_frames", lambda bag: (f for k, f in enumerate(every(bag)) if k % 4 < 2)
+        workflow,
+        "named_frames",
+        lambda *args: (f for k, f in enumerate(every(*args)) if k % 4 < 2),
     )
     off = CalibrationOptions(residual="off")
     done = calibrate_recording(reference_data / "grid_real_stage", options=off)

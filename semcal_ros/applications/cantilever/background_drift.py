@@ -134,7 +134,10 @@ def follow_background(
     weight = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
     texture = _find_texture(weight, float(np.max(np.abs(rough_px))))
-    settings = DriftSettings(registration=RegistrationSettings(texture_region=texture))
+    # The plane of the undeformed specimen knows a shift alone.
+    settings = DriftSettings(
+        registration=RegistrationSettings(texture_region=texture), similarity=False
+    )
     tracker = DriftTracker(settings, history=history)
     for image, time_s, shift in zip(grey, times_s, rough_px, strict=True):
         shifted = _shift_image(weight, shift)

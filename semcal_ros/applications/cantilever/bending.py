@@ -34,6 +34,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = [
     "SHAPES",
@@ -129,7 +130,9 @@ def parse_shape(name: str) -> Shape | None:
         If there is no such name.
     """
     if name not in SHAPES:
-        raise InvalidValueError(f"shape {name!r}", expected="one of " + ", ".join(SHAPES))
+        raise InvalidValueError(
+            f"shape {name!r}", expected="one of " + ", ".join(SHAPES), do=did_you_mean(name, SHAPES)
+        )
     return {"beam": Shape(-0.5, 0.0), "parabola": Shape(0.0, 0.0)}.get(name)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from semcal_ros.applications.cantilever.series import Series
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import counted
 
 __all__ = ["Repeatability", "compare_series", "group_frames"]
 
@@ -74,9 +75,9 @@ def group_frames(frames: int, poses: int | None) -> list[list[int]]:
     count = frames if poses is None else poses
     if not isinstance(count, (int, np.integer)) or count < 1 or frames % count:
         raise InvalidValueError(
-            f"{frames} frames for {count} poses",
+            f"{counted(frames, 'frame')} for {count} poses",
             expected="the same number of frames in each pose",
-            do="correct the number of poses, or cut the recording",
+            do="correct --poses, or cut the recording",
         )
     each = frames // count
     return [list(range(k * each, (k + 1) * each)) for k in range(count)]
@@ -106,7 +107,7 @@ def compare_series(series: Sequence[Series], poses: int | None = None) -> Repeat
         raise InvalidValueError(
             f"different numbers of frames by magnification ({seen})",
             expected="the same poses at each magnification",
-            do="state how many poses there are, or cut the recordings",
+            do="state --poses, or cut the recordings",
         )
     value, sigma = _average_poses(series, groups, by_length=False)
     known, known_sigma = _average_poses(series, groups, by_length=True)

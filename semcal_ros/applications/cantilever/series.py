@@ -47,8 +47,9 @@ from semcal_ros.core.arrays import AnyImage, Array, Indices, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.estimates import DriftPath, omit_numbers
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import counted, omit_numbers
 
 __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 
@@ -236,7 +237,8 @@ def measure_series(
 def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequence[int]) -> None:
     if not images or len(images) != len(times_s):
         raise InvalidValueError(
-            f"{len(images)} images at {len(times_s)} times", expected="one time for each"
+            f"{counted(len(images), 'image')} at {counted(len(times_s), 'time')}",
+            expected="one time for each",
         )
     shapes = sorted({image.shape for image in images})
     if len(shapes) > 1 or len(shapes[0]) != 2:
@@ -315,14 +317,16 @@ def _collect_notes(
 ) -> tuple[str, ...]:
     notes = list(undeformed.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
-        notes.append(f"the beam is not found in {unseen} of {len(frames)} frames")
+        notes.append(f"the beam is not found in {unseen} of {counted(len(frames), 'frame')}")
     if lost := sum(not _is_tied(path, frame, reference) for frame in range(len(path))):
         left = (
             "they rest on the base alone"
             if undeformed.axis.base_seen
             else "neither drift nor base holds them, and their sigma says so"
         )
-        notes.append(f"no drift in {lost} of {len(path)} frames ({_name_reasons(path)}): {left}")
+        notes.append(
+            f"no drift in {lost} of {counted(len(path), 'frame')} ({_name_reasons(path)}): {left}"
+        )
     if abs(undeformed.length_m / settings.length_m - 1.0) > _NOTED_LENGTH:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["CELLS", "MARKER_BITS", "RATIO", "SIDE", "NestedTarget", "dictionary"]
@@ -84,10 +84,7 @@ class NestedTarget:
     levels: int = _MOST_LEVELS
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.largest_cell_m) and self.largest_cell_m > 0.0):
-            raise InvalidValueError(
-                f"a target with cells of {self.largest_cell_m} m", expected="a positive size"
-            )
+        check_positive(self.largest_cell_m, "a target with cells of", "m")
         if not 1 <= self.levels <= _MOST_LEVELS:
             raise InvalidValueError(
                 f"a target with {self.levels} levels", expected=f"1 to {_MOST_LEVELS}"

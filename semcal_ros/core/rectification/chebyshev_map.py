@@ -326,7 +326,8 @@ def _drift_path(size: tuple[int, int], moving: PixelDrift | None) -> Array:
     """Drift, (2, 2) px, at the times of the first and the last pixel."""
     if moving is None:
         return np.zeros((2, 2))
-    return moving.moved(np.zeros((2, 2)), np.array([[0.0, 0.0], np.subtract(size, 1.0)]))
+    corners = np.array([[0.0, 0.0], np.subtract(size, 1.0)])
+    return moving.displacement(corners)
 
 
 def _largest(values: Array | Array32) -> float:

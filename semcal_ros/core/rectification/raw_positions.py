@@ -20,7 +20,9 @@ pixel of the camera with the specimen at zero drift, is seen in the raw frame at
     raw = raw_from_rect(x + m d(t(raw))),    d(t) = d_centre + v (t - t_centre) + a (t - t_centre)^2 / 2
 
 with the scale ``m`` of the rectified camera, in px per m, and ``t(raw)`` the time at which that raw
-pixel was scanned. Aspect, skew and distortion of the camera are all in ``raw_from_rect``
+pixel was scanned. A specimen that also turns, or whose magnification creeps, has ``c + M(t) (x - c)``
+in the place of x, with the principal point c and a matrix ``M = exp(s) R(theta)``. Aspect, skew and
+distortion of the camera are all in ``raw_from_rect``
 (:class:`~semcal_ros.core.camera.scan_camera.ScanCamera`).
 """
 
@@ -35,7 +37,16 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PixelDrift", "RasterDrift", "camera_key", "check_drift", "drift_key", "raw_from_output"]
+__all__ = [
+    "PixelDrift",
+    "RasterDrift",
+    "camera_key",
+    "check_drift",
+    "drift_key",
+    "raw_from_output",
+    "rotation_centre",
+    "similarity_matrix",
+]
 
 
 # Each step shrinks the error by the drift per row time over a row: a drift of half a row per row
@@ -58,11 +69,35 @@ class RasterDrift:
         (2,) drift velocity at that moment, the same unit per s.
     acceleration
         (2,) its rate of change, the same unit per s^2.
+    similarity
+        (2,) rotation (rad, from x towards y) and logarithm of the scale of the image of the specimen,
+        about :func:`rotation_centre`; the position is the displacement of what lay there.
+    similarity_rate
+        (2,) their rates, per s.
     """
 
     position: Array
     velocity: Array
     acceleration: Array = field(default_factory=lambda: np.zeros(2))
+    similarity: Array = field(default_factory=lambda: np.zeros(2))
+    similarity_rate: Array = field(default_factory=lambda: np.zeros(2))
+
+
+def similarity_matrix(similarity: Array) -> Array:
+    """(2, 2) matrix ``exp(s) R(theta)`` of ``[theta, s]``; those of two of them multiply as they add."""
+    angle, log_scale = similarity.tolist()
+    cos, sin = np.exp(log_scale) * np.cos(angle), np.exp(log_scale) * np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def rotation_centre(size: tuple[int, int], camera: ScanCamera | None) -> Array:
+    """(2,) rectified pixel about which a specimen turns: the origin of the sem frame, or the middle of
+    the image where there is no camera.
+    """
+    if camera is None:
+        return 0.5 * (np.array(size, dtype=np.float64) - 1.0)
+    rectified = camera.rectified
+    return np.array([rectified.px, rectified.py])
 
 
 def raw_from_output(
@@ -135,11 +170,24 @@ class PixelDrift:
         )
         self.velocity_px_s = jacobian @ np.asarray(drift.velocity, dtype=np.float64)
         self._is_accelerated = bool(self._half_acceleration_px.any())
+        self._turns = bool(np.any(drift.similarity) or np.any(drift.similarity_rate))
+        if self._turns:
+            self._centre = rotation_centre(size, camera)
+            self._matrix = similarity_matrix(np.asarray(drift.similarity, dtype=np.float64))
+            turn, growth = np.asarray(drift.similarity_rate, dtype=np.float64).tolist()
+            self._rate = np.array([[growth, -turn], [turn, growth]]) @ self._matrix
 
     @property
     def is_still(self) -> bool:
         """Whether the drift is the same for all pixels of a frame."""
-        return self._timing is None or not (self._is_accelerated or self.velocity_px_s.any())
+        moves = self._is_accelerated or bool(self.velocity_px_s.any())
+        turns = self._turns and bool(self._rate.any())
+        return self._timing is None or not (moves or turns)
+
+    def displacement(self, raw: Array) -> Array:
+        """(n, 2) by how much the drift displaces what is scanned at raw pixels (n, 2)."""
+        start = raw if self._turns else np.zeros_like(raw)
+        return self.moved(start, raw) - start
 
     def moved(self, xy: Array, raw: Array | None = None) -> Array:
         """Return rectified pixels (n, 2) moved by the drift at the times at which raw ones are scanned.
@@ -147,6 +195,9 @@ class PixelDrift:
         Without raw pixels, the time is the centre of the acquisition.
         """
         at_centre = xy + self._position_px
+        if self._turns:
+            from_centre = xy - self._centre
+            at_centre = from_centre @ self._matrix.T + (self._centre + self._position_px)
         if raw is None or self._timing is None:
             return at_centre
         width, height = self._size
@@ -157,6 +208,8 @@ class PixelDrift:
             # The mean over the passes of the square of the time.
             square_s2 = since_s**2 + self._timing.pass_variance_s2
             moved += np.multiply.outer(self._half_acceleration_px, square_s2).T
+        if self._turns:
+            moved += since_s[:, None] * (from_centre @ self._rate.T)
         return moved
 
 
@@ -172,18 +225,21 @@ def drift_key(drift: RasterDrift | None, timing: ScanTiming | None) -> tuple[obj
     """What the drift adds to :func:`camera_key`."""
     if drift is None:
         return ()
-    parts = (drift.position, drift.velocity, drift.acceleration)
-    return (timing, *(float(value) for part in parts for value in part))
+    return (timing, *(float(value) for part in _parts(drift) for value in part))
+
+
+def _parts(drift: RasterDrift) -> tuple[Array, ...]:
+    turn = drift.similarity, drift.similarity_rate
+    return drift.position, drift.velocity, drift.acceleration, *turn
 
 
 def check_drift(drift: RasterDrift | None) -> None:
     """Raise :class:`InvalidValueError` where a drift is not made of finite pairs."""
     if drift is None:
         return
-    parts = (drift.position, drift.velocity, drift.acceleration)
-    values = np.concatenate([np.ravel(part) for part in parts])
-    if values.shape != (6,) or not np.all(np.isfinite(values)):
+    values = np.concatenate([np.ravel(part) for part in _parts(drift)])
+    if values.shape != (10,) or not np.all(np.isfinite(values)):
         raise InvalidValueError(
             f"drift {values.tolist()}",
-            expected="two finite positions, velocities and accelerations each",
+            expected="two finite positions, velocities, accelerations, and numbers of a rotation each",
         )

@@ -81,11 +81,16 @@ class Rectifier:
             raise InvalidValueError(
                 f"interpolation {interpolation!r}", expected=" or ".join(_INTERPOLATIONS)
             )
+        self._interpolation = interpolation
         self._flag = _INTERPOLATIONS[interpolation]
         self._smooth = SmoothMaps()
         self._maps: LruCache[tuple[object, ...], tuple[Array32, Array32]] = LruCache(_MAX_MAPS)
         self._last: tuple[object, ...] | None = None
         self._scratch: deque[Array32] = deque()
+
+    def __reduce__(self) -> tuple[type[Rectifier], tuple[str]]:
+        """Without its maps, which another process computes in less time than they take to arrive."""
+        return type(self), (self._interpolation,)
 
     def rectify(
         self,

@@ -35,7 +35,7 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
 
-__all__ = ["Stack", "StackedImage", "find_scanned"]
+__all__ = ["Stack", "StackSums", "StackedImage", "find_scanned"]
 
 
 # Rows or columns that an interpolation takes beyond the two nearest ones.
@@ -64,6 +64,24 @@ class StackedImage:
 
     mean: NDArray[np.float32]
     standard_error: NDArray[np.float32]
+    count: NDArray[np.int32]
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class StackSums:
+    """What a stack has added up so far.
+
+    Attributes
+    ----------
+    total, squares, count
+        (h, w) sums of grey levels and of their squares, and number of frames in each pixel.
+    frames
+        Number of frames that were added.
+    """
+
+    total: Array
+    squares: Array
     count: NDArray[np.int32]
     frames: int
 
@@ -160,6 +178,27 @@ class Stack:
         cv2.accumulateSquare(values, self._squares, mask)
         self._count += mask
         self._frames += 1
+
+    def sums(self) -> StackSums:
+        """What was added so far; it changes with the stack."""
+        return StackSums(self._sum, self._squares, self._count, self._frames)
+
+    def merge(self, part: StackSums) -> None:
+        """Add what another stack of the same size and interpolation has added up.
+
+        Raises
+        ------
+        InvalidValueError
+            If it has another size.
+        """
+        if part.total.shape != self._sum.shape:
+            raise InvalidValueError(
+                f"sums of shape {part.total.shape}", expected=f"{self._sum.shape}"
+            )
+        self._sum += part.total
+        self._squares += part.squares
+        self._count += part.count
+        self._frames += part.frames
 
     def result(self) -> StackedImage:
         """The average of all that was added so far."""

@@ -20,7 +20,12 @@ from typing import Any
 
 from semcal_ros.bridge.calibration_text import fill_calibration_text
 from semcal_ros.bridge.camera_info import fill_camera_info
-from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
+from semcal_ros.bridge.drift import (
+    fill_drift,
+    fill_drift_velocity,
+    rotation_of,
+    rotation_rate_of,
+)
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.projection import fill_projection, fill_stamped_projection
@@ -97,10 +102,12 @@ class CorrectedBagWriter:
         self._write("projection_stamped", when, matrix)
         if update is not None:
             drift = blank_message(_TOPICS["drift"])
-            fill_drift(drift, update.drift_m, update.covariance, header)
+            fill_drift(drift, update.drift_m, update.covariance, header, rotation_of(update))
             self._write("drift", when, drift)
             velocity = blank_message(_TOPICS["drift_velocity"])
-            fill_drift_velocity(velocity, update.velocity_m_s, update.covariance, header)
+            fill_drift_velocity(
+                velocity, update.velocity_m_s, update.covariance, header, rotation_rate_of(update)
+            )
             self._write("drift_velocity", when, velocity)
 
     def _write_magnification(self, frame: RecordedFrame, camera: ScanCamera) -> None:

@@ -42,10 +42,11 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from semcal_ros.core.errors import BagError, CalibrationFileError
+from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
 from semcal_ros.files.bags.messages import jazzy_types
 from semcal_ros.files.plain_yaml import check_plain_yaml
-from semcal_ros.text_files import read_text_file
+from semcal_ros.text_files import name_similar_file, read_text_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -122,7 +123,11 @@ def _storage_files(folder: Path) -> list[Path]:
 def _locate(path: Path) -> Path:
     """Return the path that the library opens for ``path``."""
     if not path.exists():
-        raise BagError(f"{path} does not exist", expected=_ACCEPTED, do="check the path")
+        raise BagError(
+            f"{path} does not exist",
+            expected=_ACCEPTED,
+            do=name_similar_file(path) or "check the path",
+        )
     if not path.is_dir():
         if path.suffix not in STORAGE_SUFFIXES:
             raise BagError(
@@ -277,7 +282,7 @@ class BagReader:
         for topic in _topic_table(chosen):
             if topic.count and not seen.get(topic.name):
                 raise BagError(
-                    f"{self.path} declares {topic.count} messages on {topic.name} and holds none",
+                    f"{self.path} declares {counted(topic.count, 'message')} on {topic.name} and holds none",
                     expected="metadata.yaml that describes the files beside it",
                     do="make it again with 'ros2 bag reindex'",
                 )

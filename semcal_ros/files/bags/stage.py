@@ -28,6 +28,7 @@ from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.held_values import HeldValues
 from semcal_ros.files.bags.reader import BagReader, BagTopic
 from semcal_ros.files.bags.topics import topic_matches
@@ -81,7 +82,9 @@ class StageTrack(HeldValues[StageReading]):
         notes = []
         if self.bad:
             notes.append(
-                f"{len(self.bad)} messages on {self._topic} are ignored, the first: {self.bad[0]}"
+                f"{counted(len(self.bad), 'message')} on {self._topic} ignored"
+                + (", the first" if len(self.bad) > 1 else "")
+                + f": {self.bad[0]}"
             )
         notes += [
             f"no message on {self._topic} has the joint {joint}"
@@ -95,7 +98,7 @@ class StageTrack(HeldValues[StageReading]):
             without = sum(getattr(reading, name) is None for reading in self._readings)
             if 0 < without < len(self._readings):
                 notes.append(
-                    f"{without} of {len(self._readings)} messages on {self._topic} lack the joint {joint}"
+                    f"{without} of {counted(len(self._readings), 'message')} on {self._topic} without the joint {joint}"
                 )
         jumps = list(self._jumps())
         if jumps:

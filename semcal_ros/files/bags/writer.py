@@ -76,7 +76,7 @@ def check_replaceable(path: Path, overwrite: bool) -> None:
         return
     if not overwrite:
         raise BagError(
-            f"{path} exists", expected="a new path", do="choose another name, or allow overwriting"
+            f"{path} exists", expected="a new path", do="choose another name, or --overwrite"
         )
     if path.is_dir() and not path.is_symlink():
         names = list(path.iterdir())

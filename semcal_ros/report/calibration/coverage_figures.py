@@ -25,6 +25,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.wording import counted
 from semcal_ros.report.calibration.cells import (
     assign_cells,
     compute_reached_shares,
@@ -83,7 +84,7 @@ def plot_coverage(result: CalibrationResult) -> Picture:
     return encode_figure(
         figure,
         f"Map of the image field with the number of corners per cell; {share}.",
-        f"Corners of all {len(result.views)} views; {share} (crosses). "
+        f"Corners of {counted(len(result.views), 'view')}; {share} (crosses). "
         "Where there are none, the distortion is extrapolated.",
     )
 

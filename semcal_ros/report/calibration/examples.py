@@ -24,6 +24,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import FoundView, RejectedView
+from semcal_ros.core.wording import counted
 from semcal_ros.report.html.encode import (
     Picture,
     convert_to_8_bits,
@@ -80,9 +81,11 @@ class Overlay:
 
 
 def choose_examples(views: Sequence[FoundView]) -> list[FoundView]:
-    """Choose the view with most corners for each magnification, ascending."""
+    """Choose the view with most corners for each magnification, ascending, of those with an image."""
     best: dict[float, FoundView] = {}
     for view in views:
+        if view.image is None:
+            continue
         known = best.get(view.magnification)
         if known is None or len(view.detection.xy) > len(known.detection.xy):
             best[view.magnification] = view
@@ -103,6 +106,7 @@ def _draw_crosses(xy: Array, k: float) -> str:
 
 def overlay_corners(view: FoundView) -> Overlay:
     """Shrink a view, with a cross at each corner and a square at each refused one."""
+    assert view.image is not None
     small, factor = shrink(convert_to_8_bits(view.image), _OVERLAY_WIDTH)
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
     xy, refused_xy = (
@@ -120,9 +124,9 @@ def overlay_corners(view: FoundView) -> Overlay:
         height=small.shape[0],
         marks=_draw_crosses(xy, size),
         refused=_draw_squares(refused_xy, size),
-        alt=f"Image at {view.magnification:g}x with {count} corners of the grid marked by crosses",
+        alt=f"Image at {view.magnification:g}x with {counted(count, 'corner')} of the grid marked by crosses",
         caption=remove_control_characters(
-            f"{view.magnification:g}×: {count} corners{dropped}{precision} ({view.name})"
+            f"{view.magnification:g}×: {counted(count, 'corner')}{dropped}{precision} ({view.name})"
         ),
     )
 

@@ -26,6 +26,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.wording import counted
 from semcal_ros.report.calibration.cells import assign_cells, concatenate_corners
 from semcal_ros.report.calibration.geometry import compute_displacements, remove_residual_field
 from semcal_ros.report.html.encode import Picture, encode_figure
@@ -100,7 +101,7 @@ def plot_residuals(result: CalibrationResult) -> Picture:
     axes = figure.add_subplot()
     style_field_axes(axes, width, height)
     _draw_arrows(axes, xy[chosen], residuals[chosen], factor, SECOND)
-    part = f"{len(chosen)} of {len(xy)} corners"
+    part = f"{len(chosen)} of {counted(len(xy), 'corner')}"
     return encode_figure(
         figure,
         f"Residual vectors of {part} over the field, drawn {factor:g} times as long.",

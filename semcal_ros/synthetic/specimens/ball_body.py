@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 
 __all__ = ["TEXTURES", "BallOnTip"]
 
@@ -117,7 +118,9 @@ class BallOnTip:
     def __post_init__(self) -> None:
         if self.texture_name not in TEXTURES:
             raise InvalidValueError(
-                f"texture '{self.texture_name}'", expected=f"one of {', '.join(TEXTURES)}"
+                f"texture '{self.texture_name}'",
+                expected=f"one of {', '.join(TEXTURES)}",
+                do=did_you_mean(self.texture_name, TEXTURES),
             )
 
     @property

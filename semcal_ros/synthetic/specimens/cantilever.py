@@ -223,7 +223,8 @@ class CantileverScene:
             all(math.isfinite(s) and s > 0 for s in sizes) and math.isfinite(self.deflection_m)
         ):
             raise InvalidValueError(
-                f"a cantilever of {self.length_m} x {self.width_m} m", expected="positive sizes"
+                f"a cantilever of {self.length_m} x {self.width_m} m",
+                expected="finite sizes above 0",
             )
         if abs(self.deflection_m) > 0.1 * self.length_m:
             raise InvalidValueError(

@@ -23,7 +23,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -210,8 +210,7 @@ class ChessGrid:
     size_error: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.square_m) and self.square_m > 0):
-            raise InvalidValueError(f"square of {self.square_m} m", expected="a positive size")
+        check_positive(self.square_m, "square of", "m")
 
     @property
     def supersampling(self) -> int:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
 
@@ -96,12 +97,14 @@ class Substrate:
     def __post_init__(self) -> None:
         if self.kind not in SUBSTRATES:
             raise InvalidValueError(
-                f"substrate {self.kind!r}", expected="one of " + ", ".join(SUBSTRATES)
+                f"substrate {self.kind!r}",
+                expected="one of " + ", ".join(SUBSTRATES),
+                do=did_you_mean(self.kind, SUBSTRATES),
             )
         if not (0.0 <= self.level <= 1.0 and 0.0 <= self.contrast <= 0.5 and self.size_m > 0.0):
             raise InvalidValueError(
                 f"a substrate of level {self.level}, contrast {self.contrast} and size {self.size_m} m",
-                expected="a level of 0 to 1, a contrast of 0 to 0.5 and a positive size",
+                expected="a level of 0 to 1, a contrast of 0 to 0.5 and a finite size above 0",
             )
 
     @property

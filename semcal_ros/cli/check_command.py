@@ -1,0 +1,133 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal check``."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.grid_options import grid_options
+from semcal_ros.cli.options import PATH, json_option
+from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
+from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.check import CalibrationCheck, Change, Verdict
+from semcal_ros.core.wording import counted
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.workflows.check_and_update import check
+
+__all__ = ["command", "echo_check"]
+
+_UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
+
+
+@click.command("check")
+@click.argument("calibration", type=PATH)
+@recording_input
+@grid_options
+@json_option
+def command(
+    calibration: Path,
+    recording: RecordedFiles,
+    config: MicroscopeConfig,
+    squares: tuple[float, ...] | None,
+    untilted: str | tuple[str, ...],
+    pattern: str,
+    as_json: bool,
+) -> None:
+    """Whether CALIBRATION still holds, by one or more views of the grid in RECORDING.
+
+    Exit status: 0 valid, 1 degraded or invalid, 2 bad input.
+
+    \b
+    Example:
+      semcal check cal.yaml recordings/grid_today
+    """
+    with show_progress() as on_progress:
+        done = check(
+            calibration,
+            recording,
+            config=config,
+            squares_m=squares,
+            untilted=untilted,
+            pattern=pattern,
+            on_progress=on_progress,
+        )
+    if as_json:
+        echo_json({**asdict(done.result), "verdict": done.result.verdict.value})
+    else:
+        click.echo(f"{calibration}: {done.result.verdict.value}")
+        echo_check(done.result)
+        click.echo(_ADVICE[done.result.verdict])
+        echo_notes(done.notes)
+    if done.result.verdict is not Verdict.VALID:
+        sys.exit(1)
+
+
+def echo_check(result: CalibrationCheck) -> None:
+    """Print what has changed, and how much of nm per pixel that is."""
+    changed = {change.name: change for change in result.changes}
+    rows = []
+    for alone in result.tested:
+        change = changed.get(alone.name, alone)
+        rows.append(
+            [
+                change.name,
+                _format_values(change),
+                f"{change.largest_px:.2f}",
+                f"{change.p_value:.2g}",
+                "changed" if alone.name in changed else "",
+            ]
+        )
+    pattern = result.shape
+    known = math.isfinite(pattern.p_value)
+    rows.append(
+        [
+            "other distortion",
+            f"{pattern.rms_px:.4f} px RMS" if known else "too few views",
+            "",
+            f"{pattern.p_value:.2g}" if known else "-",
+            "changed" if known and pattern.significant else "",
+        ]
+    )
+    echo_table(["", "images against calibration", "px at most", "probability", ""], rows)
+    click.echo(
+        f"nm per px is off by {-100.0 * result.scale_change:+.3f} +- {100.0 * result.scale_sigma:.3f} %; "
+        f"{counted(result.views, 'view')}, RMS {result.rms_px:.4f} px"
+        + (f", {result.out_of_range} outside the calibrated range" if result.out_of_range else "")
+    )
+
+
+_ADVICE = {
+    Verdict.VALID: "nothing to do: the views agree with the calibration within its uncertainty",
+    Verdict.DEGRADED: "renew it with `semcal update` and such views, or calibrate again",
+    Verdict.INVALID: "this is another microscope, grid or display width: check --config, --squares and "
+    "--display-width, else calibrate anew",
+}
+
+
+def _format_values(change: Change) -> str:
+    pairs = zip(change.values, change.sigmas, strict=True)
+    if change.name in ("scale", "aspect", "skew"):
+        return ", ".join(f"{100.0 * v:+.3f} +- {100.0 * s:.3f} %" for v, s in pairs)
+    unit, factor, digits = _UNITS[change.name]
+    return ", ".join(
+        f"{factor * v:+.{digits}f} +- {factor * s:.{digits}f} {unit}".strip() for v, s in pairs
+    )

@@ -1,0 +1,116 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal plan``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.cli.options import (
+    PATH,
+    config_option,
+    json_option,
+    parse_ratio,
+    squares_option,
+)
+from semcal_ros.cli.output import echo_json, echo_table
+from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, ViewPlan, plan_views
+from semcal_ros.core.wording import counted
+from semcal_ros.workflows.inputs import resolve_config
+
+__all__ = ["command"]
+
+
+@click.command("plan")
+@click.argument("calibration", type=PATH)
+@click.option(
+    "--target",
+    required=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="1-sigma of nm per pixel to reach at all calibrated magnifications, such as 0.1%.",
+)
+@click.option(
+    "--visits",
+    type=click.IntRange(1, 30),
+    default=10,
+    show_default=True,
+    help="Propose at most so many visits.",
+)
+@squares_option(
+    "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
+)
+@config_option
+@json_option
+def command(
+    calibration: Path,
+    target: float,
+    visits: int,
+    squares: tuple[float, ...] | None,
+    config: str,
+    as_json: bool,
+) -> None:
+    """Which views to record next for CALIBRATION, so that nm per pixel becomes more certain.
+
+    Record them, and use them with `semcal update`.
+
+    \b
+    Example:
+      semcal plan cal.yaml --target 0.1%
+    """
+    model = Calibration.load(calibration)
+    microscope = resolve_config(config, model)
+    plan = plan_views(model, target, squares_m=squares or microscope.squares_m, most_visits=visits)
+    if as_json:
+        echo_json(asdict(plan))
+    else:
+        _echo_plan(plan, target)
+
+
+def _echo_plan(plan: ViewPlan, target: float) -> None:
+    click.echo(f"now: nm per px known to {100.0 * plan.largest:.3f} % at {plan.at:.0f}x, the worst")
+    if plan.visits:
+        tilts = ", ".join(f"{math.degrees(tilt):.0f}" for tilt in PLANNED_TILTS_RAD)
+        click.echo(
+            f"visit in this order, each with views tilted by {tilts} degrees, differently turned:"
+        )
+        echo_table(
+            ["magnification", "squares um", "then %", "worst at"],
+            [
+                [
+                    f"{v.magnification:.0f}",
+                    f"{1e6 * v.square_m:g}",
+                    f"{100.0 * v.largest:.3f}",
+                    f"{v.at:.0f}",
+                ]
+                for v in plan.visits
+            ],
+        )
+    if plan.reached:
+        click.echo(f"{counted(len(plan.visits), 'visit')}: {100.0 * target:g} % is met")
+    elif plan.floor >= target:
+        click.echo(
+            f"no number of views meets {100.0 * target:g} %: repeatability, squares and height alone are "
+            f"{100.0 * plan.floor:.3f} %; `semcal at --budget` shows which"
+        )
+    else:
+        click.echo(
+            f"{100.0 * target:g} % is not met with {counted(len(plan.visits), 'visit')}; allow more with --visits"
+        )

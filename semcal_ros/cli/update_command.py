@@ -1,0 +1,83 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal update``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.check_command import echo_check
+from semcal_ros.cli.grid_options import grid_options
+from semcal_ros.cli.options import PATH, output_option, parse_ratio
+from semcal_ros.cli.output import echo_certainty, echo_notes, show_progress
+from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.update import DEFAULT_AGEING
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.workflows.check_and_update import update
+
+__all__ = ["command"]
+
+
+@click.command("update")
+@click.argument("calibration", type=PATH)
+@recording_input
+@output_option("Renewed calibration file.")
+@grid_options
+@click.option(
+    "--ageing",
+    callback=parse_ratio,
+    default=f"{100.0 * DEFAULT_AGEING:g}%",
+    show_default=True,
+    metavar="RATIO",
+    help="1-sigma of a change of the scale since the calibration that the views need not prove.",
+)
+def command(
+    calibration: Path,
+    recording: RecordedFiles,
+    output: Path,
+    config: MicroscopeConfig,
+    squares: tuple[float, ...] | None,
+    pattern: str,
+    untilted: str | tuple[str, ...],
+    ageing: float,
+) -> None:
+    """Renew CALIBRATION with a few views of the grid in RECORDING.
+
+    The old calibration, with its uncertainty, is the prior: ten views are enough for what all magnifications share.
+
+    \b
+    Example:
+      semcal update cal.yaml recordings/grid_today -o cal_today.yaml
+    """
+    check_outputs([("-o", output, ())], recording=recording)
+    with show_progress() as on_progress:
+        done = update(
+            calibration,
+            recording,
+            config=config,
+            squares_m=squares,
+            untilted=untilted,
+            pattern=pattern,
+            ageing=ageing,
+            on_progress=on_progress,
+        )
+    done.calibration.save(output)
+    echo_certainty(done.calibration)
+    echo_check(done.result.check)
+    echo_notes(done.notes)
+    click.echo(f"calibration: {output}")

@@ -1,0 +1,79 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The English of messages: numbers of things, and names that were misspelt."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable
+from typing import SupportsIndex
+
+__all__ = ["counted", "did_you_mean", "group_by_kind", "nearest_name", "omit_numbers"]
+
+_NUMBER = re.compile(r"-?\d[\d.]*")
+
+
+def counted(count: SupportsIndex, one: str, many: str = "") -> str:
+    """Return a number of things in words, such as ``1 frame`` and ``2 frames``.
+
+    Parameters
+    ----------
+    count
+        How many there are.
+    one, many
+        What one of them and several are called, with a verb where the sentence needs it (``frame is``,
+        ``frames are``); several get an s if nothing is given.
+    """
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
+def omit_numbers(text: str) -> str:
+    """A text with dots in the place of its numbers, so that messages can be counted by kind."""
+    return _NUMBER.sub("\u2026", text)
+
+
+def group_by_kind(
+    messages: Iterable[str], kind_of: Callable[[str], str] = omit_numbers
+) -> list[str]:
+    """Return one message of each kind, the first, with how many more there are.
+
+    Parameters
+    ----------
+    messages
+        In any order; the kinds come in the order of their first messages.
+    kind_of
+        What is the same for messages of a kind; by default all but the numbers.
+    """
+    kinds: dict[str, list[str]] = {}
+    for message in messages:
+        kinds.setdefault(kind_of(message), []).append(message)
+    return [
+        same[0] if len(same) == 1 else f"{same[0]} (and {len(same) - 1} more of this kind)"
+        for same in kinds.values()
+    ]
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Return the known name that looks most like a misspelt one; empty if none does."""
+    names = {other.casefold(): other for other in known}
+    found = difflib.get_close_matches(name.casefold(), list(names), 1)
+    return names[found[0]] if found else ""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the question which of the known names a misspelt one stands for; empty if none looks like it."""
+    nearest = nearest_name(name, known)
+    return f"did you mean {nearest}?" if nearest else ""

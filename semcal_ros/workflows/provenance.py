@@ -1,0 +1,154 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where a calibration comes from: its recording, configuration and conditions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import semcal_ros
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.files.images.image_series import find_image_files
+from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
+from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.workflows.inputs import Source
+
+__all__ = [
+    "describe_computation",
+    "describe_provenance",
+    "format_date",
+    "list_recording_files",
+    "sum_up",
+]
+
+# Stamps before 2001 count from the start of a recording, not from 1970.
+_FIRST_DATE_NS = 978_307_200_000_000_000
+# Endings of a bag's data files, before that of a compressed one.
+_BAG_DATA = frozenset({".mcap", ".db3"})
+# The longest text of the calibration file.
+_MOST_CHARACTERS = 1000
+
+
+def describe_computation() -> Provenance:
+    """When, and with which software, a calibration is computed: all that is known without its recording."""
+    now = datetime.now(timezone.utc).replace(tzinfo=None)
+    return Provenance(
+        calibrated=now.isoformat(sep=" ", timespec="seconds"),
+        software_version=semcal_ros.__version__,
+    )
+
+
+def describe_provenance(
+    source: Source, config: MicroscopeConfig, views: Mapping[str, RecordedFrame]
+) -> Provenance:
+    """Tell where a calibration comes from.
+
+    Parameters
+    ----------
+    source
+        The recording; images in memory have no name and no digest.
+    config
+        The settings in effect.
+    views
+        The frames used, by the names of the views; their pixels are not looked at.
+    """
+    now = describe_computation()
+    stamps = [frame.stamp_ns for frame in views.values()]
+    dates = [format_date(stamp) for stamp in (min(stamps), max(stamps))] if stamps else []
+    path = source.path if isinstance(source, RecordedFiles) else source
+    name = Path(path).resolve().name if isinstance(path, (str, os.PathLike)) else ""
+    settings = json.dumps(asdict(config), sort_keys=True, default=str)
+    return Provenance(
+        now.calibrated,
+        tuple(date for date in dates if date),
+        now.software_version,
+        name[:_MOST_CHARACTERS],
+        _digest(list_recording_files(source)),
+        config.name,
+        hashlib.sha256(settings.encode()).hexdigest(),
+        tuple(views),
+        _sum_up_conditions(views.values()),
+    )
+
+
+def list_recording_files(source: Source) -> list[Path]:
+    """Files of a recording on disk; none for images in memory."""
+    if isinstance(source, (str, os.PathLike)):
+        source = RecordedFiles(source)
+    if not isinstance(source, RecordedFiles):
+        return []
+    files: list[Path] = []
+    for path in source.paths:
+        if path.is_dir() and (path / "metadata.yaml").exists():
+            files += [own for own in path.rglob("*") if own.is_file()]
+        elif path.is_file():
+            files.append(path)
+        else:
+            files += find_image_files(path)
+    return files
+
+
+def format_date(stamp_ns: int) -> str | None:
+    """Date and time (UTC) of a stamp; None if it is none."""
+    if stamp_ns < _FIRST_DATE_NS:
+        return None
+    date = datetime.fromtimestamp(stamp_ns // 1_000_000_000, tz=timezone.utc)
+    return date.replace(tzinfo=None).isoformat(sep=" ")
+
+
+def sum_up(values: set[Any]) -> tuple[Any, ...]:
+    """The different texts, or the least and the greatest number."""
+    if all(isinstance(value, str) for value in values):
+        return tuple(sorted(values))
+    return (min(values), max(values))
+
+
+def _digest(files: Sequence[Path]) -> str:
+    """SHA-256 of the one data file, or of the lines that ``sha256sum`` prints of several by name."""
+    # Other files in a bag's folder, such as metadata.yaml and notes, change without any change of the data.
+    own = [file for file in files if _BAG_DATA.intersection(file.suffixes)]
+    data = sorted(own or files, key=lambda file: file.name)
+    digests = []
+    for file in data:
+        found = hashlib.sha256()
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                found.update(block)
+        digests.append(found.hexdigest())
+    if len(data) < 2:
+        return digests[0] if digests else ""
+    lines = (f"{digest}  {file.name}\n" for digest, file in zip(digests, data, strict=True))
+    return hashlib.sha256("".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def _sum_up_conditions(frames: Iterable[RecordedFrame]) -> dict[str, tuple[Any, ...]]:
+    found: dict[str, set[Any]] = {}
+    for frame in frames:
+        if frame.conditions is not None:
+            for item in fields(Conditions):
+                value = getattr(frame.conditions, item.name)
+                if item.name != "time" and value not in (None, ""):
+                    found.setdefault(item.name, set()).add(value)
+        elif frame.stage is not None and frame.stage.tilt_rad is not None:
+            found.setdefault("stage_tilt_rad", set()).add(frame.stage.tilt_rad)
+    return {name: sum_up(values) for name, values in found.items()}

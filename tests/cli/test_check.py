@@ -1,0 +1,89 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from semcal_ros import Calibration
+from tests.helpers.semcal_runs import refused, run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration, and two recordings of the grid by other seeds."""
+    place = tmp_path_factory.mktemp("check")
+    magnifications = [part for g in (600, 1500, 4000) for part in ("--magnification", g)]
+    common = ("simulate", "--size", 256, "--plan", "grid", *magnifications)
+    assert run(*common, place / "grid", "--views", 4) == 0
+    assert run(*common, place / "today", "--views", 2, "--seed", 3) == 0
+    assert run("calibrate", place / "grid", "-o", place / "cal.yaml", "--residual", "off") == 0
+    # The same with a display that is 4 % narrower: all magnifications are other ones.
+    data = yaml.safe_load((place / "cal.yaml").read_text())
+    data["display_width_m"] *= 0.96
+    (place / "off.yaml").write_text(yaml.safe_dump(data))
+    return place
+
+
+@pytest.mark.slow
+def test_the_exit_status_is_the_verdict(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("check", folder / "cal.yaml", folder / "today") == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"{folder / 'cal.yaml'}: valid\n")
+    assert "6 views" in out
+    with pytest.raises(SystemExit) as ended:
+        run("check", folder / "off.yaml", folder / "today", "--json")
+    assert ended.value.code == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["verdict"] == "degraded"
+    assert said["changes"][0]["name"] == "scale"
+    # px per m of the file are 1 / 0.96 of those of the images.
+    assert said["scale_change"] == pytest.approx(0.96 - 1.0, abs=3.0 * said["scale_sigma"])
+
+
+@pytest.mark.slow
+def test_bad_input_is_refused_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "check", folder / "cal.yaml", folder / "today", "--untilted", "99")
+    assert "untilted '99'" in line
+    line = refused(capsys, "check", folder / "cal.yaml", folder / "missing")
+    assert "missing" in line
+
+
+@pytest.mark.slow
+def test_an_update_brings_the_scale_back(folder: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new.yaml"
+    assert run("update", folder / "off.yaml", folder / "today", "-o", new) == 0
+    # Now it is valid; before it was not.
+    assert run("check", new, folder / "today") == 0
+    truth = Calibration.load(folder / "cal.yaml")
+    for g in (700.0, 3000.0):
+        # The display of off.yaml is 4 % narrower, so the same field has another magnification.
+        ours, true = Calibration.load(new).at(0.96 * g), truth.at(0.96 * g)
+        sigma = np.hypot(ours.pixel_size_sigma_m[0], true.pixel_size_sigma_m[0])
+        assert abs(ours.pixel_size_m[0] - true.pixel_size_m[0]) < 3.0 * sigma
+
+
+def test_a_plan_is_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("plan", folder / "cal.yaml", "--target", "0.01%", "--visits", 2) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("now: nm per px known to 0.")
+    assert "no number of views meets 0.01 %" in out
+    assert run("plan", folder / "cal.yaml", "--target", "5%", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["reached"] and said["visits"] == []

@@ -1,0 +1,93 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Errors name what was misspelt, the option to use, and the range of a number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from semcal_ros.cli import main
+from semcal_ros.cli.calibrate_command import _echo_rejected
+from semcal_ros.core.calibration.views import RejectedView, ViewStatus
+from semcal_ros.core.errors import Rejection
+
+
+@pytest.mark.parametrize(
+    ("given", "question"),
+    [
+        ("calibrat grid", "did you mean calibrate?"),
+        ("measure cantilevr x", "cantilever"),
+        ("drift x --confg generic", "--config"),
+        ("simulate x --plan gridd", "did you mean grid?"),
+        ("simulate x --preset jms820", "did you mean jsm820?"),
+        ("simulate x --plan drift --specimen golld", "did you mean gold?"),
+        ("drift x -o d.csv --config jsm280", "did you mean jsm820?"),
+        ("drift grid -o d.csv", "did you mean gird?"),
+        ("at cal.yam 100", "did you mean cal.yaml?"),
+    ],
+)
+def test_what_is_misspelt_is_recognised(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    given: str,
+    question: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gird").mkdir()
+    (tmp_path / "cal.yaml").write_text("")
+    assert main(given.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert question in line
+
+
+def test_what_resembles_nothing_gets_no_guess(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["xyz"]) == 2
+    assert "did you mean" not in capsys.readouterr().err
+
+
+def test_rejected_views_are_told_by_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    views = [
+        RejectedView(f"frame {k}", 100.0, Rejection(ViewStatus.OTHER_IMAGE_SIZE, f"{k} px wide"))
+        for k in range(7)
+    ]
+    _echo_rejected([*views, replace(views[0], rejection=Rejection(ViewStatus.OUTLIER, "outlier"))])
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("rejected: frame 0 at 100, frame 1 at 100, ")
+    assert first.endswith("frame 4 at 100, 2 more: 0 px wide")
+    assert second == "rejected: frame 0 at 100: outlier"
+
+
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [
+        ("--pixel-size 43.9", "expected 1e-13 to 1 m; state the unit, as in --pixel-size 43.9nm"),
+        ("--display-width 127", "expected 0.001 to 100 m; state the unit"),
+        ("--frame-interval 1e9", "expected 1e-06 to 1e+06 s; state the unit"),
+        ("--frame-time 1e9", "expected at most 1e+06 s; state the unit"),
+        ("--frame-time 1e400", "'1e400' is too large"),
+        ("--magnification 1e30", "expected 0.001 to 1e+08"),
+        ("--pixel-size 5lightyears", "is not a length such as 35um"),
+        ("--pixel-size 0", "is not above 0"),
+    ],
+)
+def test_a_number_that_is_too_large_is_not_called_negative(
+    capsys: pytest.CaptureFixture[str], option: str, reason: str
+) -> None:
+    assert main(["drift", "x", "-o", "d.csv", *option.split()]) == 2
+    assert reason in capsys.readouterr().err
