@@ -50,6 +50,7 @@ from semcal_ros.applications.servoing import PlanePose, ServoSettings
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import UnusableCalibrationError
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
@@ -89,8 +90,11 @@ def named_frames(plan: RecordingPlan) -> Iterator[NamedFrame]:
 
 def calibrations(
     microscope: VirtualMicroscope, seed: int, *, quick: bool
-) -> tuple[Calibration, Calibration]:
-    """The continuous and the discrete calibration from one recording."""
+) -> tuple[Calibration, Calibration | None]:
+    """The continuous and the discrete calibration from one recording.
+
+    The discrete one is None where the few views of one magnification do not converge.
+    """
     shown, views = (QUICK, QUICK_VIEWS) if quick else (CONTINUOUS, VIEWS)
     plan = calibration_plan(
         microscope,
@@ -107,7 +111,11 @@ def calibrations(
     continuous = calibrate_found(found, rejected, options=options, **common).calibration
     some = [view for view in found if view.magnification in DISCRETE]
     alone = replace(options, method="discrete")
-    discrete = calibrate_found(some, [], options=alone, **common).calibration
+    try:
+        discrete = calibrate_found(some, [], options=alone, **common).calibration
+    except UnusableCalibrationError as error:
+        print(f"no discrete calibration: {error.seen}", flush=True)
+        return continuous, None
     return continuous, discrete
 
 
@@ -120,16 +128,15 @@ def schedule(quick: bool) -> list[tuple[float, int]]:
 
 
 def cases_of(
-    scope: VirtualMicroscope, continuous: Calibration, discrete: Calibration
+    scope: VirtualMicroscope, continuous: Calibration, discrete: Calibration | None
 ) -> list[Case]:
     def nominal(g: float) -> ScanCamera:
         return ScanCamera.nominal(g, scope.width, scope.height, scope.display_width_m)
 
-    return [
-        Case("uncalibrated", nominal, corrected=False),
-        Case("interpolated", discrete.at, corrected=True),
-        Case("continuous", continuous.at, corrected=True),
-    ]
+    cases = [Case("uncalibrated", nominal, corrected=False)]
+    if discrete is not None:
+        cases.append(Case("interpolated", discrete.at, corrected=True))
+    return [*cases, Case("continuous", continuous.at, corrected=True)]
 
 
 def frames_to(near: np.ndarray) -> int | None:
@@ -193,9 +200,11 @@ def show_seeds(found: list[dict[str, dict[str, Any]]]) -> None:
     print(
         f"\nfinal true error over {len(found)} seeds      px: median   worst    nm: median   worst"
     )
-    for name in found[0]:
-        px, nm = (np.array([r[name][f"final_true_{unit}"] for r in found]) for unit in ("px", "nm"))
-        print(f"{name:30}{np.median(px):20.3f}{px.max():8.3f}{np.median(nm):14.1f}{nm.max():8.1f}")
+    for name in dict.fromkeys(name for results in found for name in results):
+        made = [results[name] for results in found if name in results]
+        px, nm = (np.array([run[f"final_true_{unit}"] for run in made]) for unit in ("px", "nm"))
+        label = name if len(made) == len(found) else f"{name} ({len(made)} of them)"
+        print(f"{label:30}{np.median(px):20.3f}{px.max():8.3f}{np.median(nm):14.1f}{nm.max():8.1f}")
 
 
 def run_cases(task: Task, cases: list[Case]) -> list[Run]:

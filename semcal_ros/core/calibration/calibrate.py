@@ -44,6 +44,7 @@ from semcal_ros.core.calibration.outliers import (
     find_change_point,
     find_outliers,
     find_wrong_tilts,
+    measure_deviations,
 )
 from semcal_ros.core.calibration.pda import pda_functions
 from semcal_ros.core.calibration.pda_step import (
@@ -63,12 +64,17 @@ from semcal_ros.core.calibration.summary import (
     list_undetermined,
 )
 from semcal_ros.core.calibration.untilted import mark_untilted
-from semcal_ros.core.calibration.views import GridView, RejectedView
+from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
+from semcal_ros.core.errors import (
+    CalibrationError,
+    InvalidValueError,
+    Rejection,
+    UnusableCalibrationError,
+)
 from semcal_ros.core.wording import counted
 
 __all__ = [
@@ -368,14 +374,21 @@ def _check_scale(setup: Setup, factor: float) -> None:
     check_nominal_scale(factor, **_units(setup))
 
 
+# Display widths and squares that are stated are right to some per cent, and tilts shorten lengths by as much.
+_TELLING_FACTOR = 1.2
+
+
 def _check_converged(setup: Setup, fit: _MethodFit, factor: float) -> None:
     """Refuse a fit that is not at a minimum, or that ended far from the nominal scale."""
     if fit.failure:
+        advice = "leave out what are not such views"
+        if not 1.0 / _TELLING_FACTOR < factor < _TELLING_FACTOR:
+            advice += "; " + advise_scale(factor, **_units(setup))
         raise UnusableCalibrationError(
             f"an adjustment that did not converge ({fit.failure}), where the images show {factor:.3g} "
             "times the scale that magnification, display width and squares predict",
             expected="views of one flat grid, by one microscope, at the magnifications that are stated",
-            do="leave out what are not such views; " + advise_scale(factor, **_units(setup)),
+            do=advice,
         )
     _check_scale(setup, float(np.median([fit.functions["scale"](g) for g in setup.magnifications])))
 
@@ -428,7 +441,9 @@ def _fit_without_outliers(
             setup, own = _without_tilts(setup, wrong)
             notes += own
             continue
-        found = find_outliers(fit.adjustment.problem, fit.adjustment.result)
+        found = _find_masked_outlier(setup, fit) or find_outliers(
+            fit.adjustment.problem, fit.adjustment.result
+        )
         if not found:
             return fit, setup, tuple(outliers), notes
         outliers += [
@@ -438,6 +453,41 @@ def _fit_without_outliers(
         # At least two views of every magnification stay, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
+
+
+# A grid that seems to be so many times less regular than lithography makes it: perhaps one view is wrong.
+_IRREGULAR = 4.0
+# Views that are left out to see.
+_SUSPECTS = 3
+
+
+def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[ViewStatus]]:
+    """Find the one view without which the grid is regular.
+
+    Where the projection is parallel, one view at a wrong scale is imitated by a tilt of a stretched grid, so
+    all views are given stretched grids, and that view stands out little. Leaving it out makes the stretch of the
+    others collapse, which leaving out another does not.
+    """
+    usual = setup.priors.grid_stretch_sigma
+    lattice = fit.adjustment.spread.lattice_sigma
+    if lattice is None or float(np.max(lattice)) < _IRREGULAR * usual:
+        return {}
+    deviations = measure_deviations(fit.adjustment.problem, fit.adjustment.result)
+    count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
+    suspects = [
+        int(v)
+        for v in np.argsort(-deviations.sigmas)[:_SUSPECTS]
+        if count[setup.views[int(v)].magnification] > 2
+    ]
+    left = {}
+    for suspect in suspects:
+        views = tuple(view for i, view in enumerate(setup.views) if i != suspect)
+        other = fit_joint(replace(setup, views=views), "off").adjustment.spread.lattice_sigma
+        left[suspect] = np.inf if other is None else float(np.max(other))
+    best = min(left, key=lambda v: left[v], default=None)
+    if best is None or left[best] > float(np.max(lattice)) / _IRREGULAR:
+        return {}
+    return {best: deviations.reject(best)}
 
 
 def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[str]]:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from semcal_ros.core.arrays import solve_scaled
+from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.normal_equations import (
     Problem,
@@ -41,7 +41,14 @@ from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["ChangePoint", "find_change_point", "find_outliers", "find_wrong_tilts"]
+__all__ = [
+    "ChangePoint",
+    "Deviations",
+    "find_change_point",
+    "find_outliers",
+    "find_wrong_tilts",
+    "measure_deviations",
+]
 
 
 # Standard deviations: a recording without a jump is suspected in one of twenty cases, as there are
@@ -140,9 +147,9 @@ def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, flo
     return {int(v): float(deviation[v]) for v in np.flatnonzero(deviation > limit)}
 
 
-# Largest deviation of a height in robust standard deviations: heights are a mixture of views with
-# still and with moved stages, with long tails.
-_HEIGHT_SIGMAS = 8.0
+# Largest deviation of height and stretch in robust standard deviations: heights are a mixture of views
+# with still and with moved stages, with long tails.
+_LARGEST_SIGMAS = 8.0
 # Least spread of the heights, m; smaller differences of height are not significant.
 _LEAST_HEIGHT_M = 5e-6
 # Least spread of the stretches and shears; smaller differences are those of ordinary grids.
@@ -156,42 +163,81 @@ _ENOUGH_VIEWS = 3
 _FEW = 0.1
 
 
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """How much each view disagrees with the others.
+
+    Attributes
+    ----------
+    height_m, stretch, misfit
+        (V,) height about that of the views at its magnification, m; the larger of stretch and shear of
+        its lattice; RMS residual over that of the median view.
+    usual_height_m
+        Robust 1-sigma of the heights, m.
+    sigmas
+        (V,) deviation of height and stretch together, in robust standard deviations. A wrong scale is
+        imitated by both in part, as the projection lets it.
+    """
+
+    height_m: Array
+    stretch: Array
+    misfit: Array
+    usual_height_m: float
+    sigmas: Array
+
+    def reject(self, view: int) -> Rejection[ViewStatus]:
+        """Return why a view is left out."""
+        return Rejection(
+            ViewStatus.OUTLIER,
+            f"does not agree with the other views at its magnification: {1e6 * self.height_m[view]:.0f} um of height, "
+            f"where {1e6 * self.usual_height_m:.0f} um are usual, a grid stretched by "
+            f"{100.0 * self.stretch[view]:.2g} %, and residuals {self.misfit[view]:.1f} times the usual; wrong "
+            "magnification, or a wrong square size",
+        )
+
+
+def measure_deviations(problem: Problem, result: BundleResult) -> Deviations:
+    """Measure how much each view disagrees with the others; ``problem`` and ``result`` are the adjustment."""
+    height = result.state.translations_m[:, 2]
+    square = np.add.reduceat(
+        whitened_norm(problem, result.residuals_px) ** 2, problem.starts[:-1]
+    ) / np.diff(problem.starts)
+    misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
+    offset = height - np.median(height)
+    for own in _members(problem):
+        if len(own) >= _ENOUGH_VIEWS:
+            offset[own] = height[own] - np.median(height[own])
+    # 90 % of normal deviates are below 1.645; the median would only reflect the views with a still
+    # stage.
+    spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
+    sigmas = np.abs(offset) / spread
+    stretch = np.zeros(len(height))
+    if len(result.state.lattices):
+        stretch = np.max(np.abs(result.state.lattices), axis=1)
+        usual = max(float(np.quantile(stretch, 1.0 - _FEW)) / 1.645, _LEAST_SHAPE)
+        sigmas = np.hypot(sigmas, stretch / usual)
+    return Deviations(offset, stretch, misfit, spread, sigmas)
+
+
+def _members(problem: Problem) -> list[Indices]:
+    """Return the views of each magnification."""
+    return [np.flatnonzero(problem.group == k) for k in range(len(problem.designs))]
+
+
 def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the views that disagree with the others; index and reason of each.
 
     ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification
     disagree, or many in all, the fault is not in single views, and none is returned.
     """
-    height = result.state.translations_m[:, 2]
-    square = np.add.reduceat(
-        whitened_norm(problem, result.residuals_px) ** 2, problem.starts[:-1]
-    ) / np.diff(problem.starts)
-    misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
-    members = [np.flatnonzero(problem.group == k) for k in range(len(problem.designs))]
-    offset = height - np.median(height)
-    for own in members:
-        if len(own) >= _ENOUGH_VIEWS:
-            offset[own] = height[own] - np.median(height[own])
-    # 90 % of normal deviates are below 1.645; the median would only reflect the views with a still
-    # stage.
-    spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
-    odd = (np.abs(offset) > _HEIGHT_SIGMAS * spread) | (misfit > _MISFIT_RATIO)
-    shape = np.zeros(len(height))
-    if len(result.state.lattices):
-        shape = np.max(np.abs(result.state.lattices), axis=1)
-        usual = max(float(np.quantile(shape, 1.0 - _FEW)) / 1.645, _LEAST_SHAPE)
-        odd |= shape > _HEIGHT_SIGMAS * usual
+    found = measure_deviations(problem, result)
+    odd = (found.sigmas > _LARGEST_SIGMAS) | (found.misfit > _MISFIT_RATIO)
     outliers: dict[int, Rejection[ViewStatus]] = {}
     if odd.mean() > _FEW:
         return outliers
-    for own in members:
+    for own in _members(problem):
         if len(own) >= _ENOUGH_VIEWS and 2 * odd[own].sum() >= len(own):
             continue
         for v in own[odd[own]]:
-            outliers[int(v)] = Rejection(
-                ViewStatus.OUTLIER,
-                f"does not agree with the other views at its magnification: {1e6 * offset[v]:.0f} um of height, where "
-                f"{1e6 * spread:.0f} um are usual, a grid stretched by {100.0 * shape[v]:.2g} %, and residuals "
-                f"{misfit[v]:.1f} times the usual; wrong magnification, or a wrong square size",
-            )
+            outliers[int(v)] = found.reject(int(v))
     return outliers
