@@ -191,13 +191,28 @@ ARGUMENTS = {
         boolean,
     ),
 }
+# Not of a replay, whose recording takes the place of the microscope.
+DRIVER = {
+    "source": Argument(
+        "",
+        "Also start the node microscope with this source; empty for a driver of your own. Its other parameters come"
+        " from params_file.",
+        choices=["", "folder"],
+    ),
+    "folder": Argument(
+        "",
+        "Folder into which the microscope saves, for source:=folder.",
+        existing_folder,
+    ),
+}
+LIVE = {**ARGUMENTS, **DRIVER}
 
 
 def generate_launch_description():
     return LaunchDescription(
         [
-            *declarations(ARGUMENTS),
-            OpaqueFunction(function=check_arguments, args=[ARGUMENTS]),
+            *declarations(LIVE),
+            OpaqueFunction(function=check_arguments, args=[LIVE]),
             OpaqueFunction(
                 function=set_environment, condition=IfCondition(LaunchConfiguration("large_images"))
             ),
@@ -255,8 +270,14 @@ def set_environment(context):
 
 
 def start_nodes(context):
-    nodes = make_nodes(context)
+    nodes = [*make_driver(context), *make_nodes(context)]
     return [*NodeWatch(nodes).handlers(), *nodes]
+
+
+def make_driver(context):
+    if not LaunchConfiguration("source").perform(context):
+        return []
+    return [suite_node(context, "microscope", "config", *DRIVER)]
 
 
 def make_nodes(context):
@@ -291,7 +312,7 @@ def suite_node(context, executable, *passed, fixed=None, fallback=None):
     return make_node(
         context,
         executable,
-        {**given(context, ARGUMENTS, passed), **fixed},
+        {**given(context, LIVE, passed), **fixed},
         fallback,
         respawn=respawn,
         respawn_delay=RESPAWN_DELAY_S,

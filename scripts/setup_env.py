@@ -64,7 +64,10 @@ def main() -> None:
 def update(distro: str, this_python: bool) -> None:
     """Bring .venv to what the requirement files and the sources ask for."""
     select(distro)
-    files = [ROOT / "requirements" / f"{name}.txt" for name in ("base", f"ros-{distro}", "test")]
+    files = [
+        ROOT / "requirements" / f"{name}.txt"
+        for name in ("base", f"ros-{distro}", "microscope", "test")
+    ]
     wanted = {"distro": distro, "environment": f"{VENV} {digest(files)}"}
     stamp = read_stamp()
     other_python = this_python and stamp.get("python") != platform.python_version()

@@ -33,7 +33,7 @@ from statistics import median
 from benchmarks.table import quick_from_command_line, show
 
 NODES = (
-    *("bag_player", "calibration_server", "drift_compensator", "parameter_server"),
+    *("bag_player", "calibration_server", "drift_compensator", "microscope", "parameter_server"),
     *("rectifier", "stream_corrector", "virtual_sem", "visual_servo"),
 )
 UNIT = "import numpy"

@@ -35,6 +35,7 @@ __all__ = [
     "MAGNIFICATION_LIMITS",
     "MagnificationReading",
     "check_magnification",
+    "published_number",
     "read_magnification",
 ]
 
@@ -120,6 +121,26 @@ def check_magnification(magnification: float) -> float:
             do="check quantity and unit in the configuration",
         )
     return float(magnification)
+
+
+def published_number(config: MicroscopeConfig, field_width_m: float, image_width_px: int) -> float:
+    """Return the number from which a reader with this configuration computes the field width.
+
+    Parameters
+    ----------
+    config
+        What the topic carries.
+    field_width_m
+        Width of the field of view.
+    image_width_px
+        Width of the frames.
+    """
+    source = config.magnification
+    if source.quantity == "magnification":
+        return (source.display_width_m or config.display_width_m) / field_width_m
+    if source.quantity == "field_width":
+        return field_width_m / source.si_per_unit
+    return field_width_m / (source.image_width_px or image_width_px) / source.si_per_unit
 
 
 def read_magnification(message: Any, config: MicroscopeConfig) -> MagnificationReading:

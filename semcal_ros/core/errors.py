@@ -32,12 +32,14 @@ __all__ = [
     "ConfigError",
     "InvalidValueError",
     "MessageError",
+    "MicroscopeError",
     "Rejection",
     "SemcalError",
     "StructureError",
     "TiffError",
     "UnknownScaleError",
     "UnusableCalibrationError",
+    "UnusableFrameError",
 ]
 
 
@@ -118,6 +120,14 @@ class BagError(SemcalError):
 
 class UnknownScaleError(BagError):
     """A recording has neither a magnification nor a pixel size, and none was given."""
+
+
+class MicroscopeError(SemcalError):
+    """A microscope, or what its pictures come from, does not answer, is not there, or refuses."""
+
+
+class UnusableFrameError(MicroscopeError):
+    """One picture of a microscope cannot be used; the next one may be."""
 
 
 class StructureError(SemcalError):

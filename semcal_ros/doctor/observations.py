@@ -38,6 +38,7 @@ SUITE = (
     "bag_player",
     "calibration_server",
     "drift_compensator",
+    "microscope",
     "parameter_server",
     "rectifier",
     "stream_corrector",

@@ -112,6 +112,8 @@ def parameters_of(node: str, folder: Path) -> dict[str, Any]:
     if node == "bag_player":
         write_recording(folder / "bag", [1000.0])
         return {"bag": folder / "bag", "start_paused": True}
+    if node == "microscope":
+        return {"source": "folder", "folder": folder, "journal": folder / "journal"}
     return {"input": "stabilized"} if node == "rectifier" else {}
 
 

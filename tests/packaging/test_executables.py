@@ -75,7 +75,12 @@ def arguments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         capture_output=True,
         timeout=120,
     )
-    return {"bag_player": ["--ros-args", "-p", f"bag:={bag}", "-p", "loop:=true"]}
+    folder = tmp_path_factory.mktemp("pictures")
+    journal = ["-p", f"journal:={folder / 'journal'}"]
+    return {
+        "bag_player": ["--ros-args", "-p", f"bag:={bag}", "-p", "loop:=true"],
+        "microscope": ["--ros-args", "-p", f"folder:={folder}", *journal],
+    }
 
 
 def _wait_for(observer: Node, name: str, process: subprocess.Popen[str]) -> None:

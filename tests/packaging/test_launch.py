@@ -330,6 +330,7 @@ EVERYTHING = {
     "use_sim_time": "true",
     "log_level": "debug",
 }
+DRIVER = {"source": "folder", "folder": "."}
 REPLAY_EVERYTHING = {
     **EVERYTHING,
     "bag": "2025",
@@ -430,6 +431,7 @@ WRONG = [
     (SUITE, "output", "."),
     (SUITE, "directory", "missing"),
     (SUITE, "params_file", "missing.yaml"),
+    (SUITE, "folder", "missing"),
     (SUITE, "use_sim_time", "ja"),
     (SUITE, "respawn", "ja"),
     (SUITE, "large_images", "ja"),
@@ -488,6 +490,16 @@ def test_arguments_of_a_launch_file_that_includes_this_one_are_no_mistakes(run: 
     # The one that is nearly meant is given.
     run(SUITE, {"calibration": "2024", "calibration_2": "x"})
     assert WARNINGS == []
+
+
+def test_a_driver_is_started_with_its_source(run: Run) -> None:
+    assert "microscope" not in [node.executable for node in run(SUITE).nodes]
+    (driver,) = (
+        n for n in run(SUITE, {**DRIVER, "config": "jsm820"}).nodes if n.name == "microscope"
+    )
+    assert driver.executable == "microscope"
+    assert driver.parameters == {"config": "jsm820", **DRIVER}
+    assert set(run(SUITE).arguments) - set(run(REPLAY, BAG).arguments) == set(DRIVER)
 
 
 def test_every_argument_is_described(run: Run) -> None:

@@ -49,12 +49,14 @@ MAY_IMPORT = {
     },
     "nodes": {
         *("core", "applications", "synthetic", "config", "middleware"),
-        *("bridge", "files", "calibration", "workflows"),
+        *("bridge", "files", "calibration", "drivers", "workflows"),
     },
+    # Microscopes are devices, as files are: they know messages by their values only.
+    "drivers": {"core", "config", "bridge", "files"},
     "doctor": {"core", "config", "middleware", "bridge", "files", "calibration"},
     "cli": {
         *("core", "applications", "synthetic", "config", "middleware", "bridge"),
-        *("files", "report", "calibration", "workflows", "nodes", "doctor"),
+        *("files", "report", "calibration", "drivers", "workflows", "nodes", "doctor"),
     },
 }
 # The same inside core.

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
+from semcal_ros.bridge.magnification import published_number
 from semcal_ros.config.config import (
     IMAGE_TYPE,
     STAGE_TYPE,
@@ -119,17 +120,6 @@ def _check_config(config: MicroscopeConfig) -> None:
         )
 
 
-def _published_number(config: MicroscopeConfig, image: SeriesImage, width_px: int) -> float:
-    """Return the number from which a reader with this configuration computes the image's field width."""
-    source = config.magnification
-    field_width_m = config.display_width_m / image.magnification
-    if source.quantity == "magnification":
-        return (source.display_width_m or config.display_width_m) / field_width_m
-    if source.quantity == "field_width":
-        return field_width_m / source.si_per_unit
-    return field_width_m / (source.image_width_px or width_px) / source.si_per_unit
-
-
 def _describe(image: SeriesImage, pixels: NDArray[Any]) -> dict[str, Any]:
     """What is known of an image, as plain values for JSON (SI units)."""
     settings, rows = image.page.settings, image.databar_rows
@@ -175,7 +165,8 @@ def _write_image(
     stage: StageConfig | None,
 ) -> dict[str, Any]:
     number = blank_message(config.magnification.type)
-    number.data = _published_number(config, entry, pixels.shape[1])
+    width_m = config.display_width_m / entry.magnification
+    number.data = published_number(config, width_m, pixels.shape[1])
     # A player that keeps the recording's order then announces the magnification before its image.
     before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
     writer.write(_topic(config.magnification.topic), before_ns, number)

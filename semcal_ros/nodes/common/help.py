@@ -91,6 +91,13 @@ EXECUTABLES = {
         "",
         "-p specimen:=gold -p drift:=slow -p magnification:=5000.0",
     ),
+    "microscope": ExecutableHelp(
+        "Puts a microscope, a folder of its pictures or a frame grabber on the topics.",
+        "~/set_magnification, ~/move_stage",
+        "image_raw, magnification, stage, conditions, ~/motion",
+        "~/start, ~/stop",
+        "-p config:=jsm820 -p source:=folder -p folder:=/mnt/sem",
+    ),
     "visual_servo": ExecutableHelp(
         "Brings a target to a pose in the sem frame by velocities of the stage.",
         "image_rect, camera_info, projection_stamped or projection, drift, magnification",

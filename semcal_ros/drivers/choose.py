@@ -1,0 +1,73 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The sources by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.errors import ConfigError
+from semcal_ros.drivers.folder import FolderSource
+from semcal_ros.drivers.journal import default_journal
+from semcal_ros.drivers.source import FrameSource
+
+__all__ = ["SOURCES", "Settings", "make_source"]
+
+
+class Settings(Protocol):
+    """Values of the parameters of the node, by name."""
+
+    def __getitem__(self, name: str) -> Any: ...
+
+
+def _make_folder(config: MicroscopeConfig, settings: Settings) -> FrameSource:
+    if not settings["folder"]:
+        raise ConfigError(
+            "no folder", expected="the parameter folder", do="give --ros-args -p folder:=PATH"
+        )
+    folder = Path(settings["folder"]).expanduser().absolute()
+    journal = settings["journal"]
+    return FolderSource(
+        folder,
+        Path(journal).expanduser().absolute() if journal else default_journal(folder),
+        pattern=settings["pattern"],
+        settle_s=settings["settle"],
+        poll_s=settings["poll"],
+        give_up_s=settings["give_up"],
+        backlog=settings["backlog"],
+        stamps=settings["stamps"],
+        field_width_m=settings["field_width_m"],
+        keep_databar=config.image.databar_rows > 0,
+    )
+
+
+SOURCES: Mapping[str, Callable[[MicroscopeConfig, Settings], FrameSource]] = {
+    "folder": _make_folder,
+}
+"""What makes each source from the configuration and the parameters of the node."""
+
+
+def make_source(name: str, config: MicroscopeConfig, settings: Settings) -> FrameSource:
+    """Return a source; it is not opened yet.
+
+    Raises
+    ------
+    ConfigError
+        A parameter that it needs is missing, or a package.
+    """
+    return SOURCES[name](config, settings)

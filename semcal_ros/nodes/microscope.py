@@ -1,0 +1,418 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Executable ``microscope``: puts a microscope, a folder of its pictures or a frame grabber on the topics."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+from semcal_ros.core.errors import MicroscopeError, SemcalError
+from semcal_ros.drivers.choose import SOURCES, make_source
+from semcal_ros.drivers.health import FrameWatch
+from semcal_ros.drivers.runner import SourceRunner
+from semcal_ros.drivers.source import ConfirmsFrames, MovesStage, SetsFieldWidth, SourceFrame
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.motion import MOTION, MotionInterface
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.frames.source_output import SourceOutput
+
+__all__ = ["Microscope", "main"]
+
+_PARAMETERS = (
+    ParameterDeclaration(
+        "source", "folder", "What the frames come from.", choices=tuple(SOURCES), fixed=True
+    ),
+    ParameterDeclaration("start", True, "Begin at once, without ~/start.", fixed=True),
+    ParameterDeclaration(
+        "field_width_m",
+        0.0,
+        "Width of the field of view where the source does not say it; 0: unknown then.",
+        "m",
+        0.0,
+        0.1,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "frame_timeout",
+        10.0,
+        "Silence of a source that scans all the time after which it is reported; three frame times, if that is longer.",
+        "s",
+        0.5,
+        3600.0,
+    ),
+    ParameterDeclaration(
+        "motion_timeout",
+        60.0,
+        "A move that takes longer is taken for failed.",
+        "s",
+        1.0,
+        3600.0,
+    ),
+    ParameterDeclaration(
+        "wait_for_subscribers",
+        1,
+        "folder: files wait until the images have this many subscribers.",
+        low=0,
+        high=100,
+    ),
+    ParameterDeclaration(
+        "max_rate", 20.0, "folder: frames per second of files that have waited.", "Hz", 0.1, 1000.0
+    ),
+    ParameterDeclaration(
+        "folder", "", "folder: the folder into which the microscope saves.", fixed=True
+    ),
+    ParameterDeclaration(
+        "pattern", "*", "folder: names that count, such as *.tif, separated by spaces.", fixed=True
+    ),
+    ParameterDeclaration(
+        "settle",
+        0.3,
+        "folder: a file that is written may not change for this time.",
+        "s",
+        0.05,
+        60,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "poll", 0.5, "folder: time between two looks through the folder.", "s", 0.05, 60, fixed=True
+    ),
+    ParameterDeclaration(
+        "give_up",
+        10.0,
+        "folder: a file that cannot be read is refused after this time without a change.",
+        "s",
+        1.0,
+        3600.0,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "backlog",
+        "resume",
+        "folder: files that are there at the start. Those since the last run; all that were never published; none.",
+        choices=("resume", "all", "skip"),
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "stamps",
+        "file",
+        "folder: a frame was finished when its file was written, or when it was found.",
+        choices=("file", "arrival"),
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "journal",
+        "",
+        "folder: file that keeps what has been published; empty: one below ROS_HOME, else ~/.ros.",
+        fixed=True,
+    ),
+    *MOTION,
+)
+# How often the state is looked at: a person who has pulled a plug sees it within the time of a report.
+_LOOK_S = 0.05
+# A call of the source that takes longer has hung; those that wait for a frame return after 0.2 s by themselves.
+_HUNG_S = 5.0
+_FRAME_TIMES = 3.0
+# Fast DDS asks its subscribers every 3 s what they have received; one that has not answered twice is not waited for.
+_PROBE_S = 7.0
+_LAST_ANSWER_S = 3.5
+
+
+class Microscope(SemNode):
+    """Publishes ``image_raw``, ``magnification``, ``stage`` and ``conditions`` of a source, and moves it."""
+
+    def __init__(self) -> None:
+        super().__init__("microscope", _PARAMETERS)
+        self._source = make_source(self.parameters["source"], self.config, self.parameters)
+        stage = isinstance(self._source, MovesStage) or self.parameters["source"] == "folder"
+        self._output = SourceOutput(self.config, self.endpoints, self.reporter, stage=stage)
+        self._watch = FrameWatch()
+        self._skipped = 0
+        self._phase = ""
+        self._frame_s = 0.0
+        self._last_published_s = -1.0
+        # Subscribers that are known to hear this node, and the frame by which that is found out.
+        self._heard_by = 0
+        self._probe: tuple[SourceFrame, int, float] | None = None
+        wake = self.endpoints.guard(self._handle)
+        self._runner = SourceRunner(self._source, _quietly(wake.trigger))
+        self.closing.callback(self._runner.close)
+        self.closing.callback(self._finish_probe)
+        self._hands = _Hands(self, self._source, self._runner)
+        self._motion = MotionInterface(
+            self, self.endpoints, self.parameters, self.reporter, self.config.stage, self._hands
+        )
+        self._controls = [
+            self.endpoints.trigger_service("~/start", self._start),
+            self.endpoints.trigger_service("~/stop", self._stop),
+        ]
+        self._timer = self.create_timer(_LOOK_S, self._handle)
+        if self.parameters["start"]:
+            self._runner.start()
+
+    # -- what it tells -----------------------------------------------------------------------------
+
+    def introduction(self) -> list[str]:
+        """Extend the base class: say which source, and whether it may be moved."""
+        may = "may move it" if self.parameters["allow_motion"] else "does not move it"
+        return [*super().introduction(), f"source {self.parameters['source']}", may]
+
+    def idle(self) -> bool:
+        """Return whether no frame may come for a long time without a fault."""
+        return not self._source.streams or not self._runner.wanted
+
+    def conditions(self) -> list[str]:
+        """Extend the base class: what is the matter with the source, its frames and its stage."""
+        state = self._runner.state()
+        found = super().conditions()
+        if state.phase == "stopped":
+            found.append("stopped")
+        elif state.phase == "lost":
+            found.append(f"source lost, trying again: {state.reason}")
+        elif state.blocked_s > _HUNG_S:
+            found.append(f"source does not answer for {state.blocked_s:.0f} s")
+        elif state.phase == "connecting":
+            found.append("connecting")
+        elif self._is_silent(state.silent_s):
+            found.append(f"no frame for {state.silent_s:.0f} s")
+        if self._waits_for_subscribers():
+            found.append(f"files wait for subscribers of {self.config.image.topic}")
+        return [*found, *self._watch.conditions(), *self._motion.conditions()]
+
+    def _is_silent(self, silent_s: float) -> bool:
+        limit_s = max(self.parameters["frame_timeout"], _FRAME_TIMES * self._frame_s)
+        return self._source.streams and silent_s > limit_s
+
+    # -- services ----------------------------------------------------------------------------------
+
+    def _start(self) -> str:
+        self._watch.acknowledge()
+        self._motion.acknowledge()
+        was_running = self._runner.wanted
+        self._runner.start()
+        return (
+            "running already; what has changed since is taken for wanted"
+            if was_running
+            else "started"
+        )
+
+    def _stop(self) -> str:
+        was_running = self._runner.wanted
+        self._runner.stop()
+        under_way = "; a move that is under way goes on to its end" if self._motion.busy else ""
+        return f"{'stopped' if was_running else 'not running'}{under_way}"
+
+    # -- frames ------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """Return the time on the steady clock of the node, s."""
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _waits_for_subscribers(self) -> bool:
+        wanted = int(self.parameters["wait_for_subscribers"])
+        return (
+            self._source.lossless and self._runner.waiting > 0 and self._output.listeners < wanted
+        )
+
+    def _handle(self) -> None:
+        """Publish the frames that have come, and say what has happened to the source."""
+        for error in self._runner.problems():
+            self.reporter.reject(error)
+        self._tell_phase()
+        if self._probe is not None:
+            self._is_heard()
+        self._hands.check(self.parameters["motion_timeout"])
+        while self._runner.waiting and self._runner.wanted and self._may_publish():
+            frame = self._runner.take()
+            if frame is None:
+                return
+            self._publish(frame)
+
+    def _may_publish(self) -> bool:
+        if not self._source.lossless:
+            return True
+        if self._waits_for_subscribers() or not self._is_heard():
+            return False
+        return self.now_s() - self._last_published_s >= 1.0 / self.parameters["max_rate"]
+
+    def _is_heard(self) -> bool:
+        """Return whether all subscribers hear what is published, or one frame shall go out to find that out.
+
+        This side may know of a subscriber that has not found this side yet, and misses what is published meanwhile
+        unless this process lives on to send it again. So the first frame after one has come is told to the journal,
+        and followed by the next, only once it has been received.
+        """
+        listeners = self._output.listeners
+        if self._probe is None:
+            self._heard_by = min(self._heard_by, listeners)
+            return True
+        frame, count, since_s = self._probe
+        if not self._output.is_taken() and self.now_s() - since_s < _PROBE_S:
+            return False
+        self._probe, self._heard_by = None, count
+        self._confirm(frame)
+        return True
+
+    def _finish_probe(self) -> None:
+        """Wait for the answer to a frame that is not in the journal yet, lest the next start publish it again."""
+        if self._probe is not None and self._output.is_taken(_LAST_ANSWER_S):
+            self._confirm(self._probe[0])
+
+    def _publish(self, frame: SourceFrame) -> None:
+        self.reporter.count_received()
+        self._frame_s = frame.acquisition_s or 0.0
+        try:
+            for news in self._watch.see(frame):
+                self.reporter.warn(news)
+            stamp_ns = self._output.publish(frame)
+            self._last_published_s = self.now_s()
+            self.reporter.count_published(stamp_ns)
+        except SemcalError as error:
+            self.reporter.reject(error)
+        listeners = self._output.listeners
+        if self._source.lossless and listeners > self._heard_by:
+            self._probe = frame, listeners, self.now_s()
+        else:
+            self._confirm(frame)
+
+    def _confirm(self, frame: SourceFrame) -> None:
+        if not isinstance(self._source, ConfirmsFrames):
+            return
+        try:
+            self._source.confirm(frame)
+        except SemcalError as error:
+            self.reporter.reject(error)
+
+    def _tell_phase(self) -> None:
+        state = self._runner.state()
+        skipped, self._skipped = state.skipped - self._skipped, state.skipped
+        if skipped:
+            self.reporter.statistics.drop(skipped)
+        self.reporter.note("source_state", state.phase)
+        if state.phase == self._phase:
+            return
+        self._phase = state.phase
+        if state.phase == "open":
+            self.reporter.info(state.reason)
+        elif state.phase == "lost" and self._motion.busy:
+            self._motion.give_up("the source went away during a move")
+
+    # -- moving ------------------------------------------------------------------------------------
+
+    @property
+    def motion(self) -> MotionInterface:
+        """What is asked to move."""
+        return self._motion
+
+    def note_field_width(self, width_m: float | None) -> None:
+        """Take note of a field width that was set from here."""
+        self._watch.asked(width_m)
+
+
+class _Hands:
+    """Moves the source in a thread of its own; a :class:`~semcal_ros.nodes.common.motion.Performer`."""
+
+    def __init__(self, node: Microscope, source: object, runner: SourceRunner) -> None:
+        self._node = node
+        self._source = source
+        self._runner = runner
+        self._results: deque[Callable[[], None]] = deque()
+        self._begun_s: float | None = None
+        self._thread: threading.Thread | None = None
+        self._guard = node.endpoints.guard(self._deliver)
+
+    def obstacle(self) -> str:
+        state = self._runner.state()
+        if self._thread is not None and self._thread.is_alive():
+            return "the microscope has not returned from the command before"
+        return "" if state.phase == "open" else f"the source is {state.phase}"
+
+    def position(self) -> Mapping[str, float]:
+        if not isinstance(self._source, MovesStage):
+            raise MicroscopeError(
+                "a source whose stage cannot be moved", expected="a source that can, as openfibsem"
+            )
+        return self._source.stage_position()
+
+    def own_limits(self) -> Mapping[str, tuple[float, float]]:
+        return self._source.stage_limits() if isinstance(self._source, MovesStage) else {}
+
+    def move(self, target: Mapping[str, float]) -> None:
+        assert isinstance(self._source, MovesStage)
+        self._source.move_stage(target)
+
+    def set_magnification(self, magnification: float) -> None:
+        if not isinstance(self._source, SetsFieldWidth):
+            raise MicroscopeError(
+                "a source whose magnification cannot be set",
+                expected="a source that can, as openfibsem",
+            )
+        width_m = self._node.config.display_width_m / magnification
+        self._source.set_field_width(width_m)
+        self._results.append(lambda: self._node.note_field_width(width_m))
+
+    def run(self, work: Callable[[], str], done: Callable[[str, SemcalError | None], None]) -> None:
+        self._begun_s = self._node.now_s()
+
+        def task() -> None:
+            answer, problem = "", None
+            try:
+                answer = work()
+            except SemcalError as error:
+                problem = error
+            except Exception as error:
+                # Libraries of makers raise what they like.
+                problem = MicroscopeError(f"{type(error).__name__}: {error}")
+            self._results.append(lambda: done(answer, problem))
+            _quietly(self._guard.trigger)()
+
+        self._thread = threading.Thread(target=task, name="motion", daemon=True)
+        self._thread.start()
+
+    def _deliver(self) -> None:
+        while self._results:
+            self._results.popleft()()
+        if not self._node.motion.busy:
+            self._begun_s = None
+
+    def check(self, timeout_s: float) -> None:
+        """Give up a command that takes too long."""
+        if self._begun_s is None or not self._node.motion.busy:
+            return
+        if self._node.now_s() - self._begun_s > timeout_s:
+            self._begun_s = None
+            self._node.motion.give_up(f"the microscope has not finished within {timeout_s:g} s")
+
+
+def _quietly(trigger: Callable[[], None]) -> Callable[[], None]:
+    """Return a call that does nothing once the node has ended."""
+
+    def call() -> None:
+        with contextlib.suppress(Exception):
+            trigger()
+
+    return call
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the executable."""
+    return run_node(Microscope, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
