@@ -40,9 +40,9 @@ from semcal_ros.core.registration.register import (
 )
 
 try:
-    from skimage.registration import phase_cross_correlation
+    from skimage import registration as skimage_registration
 except ImportError:
-    phase_cross_correlation = None
+    skimage_registration = None
 try:
     import imreg_dft
 except ImportError:
@@ -145,7 +145,7 @@ def ecc(pair: Pair, prepared: None) -> Answer:
 
 def _skimage(normalization: str | None) -> Callable[[Pair, None], Answer]:
     def method(pair: Pair, prepared: None) -> Answer:
-        shift = phase_cross_correlation(
+        shift = skimage_registration.phase_cross_correlation(
             pair.reference, pair.image, upsample_factor=100, normalization=normalization
         )[0]
         return -np.asarray(shift, dtype=np.float64)[::-1], None
@@ -172,8 +172,8 @@ METHODS = (
     Method(UNIT, phase_correlate),
     Method("cv2.phaseCorrelate", phase_correlate_bare),
     Method("cv2.findTransformECC", ecc),
-    Method("skimage, default", _skimage("phase") if phase_cross_correlation else None),
-    Method("skimage, no normalization", _skimage(None) if phase_cross_correlation else None),
+    Method("skimage, default", _skimage("phase") if skimage_registration else None),
+    Method("skimage, no normalization", _skimage(None) if skimage_registration else None),
     Method("imreg_dft", imreg if imreg_dft else None),
     Method("pystackreg", stackreg if StackReg else None),
 )

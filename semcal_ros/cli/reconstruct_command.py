@@ -257,7 +257,7 @@ def _echo_summary(result: dict[str, Any]) -> None:
     )
     click.echo(
         f"  1-sigma: noise {parts['noise']:.2f}, shape {parts['shape']:.2f}, scale "
-        f"{parts['scale']:.2f} nm; depth {result['relief_sigma']:.2%}"
+        f"{parts['scale']:.2f}, patches {parts['patches']:.2f} nm; depth {result['relief_sigma']:.2%}"
     )
     click.echo(f"  points about the sphere: RMS {1e9 * result['sphere_rms_m']:.2f} nm")
     departure = result["departure"]

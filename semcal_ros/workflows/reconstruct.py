@@ -131,6 +131,7 @@ class Reconstruction:
                 "noise": ball.noise_sigma_m,
                 "shape": ball.shape_sigma_m,
                 "scale": ball.scale_sigma_m,
+                "patches": ball.patch_bias_sigma_m,
             },
             "sphere_rms_m": ball.sphere.rms_m,
             "is_ball": ball.roundness.is_ball,

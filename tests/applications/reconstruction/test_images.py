@@ -29,7 +29,7 @@ from semcal_ros.applications.reconstruction import (
 )
 from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
-from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
+from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan, draw_ball_plan
 
 # The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
@@ -76,6 +76,24 @@ def test_points_lie_on_the_true_surface(plan, structure):
     low, high = ball.interval_m
     assert low < 900e-9 < high
     assert high - low < 60e-9
+    # What no residual shows is not left out: 0.07 px of the radius, wherever the other parts are small.
+    assert ball.patch_bias_sigma_m == pytest.approx(2 * 0.07 * 6.5e-9, rel=0.05)
+    assert ball.sigma_m > max(ball.patch_bias_sigma_m, ball.noise_sigma_m)
+
+
+@pytest.mark.slow
+def test_the_outline_of_a_tip_does_not_bend_the_poses():
+    """Points on the outline move over the surface as it turns: they are told by their residuals."""
+    made = draw_ball_plan(3, frames=60, pixel_m=8e-9)
+    assert made.specimen.tip_length_m > 0.0
+    found = reconstruct(followed(made), made.microscope.timing)
+    ball = measure_ball(found)
+    off = np.abs(np.linalg.norm(found.points_m - ball.sphere.centre_m, axis=1) - 450e-9)
+    # Off the ball by more than 2 px: 22 points while those of the outline were kept.
+    assert np.count_nonzero(off > 16e-9) < 15
+    # Those kept it from converging in 10 passes, with a diameter 0.4 % too small.
+    assert found.converged
+    assert ball.diameter_m == pytest.approx(900e-9, rel=0.003)
 
 
 @pytest.mark.slow
