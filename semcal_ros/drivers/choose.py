@@ -24,6 +24,7 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.drivers.folder import FolderSource
 from semcal_ros.drivers.journal import default_journal
+from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem
 from semcal_ros.drivers.source import FrameSource
 
 __all__ = ["SOURCES", "Settings", "make_source"]
@@ -56,8 +57,20 @@ def _make_folder(config: MicroscopeConfig, settings: Settings) -> FrameSource:
     )
 
 
+def _make_openfibsem(_config: MicroscopeConfig, settings: Settings) -> FrameSource:
+    require_fibsem()
+    manufacturer, configuration = settings["manufacturer"], settings["fibsem_config"]
+    return OpenFibsemSource(
+        "" if manufacturer == "configured" else manufacturer,
+        settings["ip_address"],
+        Path(configuration).expanduser().absolute() if configuration else None,
+        settings["beam"],
+    )
+
+
 SOURCES: Mapping[str, Callable[[MicroscopeConfig, Settings], FrameSource]] = {
     "folder": _make_folder,
+    "openfibsem": _make_openfibsem,
 }
 """What makes each source from the configuration and the parameters of the node."""
 

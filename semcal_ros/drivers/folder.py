@@ -386,7 +386,9 @@ class FolderSource:
         self, state: FileState, pages: tuple[ImagePage, ...], images: list[NDArray[Any]]
     ) -> list[SourceFrame]:
         if len(images) != len(pages):
-            raise UnusableFrameError(f"{state.name}: {len(images)} images of {len(pages)}")
+            raise UnusableFrameError(
+                f"{state.name}: only {len(images)} of {len(pages)} pages can be read"
+            )
         written_ns = state.mtime_ns if self._stamps == "file" else time.time_ns()
         return [
             self._frame(state.name, page, image, written_ns, pages[-1])

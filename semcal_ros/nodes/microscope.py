@@ -24,6 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.choose import SOURCES, make_source
 from semcal_ros.drivers.health import FrameWatch
+from semcal_ros.drivers.openfibsem import MANUFACTURERS
 from semcal_ros.drivers.runner import SourceRunner
 from semcal_ros.drivers.source import ConfirmsFrames, MovesStage, SetsFieldWidth, SourceFrame
 from semcal_ros.nodes.common.base import SemNode
@@ -120,6 +121,28 @@ _PARAMETERS = (
         "",
         "folder: file that keeps what has been published; empty: one below ROS_HOME, else ~/.ros.",
         fixed=True,
+    ),
+    ParameterDeclaration(
+        "manufacturer",
+        "configured",
+        "openfibsem: the microscope; by default that of its configuration.",
+        choices=("configured", *MANUFACTURERS),
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "ip_address",
+        "",
+        "openfibsem: of the microscope's server; empty: that of the configuration.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "fibsem_config",
+        "",
+        "openfibsem: configuration file of fibsem; empty: its default.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "beam", "electron", "openfibsem: which beam.", choices=("electron", "ion"), fixed=True
     ),
     *MOTION,
 )
