@@ -30,9 +30,9 @@ __all__ = ["FrameWatch", "is_blank"]
 
 # Rows that are looked at: a blanked beam blanks all of them, and a large image costs no more than a small one.
 _ROWS = 64
-# A blanked beam leaves the dark level and its noise, below a hundredth of the range; the noise of a picture of anything
-# is larger, since brightness is set so that the specimen uses the range.
-_BLANK_SPREAD = 0.01
+# A blanked beam leaves the dark level and its noise, four grey levels of 8 bit at most; a picture of anything has more,
+# since contrast is set so that the specimen uses the range.
+_BLANK_SPREAD = 4.5 / 255.0
 # One dark frame may be a beam that was blanked for a moment, as some microscopes do between two scans.
 _BLANK_FRAMES = 2
 # Two numbers for one setting agree to rounding; a person changes the magnification by more.
@@ -42,7 +42,7 @@ _SAME_VOLTAGE = 0.01
 
 
 def is_blank(image: NDArray[Any]) -> bool:
-    """Return whether an image shows nothing: all of its grey levels lie within a hundredth of the range.
+    """Return whether an image shows nothing: its grey levels lie within a sixtieth of the range.
 
     Parameters
     ----------
@@ -66,18 +66,19 @@ class FrameWatch:
     """
 
     asked_width_m: float | None = None
+    _asked_ns: int = 0
     _blank: int = 0
     _width_m: float | None = None
     _voltage_v: float | None = None
     _first_voltage_v: float | None = None
 
-    def asked(self, width_m: float | None) -> None:
-        """Take note of a field width that was set from here; None if a person has taken over."""
-        self.asked_width_m = width_m
+    def asked(self, width_m: float, now_ns: int) -> None:
+        """Take note of a field width that was set from here; frames that began before may show another."""
+        self.asked_width_m, self._asked_ns, self._width_m = width_m, now_ns, None
 
     def acknowledge(self) -> None:
         """Take what is now for what is wanted."""
-        self.asked_width_m = None
+        self.asked_width_m, self._asked_ns = None, 0
         self._first_voltage_v = self._voltage_v
 
     def see(self, frame: SourceFrame) -> list[str]:
@@ -88,7 +89,8 @@ class FrameWatch:
         if self._blank == _BLANK_FRAMES:
             news.append("the frames are blank: is the beam blanked, or off?")
         turned_before, voltage_before = self._turned(), self._other_voltage()
-        self._width_m = frame.field_width_m
+        if frame.start_ns >= self._asked_ns:
+            self._width_m = frame.field_width_m
         voltage_v = _number(frame.conditions, "accelerating_voltage_v")
         if voltage_v is not None:
             self._voltage_v = voltage_v

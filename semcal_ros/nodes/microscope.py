@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
@@ -342,9 +343,9 @@ class Microscope(SemNode):
         """What is asked to move."""
         return self._motion
 
-    def note_field_width(self, width_m: float | None) -> None:
-        """Take note of a field width that was set from here."""
-        self._watch.asked(width_m)
+    def note_field_width(self, width_m: float, now_ns: int) -> None:
+        """Take note of a field width that was set from here, at this time."""
+        self._watch.asked(width_m, now_ns)
 
 
 class _Hands:
@@ -387,7 +388,8 @@ class _Hands:
             )
         width_m = self._node.config.display_width_m / magnification
         self._source.set_field_width(width_m)
-        self._results.append(lambda: self._node.note_field_width(width_m))
+        now_ns = time.time_ns()
+        self._results.append(lambda: self._node.note_field_width(width_m, now_ns))
 
     def run(self, work: Callable[[], str], done: Callable[[str, SemcalError | None], None]) -> None:
         self._begun_s = self._node.now_s()

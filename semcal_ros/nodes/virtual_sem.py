@@ -17,12 +17,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, Header
 
@@ -30,8 +31,9 @@ from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
 from semcal_ros.config.config import IMAGE_TYPE
-from semcal_ros.core.errors import ConfigError, SemcalError
+from semcal_ros.core.errors import ConfigError, MicroscopeError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.motion import MotionInterface, motion_with
 from semcal_ros.nodes.common.parameters import CONFIG, ParameterDeclaration
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.run import run_node
@@ -54,6 +56,7 @@ from semcal_ros.synthetic import (
     preset,
     read_position,
 )
+from semcal_ros.synthetic.pose import rotation_about_beam
 
 __all__ = ["VirtualSem", "main"]
 
@@ -84,6 +87,14 @@ _PARAMETERS = (
     ),
     ParameterDeclaration(
         "rotation_deg", 0.0, "Rotation of the specimen.", "degrees", -360.0, 360.0
+    ),
+    ParameterDeclaration(
+        "scan_rotation_deg",
+        0.0,
+        "Rotation of the scan, which turns specimen and tilt axis in the image.",
+        "degrees",
+        -360.0,
+        360.0,
     ),
     ParameterDeclaration(
         "height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3
@@ -167,15 +178,17 @@ _PARAMETERS = (
         4.0,
         fixed=True,
     ),
+    # There is nothing to break, and nobody to ask.
+    *motion_with(allow_motion=True, min_tilt=-1.05, min_magnification=1.0, max_magnification=1e8),
 )
-_POSE = ("tilt_deg", "tilt_axis_deg", "rotation_deg", "height_m")
+_POSE = ("tilt_deg", "tilt_axis_deg", "rotation_deg", "height_m", "scan_rotation_deg")
 _ENCODINGS = {8: "mono8", 16: "mono16"}
 
 
 class VirtualSem(SemNode):
     """Publishes ``image_raw`` and, whenever they change, ``magnification`` and ``stage``.
 
-    Listens to ``~/stage`` and ``~/set_magnification``.
+    Listens to ``~/stage``, ``~/move_stage`` and ``~/set_magnification``.
     """
 
     def __init__(self) -> None:
@@ -210,14 +223,23 @@ class VirtualSem(SemNode):
             self._joints = self.endpoints.latched_publisher(JointState, self.config.stage.topic)
             self._announce_stage()
         self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
-        self._knob = self.create_subscription(
-            Float64, "~/set_magnification", self._on_magnification, stream_output(10)
+        self._motion = MotionInterface(
+            self, self.endpoints, self.parameters, self.reporter, self.config.stage, self
         )
+        self._controls = [
+            self.endpoints.trigger_service("~/start", self._start),
+            self.endpoints.trigger_service("~/stop", self._stop),
+        ]
         self._timer = self.create_timer(self._period_s(), self._take_frame)
 
     def idle(self) -> bool:
         """Return True: this node receives no frames."""
         return True
+
+    def conditions(self) -> list[str]:
+        """Extend the base class: also report whether it is stopped, and why nothing moves."""
+        stopped = ["stopped"] if self._timer.is_canceled() else []
+        return [*super().conditions(), *stopped, *self._motion.conditions()]
 
     # -- set-up ------------------------------------------------------------------------------------
 
@@ -275,10 +297,15 @@ class VirtualSem(SemNode):
         """Return where the specimen is, and what the stage says about it before it is moved."""
         tilt, axis, rotation = (math.radians(self.parameters[name]) for name in _POSE[:3])
         height_m = self.parameters["height_m"]
+        scan = math.radians(self.parameters["scan_rotation_deg"])
+        turn = rotation_about_beam(scan)
         if self._mechanics.axis_rad is None:
-            return Pose.tilted(tilt, axis, rotation, (0.0, 0.0, height_m)), None
+            pose = Pose.tilted(tilt, axis, rotation, (0.0, 0.0, height_m))
+            return Pose(turn @ pose.R, turn @ pose.t_m), None
         pose, position = pose_on_stage(self._mechanics, tilt, rotation, axis, height_m=height_m)
-        return pose, read_position(self._mechanics, position, self._random)
+        position = replace(position, scan_rotation_rad=scan)
+        seen = Pose(turn @ pose.R, turn @ pose.t_m)
+        return seen, read_position(self._mechanics, position, self._random)
 
     def _period_s(self) -> float:
         rate = self.parameters["rate"]
@@ -299,6 +326,12 @@ class VirtualSem(SemNode):
 
     def _on_stage(self, message: Any) -> None:
         try:
+            if not self.parameters["allow_motion"]:
+                raise MicroscopeError(
+                    "a velocity of the stage, which is not allowed",
+                    expected="a node that may move its stage",
+                    do="start it with -p allow_motion:=true",
+                )
             self._scene.set_twist(
                 self._now_s(), (message.linear.x, message.linear.y), message.angular.z
             )
@@ -306,12 +339,72 @@ class VirtualSem(SemNode):
         except SemcalError as error:
             self.reporter.reject(error)
 
-    def _on_magnification(self, message: Any) -> None:
+    def _start(self) -> str:
+        self._motion.acknowledge()
+        was_running = not self._timer.is_canceled()
+        self._timer.reset()
+        return "running already" if was_running else "started"
+
+    def _stop(self) -> str:
+        was_running = not self._timer.is_canceled()
+        self._timer.cancel()
+        self._scene.set_twist(self._now_s(), (0.0, 0.0))
+        self._announce_stage()
+        return "stopped, the stage too" if was_running else "not running"
+
+    # -- what is asked of ~/move_stage and ~/set_magnification --------------------------------------
+
+    def obstacle(self) -> str:
+        """Return why nothing can be moved now; see :class:`~semcal_ros.nodes.common.motion.Performer`."""
+        return "it is stopped" if self._timer.is_canceled() else ""
+
+    def position(self) -> dict[str, float]:
+        """Return what the stage says of its joints."""
+        position = self._reading()
+        return {} if position is None else position.joints
+
+    def own_limits(self) -> dict[str, tuple[float, float]]:
+        """Return the range of the parameters that the joints are."""
+        angles = {"tilt": 60.0, "rotation": 360.0, "scan_rotation": 360.0}
+        return {joint: (-math.radians(far), math.radians(far)) for joint, far in angles.items()}
+
+    def move(self, target: Mapping[str, float]) -> None:
+        """Move at once to where the stage then says that it is, but for the scatter of its readings."""
+        constant = {
+            "tilt": self._mechanics.tilt_error_rad,
+            "rotation": self._mechanics.rotation_error_rad
+            + self._scene.stage.rotation_at(self._now_s()),
+            "scan_rotation": 0.0,
+        }
+        turned = [
+            Parameter(f"{joint}_deg", value=math.degrees(target[joint] - constant[joint]))
+            for joint in constant
+            if joint in target
+        ]
+        for result in self.set_parameters(turned):
+            if not result.successful:
+                raise MicroscopeError(result.reason)
+        if "x" in target or "y" in target:
+            # A tilt about an axis that misses the specimen has brought it back to the beam by x and y.
+            now_s, before = self._now_s(), self.position()
+            x, y = self._scene.stage.position_at(now_s)[0]
+            way = [target.get(joint, before[joint]) - before[joint] for joint in ("x", "y")]
+            self._scene.place_stage(now_s, (float(x) + way[0], float(y) + way[1]))
+        self._announce_stage()
+
+    def set_magnification(self, magnification: float) -> None:
+        """Set it at once."""
+        self._scene.set_magnification(check_magnification(magnification), self._now_s())
+        self._announce()
+
+    def run(self, work: Callable[[], str], done: Callable[[str, SemcalError | None], None]) -> None:
+        """Do it here: nothing takes any time."""
         try:
-            self._scene.set_magnification(check_magnification(message.data), self._now_s())
-            self._announce()
+            answer = work()
         except SemcalError as error:
-            self.reporter.reject(error)
+            done("", error)
+        else:
+            done(answer, None)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -325,18 +418,24 @@ class VirtualSem(SemNode):
             self._magnification.publish(Float64(data=self._announced))
             self.reporter.note("magnification", self._announced)
 
-    def _announce_stage(self) -> None:
-        """Publish where the stage is if it has moved."""
-        if self._joints is None or self._position is None or self.config.stage is None:
-            return
+    def _reading(self) -> StagePosition | None:
+        """What the stage says, or None for one that says nothing."""
+        if self._position is None:
+            return None
         now_s, motion = self._now_s(), self._scene.stage
         x, y = motion.position_at(now_s)[0]
-        position = replace(
+        return replace(
             self._position,
             rotation_rad=self._position.rotation_rad + motion.rotation_at(now_s),
             x_m=self._position.x_m + float(x),
             y_m=self._position.y_m + float(y),
         )
+
+    def _announce_stage(self) -> None:
+        """Publish where the stage is if it has moved."""
+        position, now_s = self._reading(), self._now_s()
+        if self._joints is None or position is None or self.config.stage is None:
+            return
         source = self.config.stage
         said = {getattr(source, joint): value for joint, value in position.joints.items()}
         if said == self._said:

@@ -98,6 +98,19 @@ class VirtualStage:
             self._recent(_COMMANDS_KEPT - 1),
         )
 
+    def placed(self, time_s: float, position_m: tuple[float, float]) -> VirtualStage:
+        """Return the stage after it has been put to a position at once; it goes on with its velocity.
+
+        Raises
+        ------
+        InvalidValueError
+            As :meth:`commanded`.
+        """
+        if not np.all(np.isfinite(position_m)):
+            raise InvalidValueError(f"stage position {position_m} m", expected="finite numbers")
+        there = self.commanded(time_s, self.velocity_m_s, self.turn_rad_s)
+        return replace(there, position_m=position_m)
+
     def _recent(self, commands: int) -> VirtualStage:
         before = None if commands <= 1 or self.before is None else self.before._recent(commands - 1)
         return replace(self, before=before)
@@ -267,6 +280,10 @@ class LiveScene:
     ) -> None:
         """Command a stage velocity from a time on; raises as :meth:`VirtualStage.commanded`."""
         self.stage = self.stage.commanded(time_s, velocity_m_s, turn_rad_s)
+
+    def place_stage(self, time_s: float, position_m: tuple[float, float]) -> None:
+        """Put the stage to a position (x, y) from a time on; raises as :meth:`VirtualStage.placed`."""
+        self.stage = self.stage.placed(time_s, position_m)
 
     def pose_at(self, time_s: float) -> Pose:
         """Return the specimen plane in the sem frame at a time, without drift."""

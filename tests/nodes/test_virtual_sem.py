@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from sensor_msgs.msg import Image, JointState
@@ -114,6 +115,66 @@ def test_a_two_axis_stage_says_nothing(peer: Peer) -> None:
     with running("virtual_sem", {**SETTINGS, "stage": "two-axis"}):
         peer.wait_for(lambda: images, "frames")
         assert peer.node.count_publishers("/sem/stage") == 0
+
+
+def test_the_stage_goes_where_it_is_sent_within_limits(peer: Peer) -> None:
+    said = peer.collect(JointState, "stage", LATCHED)
+    images = peer.collect(Image, "image_raw")
+    told = peer.collect(DiagnosticStatus, f"{SEM}/motion", LATCHED)
+    hand = peer.node.create_publisher(JointState, f"{SEM}/move_stage", RELIABLE)
+
+    def outcome(**joints: float) -> str:
+        count = len(told)
+        hand.publish(JointState(name=list(joints), position=list(joints.values())))
+        peer.wait_for(lambda: len(told) > count and "moving" not in state(), "what became of it")
+        return state()
+
+    def state() -> str:
+        return next(value.value for value in told[-1].values if value.key == "state")
+
+    with running("virtual_sem", SETTINGS):
+        peer.wait_for(lambda: said and images and told, "the stage and frames")
+        peer.wait_for(lambda: hand.get_subscription_count() == 1, "the stage's input")
+        assert outcome(tilt=0.3, x=2e-6) == "done"
+        peer.wait_for(lambda: abs(said[-1].position[2] - 2e-6) < 1e-9, "the new position")
+        # It says that it is there, but for a scatter of 0.1 degrees.
+        assert said[-1].position[0] == pytest.approx(0.3, abs=0.01)
+        # Which it is but for its constant error of 0.3 degrees.
+        (tilt,) = peer.get_parameters(SEM, "tilt_deg")
+        assert tilt.double_value == pytest.approx(np.degrees(0.3) - 0.3)
+        assert outcome(rotation=said[-1].position[1] + 0.1, scan_rotation=0.2) == "done"
+        peer.wait_for(lambda: said[-1].position[5] == pytest.approx(0.2), "the scan rotation")
+
+        assert outcome(tilt=0.9) == "refused"
+        assert "at most 0.35 rad" in told[-1].message
+        assert outcome(z=1e-5) == "refused"
+        assert outcome(tilt=-2.0) == "refused"
+        peer.wait_for(lambda: "expected" in peer.state(SEM).get("last_rejection", ""), "the reason")
+
+        assert peer.trigger(f"{SEM}/stop").success
+        assert outcome(tilt=0.2) == "refused"
+        count = len(images)
+        peer.spin(1.2)
+        assert len(images) <= count + 1
+        assert "stopped" in peer.state(SEM)["message"]
+        assert peer.trigger(f"{SEM}/start").success
+        peer.wait_for(lambda: len(images) > count + 1, "further frames")
+        assert outcome(tilt=0.2) == "done"
+
+
+def test_a_stage_that_may_not_be_moved(peer: Peer) -> None:
+    values = peer.collect(Float64, "magnification", LATCHED)
+    told = peer.collect(DiagnosticStatus, f"{SEM}/motion", LATCHED)
+    knob = peer.node.create_publisher(Float64, f"{SEM}/set_magnification", RELIABLE)
+    stage = peer.node.create_publisher(Twist, f"{SEM}/stage", RELIABLE)
+    with running("virtual_sem", {**SETTINGS, "allow_motion": False}):
+        peer.wait_for(lambda: knob.get_subscription_count() == 1, "the knob")
+        peer.wait_for(lambda: stage.get_subscription_count() == 1, "the stage's input")
+        knob.publish(Float64(data=8000.0))
+        peer.wait_for(lambda: told and "allow_motion:=true" in told[-1].message, "the refusal")
+        stage.publish(Twist())
+        peer.wait_for(lambda: peer.state(SEM).get("rejected") == "2", "the other refusal")
+    assert [value.data for value in values] == [4000.0]
 
 
 def _pairs(raw: list[Any], held: list[Any]) -> list[tuple[Any, Any]]:

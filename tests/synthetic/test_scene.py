@@ -255,6 +255,11 @@ def test_stage_integrates_its_commands() -> None:
 
 
 def test_a_stage_that_is_commanded_for_hours_keeps_no_more_than_it_needs() -> None:
+    there = VirtualStage().commanded(1.0, (1e-6, 0.0)).placed(2.0, (5e-6, 0.0))
+    # Where it was before holds for the rows that were scanned before.
+    assert there.position_at([1.5, 2.0, 3.0])[:, 0] == pytest.approx([0.5e-6, 5e-6, 6e-6])
+    with pytest.raises(InvalidValueError, match="stage position"):
+        there.placed(3.0, (np.nan, 0.0))
     stage = VirtualStage()
     for second in range(2000):
         stage = stage.commanded(float(second), (1e-9, 0.0))

@@ -86,9 +86,9 @@ EXECUTABLES = {
     ),
     "virtual_sem": ExecutableHelp(
         "A simulated live microscope with a stage and a magnification knob.",
-        "~/stage, ~/set_magnification",
-        "image_raw, magnification, stage",
-        "",
+        "~/stage, ~/move_stage, ~/set_magnification",
+        "image_raw, magnification, stage, ~/motion",
+        "~/start, ~/stop",
         "-p specimen:=gold -p drift:=slow -p magnification:=5000.0",
     ),
     "microscope": ExecutableHelp(
