@@ -197,7 +197,7 @@ DRIVER = {
         "",
         "Also start the node microscope with this source; empty for a driver of your own. Its other parameters come"
         " from params_file.",
-        choices=["", "folder", "openfibsem"],
+        choices=["", "folder", "openfibsem", "video"],
     ),
     "folder": Argument(
         "",

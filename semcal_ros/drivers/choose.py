@@ -26,6 +26,7 @@ from semcal_ros.drivers.folder import FolderSource
 from semcal_ros.drivers.journal import default_journal
 from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem
 from semcal_ros.drivers.source import FrameSource
+from semcal_ros.drivers.video import SideFile, VideoSource
 
 __all__ = ["SOURCES", "Settings", "make_source"]
 
@@ -52,7 +53,7 @@ def _make_folder(config: MicroscopeConfig, settings: Settings) -> FrameSource:
         give_up_s=settings["give_up"],
         backlog=settings["backlog"],
         stamps=settings["stamps"],
-        field_width_m=settings["field_width_m"],
+        field_width_m=lambda: float(settings["field_width_m"]),
         keep_databar=config.image.databar_rows > 0,
     )
 
@@ -68,9 +69,27 @@ def _make_openfibsem(_config: MicroscopeConfig, settings: Settings) -> FrameSour
     )
 
 
+def _make_video(config: MicroscopeConfig, settings: Settings) -> FrameSource:
+    if not settings["video"]:
+        raise ConfigError(
+            "no video",
+            expected="the parameter video",
+            do="give --ros-args -p video:=/dev/video0, an address or a file",
+        )
+    file = settings["magnification_file"]
+    side = SideFile(Path(file).expanduser(), config.display_width_m) if file else None
+
+    def field_width_m() -> float | None:
+        told_m = None if side is None else side.field_width_m()
+        return told_m or settings["field_width_m"] or None
+
+    return VideoSource(settings["video"], field_width_m, form=settings["video_format"])
+
+
 SOURCES: Mapping[str, Callable[[MicroscopeConfig, Settings], FrameSource]] = {
     "folder": _make_folder,
     "openfibsem": _make_openfibsem,
+    "video": _make_video,
 }
 """What makes each source from the configuration and the parameters of the node."""
 

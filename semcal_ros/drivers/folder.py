@@ -24,6 +24,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -114,7 +115,7 @@ class FolderSource:
         ``file``: a frame was finished when its file was written last, by the clock of its file system; ``arrival``:
         when the file was found to be complete, for shares whose clock differs.
     field_width_m
-        Field width of files that do not say it; 0 leaves it unknown.
+        Returns the field width of files that do not say it; 0 leaves it unknown.
     keep_databar
         Whether the data bar stays in the image, for receivers that cut it off.
     """
@@ -133,7 +134,7 @@ class FolderSource:
         give_up_s: float = 10.0,
         backlog: str = "resume",
         stamps: str = "file",
-        field_width_m: float = 0.0,
+        field_width_m: Callable[[], float] = float,
         keep_databar: bool = False,
     ) -> None:
         self._folder = folder
@@ -414,7 +415,7 @@ class FolderSource:
             np.ascontiguousarray(stored[: stored.shape[0] - rows]),
             start_ns,
             acquisition_s,
-            width_m or self._field_width_m or None,
+            width_m or self._field_width_m() or None,
             file_conditions(settings),
             file_stage(settings, self._first_rotation_rad),
             name,

@@ -22,12 +22,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.choose import SOURCES, make_source
 from semcal_ros.drivers.health import FrameWatch
 from semcal_ros.drivers.openfibsem import MANUFACTURERS
 from semcal_ros.drivers.runner import SourceRunner
-from semcal_ros.drivers.source import ConfirmsFrames, MovesStage, SetsFieldWidth, SourceFrame
+from semcal_ros.drivers.source import (
+    ConfirmsFrames,
+    FrameSource,
+    MovesStage,
+    SetsFieldWidth,
+    SourceFrame,
+)
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.motion import MOTION, MotionInterface
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
@@ -48,7 +55,6 @@ _PARAMETERS = (
         "m",
         0.0,
         0.1,
-        fixed=True,
     ),
     ParameterDeclaration(
         "frame_timeout",
@@ -145,6 +151,27 @@ _PARAMETERS = (
     ParameterDeclaration(
         "beam", "electron", "openfibsem: which beam.", choices=("electron", "ion"), fixed=True
     ),
+    ParameterDeclaration(
+        "video", "", "video: device such as /dev/video0, address, or file.", fixed=True
+    ),
+    ParameterDeclaration(
+        "video_format",
+        "",
+        "video: FFmpeg's name of the format; empty: v4l2 for a device, else found out.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "magnification_file",
+        "",
+        "video: text file that says the magnification or the field width; read again when it changes.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "publish_magnification",
+        True,
+        "Publish the magnification; false: another node does.",
+        fixed=True,
+    ),
     *MOTION,
 )
 # How often the state is looked at: a person who has pulled a plug sees it within the time of a report.
@@ -158,13 +185,31 @@ _LAST_ANSWER_S = 3.5
 
 
 class Microscope(SemNode):
-    """Publishes ``image_raw``, ``magnification``, ``stage`` and ``conditions`` of a source, and moves it."""
+    """Publishes ``image_raw``, ``magnification``, ``stage`` and ``conditions`` of a source, and moves it.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    make_own
+        Makes another source than those of the parameter ``source``, from the configuration.
+    """
+
+    def __init__(self, make_own: Callable[[MicroscopeConfig], FrameSource] | None = None) -> None:
         super().__init__("microscope", _PARAMETERS)
-        self._source = make_source(self.parameters["source"], self.config, self.parameters)
-        stage = isinstance(self._source, MovesStage) or self.parameters["source"] == "folder"
-        self._output = SourceOutput(self.config, self.endpoints, self.reporter, stage=stage)
+        name = self.parameters["source"]
+        if make_own is None:
+            self._source = make_source(name, self.config, self.parameters)
+        else:
+            self._source = make_own(self.config)
+            name = type(self._source).__name__
+        self._source_name = name
+        stage = name != "video"
+        self._output = SourceOutput(
+            self.config,
+            self.endpoints,
+            self.reporter,
+            stage=stage,
+            magnification=self.parameters["publish_magnification"],
+        )
         self._watch = FrameWatch()
         self._skipped = 0
         self._phase = ""
@@ -194,7 +239,7 @@ class Microscope(SemNode):
     def introduction(self) -> list[str]:
         """Extend the base class: say which source, and whether it may be moved."""
         may = "may move it" if self.parameters["allow_motion"] else "does not move it"
-        return [*super().introduction(), f"source {self.parameters['source']}", may]
+        return [*super().introduction(), f"source {self._source_name}", may]
 
     def idle(self) -> bool:
         """Return whether no frame may come for a long time without a fault."""

@@ -254,12 +254,15 @@ def test_stage_integrates_its_commands() -> None:
         stage.commanded(7.0, (math.nan, 0.0))
 
 
-def test_a_stage_that_is_commanded_for_hours_keeps_no_more_than_it_needs() -> None:
+def test_a_stage_that_is_put_to_a_place() -> None:
     there = VirtualStage().commanded(1.0, (1e-6, 0.0)).placed(2.0, (5e-6, 0.0))
     # Where it was before holds for the rows that were scanned before.
     assert there.position_at([1.5, 2.0, 3.0])[:, 0] == pytest.approx([0.5e-6, 5e-6, 6e-6])
     with pytest.raises(InvalidValueError, match="stage position"):
         there.placed(3.0, (np.nan, 0.0))
+
+
+def test_a_stage_that_is_commanded_for_hours_keeps_no_more_than_it_needs() -> None:
     stage = VirtualStage()
     for second in range(2000):
         stage = stage.commanded(float(second), (1e-9, 0.0))

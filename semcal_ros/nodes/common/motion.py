@@ -249,7 +249,13 @@ class MotionInterface:
             act()
             return f"done: {asked}"
 
+        number = self._number
+
         def done(answer: str, error: SemcalError | None) -> None:
+            if not self._busy or number != self._number:
+                # It had been given up.
+                self._reporter.warn(f"~/{command} has ended after all: {error or answer}")
+                return
             self._busy = False
             if error is None:
                 self._reporter.info(f"~/{command}: {answer}")
@@ -292,8 +298,9 @@ class MotionInterface:
         self._say("failed", self.failure, DiagnosticLevel.ERROR)
 
     def give_up(self, reason: str) -> None:
-        """Take a command that is under way for failed; its end, should it come, changes nothing."""
-        if self._busy and not self.failure:
+        """Take a command that is under way for failed; its end, should it come, is only told."""
+        if self._busy:
+            self._busy = False
             self._fail(MicroscopeError(reason))
 
     @property

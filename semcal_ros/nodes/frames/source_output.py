@@ -53,6 +53,8 @@ class SourceOutput:
         Topics, types and units.
     endpoints, reporter
         Of the node.
+    stage, magnification
+        Whether these topics are published.
 
     Raises
     ------
@@ -61,7 +63,13 @@ class SourceOutput:
     """
 
     def __init__(
-        self, config: MicroscopeConfig, endpoints: Endpoints, reporter: Reporter, *, stage: bool
+        self,
+        config: MicroscopeConfig,
+        endpoints: Endpoints,
+        reporter: Reporter,
+        *,
+        stage: bool,
+        magnification: bool,
     ) -> None:
         self._config = config
         self._reporter = reporter
@@ -82,7 +90,7 @@ class SourceOutput:
         self._new_number = kind
         self._set_number(kind(), 1.0)
         self._images = endpoints.stream_publisher(Image, config.image.topic)
-        self._numbers = endpoints.latched_publisher(kind, source.topic)
+        self._numbers = endpoints.latched_publisher(kind, source.topic) if magnification else None
         self._conditions = endpoints.latched_publisher(DiagnosticStatus, "conditions")
         self._joints = None
         if stage and config.stage is not None:
@@ -151,6 +159,8 @@ class SourceOutput:
         return bool(self._images.wait_for_all_acked(timeout))
 
     def _publish_magnification(self, frame: SourceFrame) -> None:
+        if self._numbers is None:
+            return
         width_m = frame.field_width_m
         number = math.nan
         if width_m is not None and math.isfinite(width_m) and width_m > 0.0:
