@@ -25,7 +25,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.grid_options import grid_options
 from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_option
-from semcal_ros.cli.output import echo_certainty, echo_notes, echo_table, show_progress
+from semcal_ros.cli.output import echo_notes, echo_table, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.calibrate import (
@@ -173,7 +173,7 @@ def command(
 
 
 def _echo_result(done: RecordingCalibration) -> None:
-    echo_certainty(done.calibration)
+    echo_verdict(done.calibration)
     statistics, method = done.calibration.statistics, done.calibration.method
     rejected = done.collected.rejected
     total = statistics["views"] + len(rejected)

@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = [
-    "echo_certainty",
     "echo_json",
     "echo_nominal_unit",
     "echo_notes",
     "echo_paths",
     "echo_states",
     "echo_table",
+    "echo_verdict",
     "show_progress",
 ]
 
@@ -149,17 +149,15 @@ def echo_paths(paths: Mapping[str, Path | None]) -> None:
             click.echo(f"{name}: {path}")
 
 
-def echo_certainty(calibration: CalibrationModel) -> None:
-    """Print how well a calibration knows nm per pixel, where it knows it least."""
+def echo_verdict(calibration: CalibrationModel) -> None:
+    """Print how well a calibration knows nm per pixel, and what would improve that."""
     # Imported here, so that commands without a calibration do not wait for it.
-    from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+    from semcal_ros.core.calibration.verdict import judge_calibration
 
-    worst, where = worst_pixel_size(calibration)
-    low, high = calibration.magnification_range
-    click.echo(
-        f"nm per px is known to {100.0 * worst:.2g} % (1-sigma) or better from {low:g}x to {high:g}x, "
-        f"the least at {where:.0f}x"
-    )
+    verdict = judge_calibration(calibration)
+    for line in (verdict.describe(), verdict.advise()):
+        if line:
+            click.echo(line)
 
 
 def echo_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -30,6 +30,7 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
     calibrate_views,
 )
+from semcal_ros.core.calibration.findings import find_weaknesses
 from semcal_ros.core.calibration.nominal_scale import (
     check_nominal_scale,
     check_square_sides,
@@ -257,6 +258,7 @@ def calibrate_found(
             f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "
             "predicts: check --display-width and --squares (display_width_m and squares_m of the configuration)"
         )
+    warnings += find_weaknesses(result, collected.rejected)
     statistics = {
         **result.model.statistics,
         "rejected_views": len(collected.rejected),

@@ -78,6 +78,7 @@ def long_words_text() -> str:
         {
             "title": long_word,
             "summary": [("Held-out error", "0.050 px", "RMS; paper: 0.9 to 1.45 px")] * 6,
+            "verdict": [long_word],
             "warnings": [long_word],
             "paper": [row],
             "worst_views": [view],

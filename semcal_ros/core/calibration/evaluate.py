@@ -159,6 +159,10 @@ def compare_scales(
     return out
 
 
+# The tilt of a nearly flat view acts through its square, so its last degrees take many small steps.
+_POSE_ITERATIONS = 300
+
+
 def fit_poses(
     views: Sequence[GridView],
     camera_at: Callable[[float], ScanCamera],
@@ -196,7 +200,7 @@ def fit_poses(
     else:
         rotations, translations = starts[0][None], starts[1][None]
     fits = [
-        refine(problem, State(np.ones(1), r, t), fixed_theta=True)
+        refine(problem, State(np.ones(1), r, t), fixed_theta=True, max_iterations=_POSE_ITERATIONS)
         for r, t in zip(rotations, translations, strict=True)
     ]
     usable = [f for f in fits if np.isfinite(f.cost)]

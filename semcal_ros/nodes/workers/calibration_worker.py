@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationOptions
+from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.core.wording import counted
@@ -109,6 +110,7 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
         f"{job.options.method} calibration from {counted(len(done.collected.views), 'view')}, "
         f"{low:g}x to {high:g}x{worst}, in {time.monotonic() - started_s:.1f} s"
     )
+    summary += f"; {judge_calibration(done.calibration).describe()}"
     notes = "".join(f"; {warning}" for warning in (*job.notes, *done.result.warnings))
     return JobResult(done.calibration.dumps(), summary + notes)
 

@@ -23,14 +23,14 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.wording import counted
-from semcal_ros.report.calibration.cells import (
+from semcal_ros.core.calibration.coverage import (
     assign_cells,
     compute_reached_shares,
+    compute_tilts_deg,
     concatenate_corners,
 )
+from semcal_ros.core.wording import counted
 from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -87,14 +87,6 @@ def plot_coverage(result: CalibrationResult) -> Picture:
         f"Corners of {counted(len(result.views), 'view')}; {share} (crosses). "
         "Where there are none, the distortion is extrapolated.",
     )
-
-
-def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
-    """Compute the tilt of the grid in each view, and the direction of its normal, degrees."""
-    normals = result.fit.rotations[:, :, 2]
-    upright = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
-    tilt = np.degrees(np.arccos(np.clip(upright[:, 2], -1.0, 1.0)))
-    return tilt, np.degrees(np.arctan2(upright[:, 1], upright[:, 0]))
 
 
 def plot_tilt_directions(result: CalibrationResult) -> Picture:

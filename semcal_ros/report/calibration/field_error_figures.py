@@ -24,10 +24,10 @@ from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.coverage import assign_cells, concatenate_corners
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.wording import counted
-from semcal_ros.report.calibration.cells import assign_cells, concatenate_corners
 from semcal_ros.report.calibration.geometry import compute_displacements, remove_residual_field
 from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.findings import find_weaknesses
+from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
     "MagnificationRow",
     "ViewRow",
     "collect_facts",
+    "collect_warnings",
     "compute_fitted_inner_px",
     "compute_held_out_px",
     "tabulate_magnifications",
@@ -141,6 +144,17 @@ def tabulate_views(result: CalibrationResult) -> list[ViewRow]:
             )
         )
     return sorted(rows, key=lambda r: -r.ratio)
+
+
+def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
+    """Collect the calibration's warnings and its weaknesses, as sentences."""
+    found = dict.fromkeys((*result.warnings, *find_weaknesses(result, rejected)))
+    return [_format_sentence(text) for text in found]
+
+
+def _format_sentence(text: str) -> str:
+    clean = remove_control_characters(text).strip()
+    return clean[:1].upper() + clean[1:].rstrip(".") + "."
 
 
 def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:

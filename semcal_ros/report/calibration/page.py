@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -46,11 +47,11 @@ from semcal_ros.report.calibration.field_error_figures import (
     plot_residual_field,
     plot_residuals,
 )
-from semcal_ros.report.calibration.findings import collect_warnings
 from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
     PAPER_RMS_PX,
     collect_facts,
+    collect_warnings,
     compute_fitted_inner_px,
     compute_held_out_px,
     tabulate_magnifications,
@@ -120,9 +121,11 @@ def write_calibration_report(
     shown = _choose_evenly(choose_examples(detections), _MAX_OVERLAYS)
     first = _choose_evenly(shown, _FIRST_OVERLAYS)
     examples = _choose_example_cameras(model)
+    verdict = judge_calibration(model)
     rms, straight = rms_by_magnification(result.fit), compute_rms_without_distortion(result)
     values = {
         "title": remove_control_characters(title),
+        "verdict": [text for text in (verdict.describe(), verdict.advise()) if text],
         "summary": _summarise(result, len(rejected)),
         "warnings": collect_warnings(result, rejected),
         "errors": [plot_rms(result, straight)],

@@ -24,6 +24,7 @@ from matplotlib.axes import Axes
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.residual_pattern import normalise_residuals
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
 from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
@@ -40,7 +41,7 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = ["normalise_residuals", "plot_residual_histogram", "plot_rms"]
+__all__ = ["plot_residual_histogram", "plot_rms"]
 
 
 # Ends of the histogram, in sigma; what lies beyond is counted in the last bins.
@@ -111,12 +112,6 @@ def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:
         markerfacecolor="none",
         label="held out, extrapolated",
     )
-
-
-def normalise_residuals(result: CalibrationResult) -> Array:
-    """Divide residuals (n, 2) by the 1-sigma of their corners."""
-    sigma = np.concatenate([v.sigma_px for v in result.views])
-    return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
 
 
 def plot_residual_histogram(result: CalibrationResult) -> Picture:

@@ -21,16 +21,16 @@ from matplotlib.axes import Axes
 
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.predicted_error import (
+    make_field_lattice,
+    predict_aligned_sigma_px,
+    predict_shape_sigma_px,
+)
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     mark_magnifications,
     sample_cameras,
     sample_cameras_around,
-)
-from semcal_ros.report.calibration.geometry import (
-    make_field_lattice,
-    predict_aligned_sigma_px,
-    predict_shape_sigma_px,
 )
 from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (

@@ -14,12 +14,16 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.plan import ViewPlan, plan_views
 from semcal_ros.core.calibration.update import update_calibration
+from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import InvalidValueError
 from tests.core.calibration.test_check import AXIS, SEM, simulated
@@ -98,3 +102,32 @@ def test_what_cannot_be_planned_is_refused(poor: CalibrationModel) -> None:
         plan(poor, 0.01, 31)
     with pytest.raises(InvalidValueError, match="positive sizes"):
         plan_views(poor, 0.01, squares_m=())
+
+
+def test_the_verdict_names_the_weakest_place_and_the_next_visit(poor: CalibrationModel) -> None:
+    known = replace(poor, statistics={**poor.statistics, "squares_m": list(SQUARES_M)})
+    verdict = judge_calibration(known)
+    assert verdict.largest == pytest.approx(worst(poor), rel=1e-6)
+    at = known.at(verdict.at)
+    assert verdict.pixel_size_m == pytest.approx(np.mean(at.pixel_size_m))
+    first = plan(poor, 1e-6, 1).visits[0]
+    assert verdict.next_visit == first
+    assert f"at {first.magnification:.0f}x" in verdict.advise()
+    # The sentence's own numbers: the sigma in nm is the stated part of the size in nm.
+    size, sigma = map(float, re.findall(r"([\d.]+) \+- ([\d.]+) nm", verdict.describe())[0])
+    assert sigma == pytest.approx(verdict.largest * size, rel=0.06)
+
+
+def test_no_visit_is_proposed_where_none_would_help(poor: CalibrationModel) -> None:
+    """Squares that are known to 3 % only set the scale's sigma, whatever is recorded."""
+    rough = replace(
+        poor,
+        statistics={**poor.statistics, "squares_m": list(SQUARES_M)},
+        scale_sigma=replace(poor.scale_sigma, grid=0.03),
+    )
+    verdict = judge_calibration(rough)
+    assert verdict.next_visit is None
+    assert "hardly improve" in verdict.advise()
+    assert verdict.floor == pytest.approx(0.03, rel=0.05)
+    # Nothing is known of the grid.
+    assert judge_calibration(replace(poor, statistics={})).advise() == ""

@@ -25,22 +25,29 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.coverage import (
+    compute_empty_share,
+    compute_reached_shares,
+    compute_tilts_deg,
+)
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.core.camera.residual_field import zero_field
-from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.calibration.cells import compute_empty_share, compute_reached_shares
-from semcal_ros.report.calibration.coverage_figures import compute_tilts_deg
-from semcal_ros.report.calibration.field_error_figures import plot_residual_field
-from semcal_ros.report.calibration.findings import collect_warnings, estimate_pattern_px
-from semcal_ros.report.calibration.geometry import (
-    compute_displacements,
-    compute_rms_without_distortion,
+from semcal_ros.core.calibration.findings import find_weaknesses
+from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
+from semcal_ros.core.camera.predicted_error import (
     make_field_lattice,
     predict_aligned_sigma_px,
     predict_shape_sigma_px,
+)
+from semcal_ros.core.camera.residual_field import zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.report.calibration.field_error_figures import plot_residual_field
+from semcal_ros.report.calibration.geometry import (
+    compute_displacements,
+    compute_rms_without_distortion,
     remove_residual_field,
 )
 from semcal_ros.report.calibration.numbers import (
+    collect_warnings,
     compute_fitted_inner_px,
     compute_held_out_px,
     tabulate_magnifications,
@@ -78,7 +85,7 @@ def test_rows_have_one_sigma_digits_and_true_pixel_size(result: CalibrationResul
 def test_infinite_held_out_error_is_named(result: CalibrationResult) -> None:
     broken = replace(result, held_out_rms_px={**result.held_out_rms_px, 400.0: float("inf")})
     assert [row.held_out for row in tabulate_magnifications(broken)][1] == "no answer"
-    assert any("without the images at 400×" in f.lower() for f in collect_warnings(broken))
+    assert any("without the images at 400x" in f.lower() for f in collect_warnings(broken))
     assert plot_rms(broken, {}).src.startswith("data:image/png")
 
 
@@ -86,7 +93,7 @@ def test_badly_predicted_magnification_is_named(result: CalibrationResult) -> No
     # 0.07 px is the noise of these views; the outermost magnifications are allowed to be worse.
     held_out = {**result.held_out_rms_px, 1500.0: 0.5, 5000.0: 0.5}
     found = collect_warnings(replace(result, held_out_rms_px=held_out))
-    assert len(found) == 1 and found[0].startswith("The images at 1500× are predicted badly")
+    assert len(found) == 1 and found[0].startswith("The images at 1500x are predicted badly")
 
 
 def test_findings_of_poor_views(result: CalibrationResult) -> None:
@@ -241,6 +248,20 @@ def test_worst_views_come_first(result: CalibrationResult) -> None:
     assert any(f"corners of {rows[0].name}" in f for f in collect_warnings(spoilt))
 
 
+def test_what_costs_most_comes_first_and_says_how_many_nm(result: CalibrationResult) -> None:
+    # Held-out error of 0.5 px at 1500x; 0.07 px is the noise. One view off by some px costs more.
+    held_out = {**result.held_out_rms_px, 1500.0: 0.5}
+    residuals = list(result.fit.residuals_px)
+    residuals[6] = 60.0 * residuals[6]
+    fit = replace(result.fit, residuals_px=tuple(residuals))
+    found = find_weaknesses(replace(result, held_out_rms_px=held_out, fit=fit))
+    costs = [re.search(r"costs ([\d.e+]+) nm at (\d+)x", text) for text in found]
+    assert costs[0] is not None and costs[1] is not None
+    assert "corners of" in found[0] and "predicted badly" in found[1]
+    pixel_m = np.mean(result.model.at(1500.0).pixel_size_m)
+    assert float(costs[1][1]) == pytest.approx(0.5 * 1e9 * pixel_m, rel=0.1)
+
+
 def test_a_pattern_in_the_residuals_is_found_and_noise_is_not(result: CalibrationResult) -> None:
     assert estimate_pattern_px(result)[1] < 2.0
     turned = []
@@ -270,7 +291,7 @@ def test_magnifications_that_fill_a_part_of_the_field_are_named(result: Calibrat
     poor = replace(result, views=views)
     shares = compute_reached_shares(poor)
     assert shares[1500.0] < 0.3 and shares[100.0] > 0.9
-    assert any("At 1500× the corners reach less than half" in f for f in collect_warnings(poor))
+    assert any("At 1500x the corners reach less than half" in f for f in collect_warnings(poor))
 
 
 def test_uncertain_positions_are_a_finding(result: CalibrationResult) -> None:

@@ -65,6 +65,7 @@ from tests.helpers.report_samples import (
 pytestmark = pytest.mark.slow
 
 SECTIONS = [
+    "verdict",
     "warnings",
     "errors",
     "predicted",
@@ -89,8 +90,8 @@ def test_html_nests_and_has_every_section_with_a_heading(page: str) -> None:
     parsed = Page(page)
     assert [s["id"] for s in parsed.named("section")] == [*SECTIONS, "images"]
     assert len(parsed.named("h1")) == 1
-    # The warnings box is the only section without a heading of its own: it bears a label instead.
-    assert len(parsed.named("h2")) == len(SECTIONS)
+    # Verdict and warnings have no heading of their own, but a label; the extra images have one.
+    assert len(parsed.named("h2")) == len(SECTIONS) - 1
     assert parsed.named("html") == [{"lang": "en"}]
     assert any(m.get("name") == "viewport" for m in parsed.named("meta"))
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Divide the image field into cells, and assign the corners of all views to them."""
+"""What the views of a calibration cover: cells of the image field that have corners, and tilts."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ __all__ = [
     "assign_cells",
     "compute_empty_share",
     "compute_reached_shares",
+    "compute_tilts_deg",
     "concatenate_corners",
 ]
 
@@ -82,3 +83,11 @@ def concatenate_corners(result: CalibrationResult) -> tuple[Array, Array]:
         np.concatenate([v.image_xy for v in result.views]),
         np.concatenate(result.fit.residuals_px),
     )
+
+
+def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
+    """Compute the tilt of the grid in each view, and the direction of its normal, degrees."""
+    normals = result.fit.rotations[:, :, 2]
+    upright = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    tilt = np.degrees(np.arccos(np.clip(upright[:, 2], -1.0, 1.0)))
+    return tilt, np.degrees(np.arctan2(upright[:, 1], upright[:, 0]))
