@@ -51,6 +51,8 @@ _SIDE_FILE_S = 2.0
 # A share of the time of the source's thread that looking through the folder may take: folders of 100 000 files on a
 # network share take seconds.
 _LOOKING = 0.1
+# All pages of a file are decoded before the first is published.
+_MOST_PIXELS = 500_000_000
 # Two pictures with one stamp could not be told apart.
 _STAMP_STEP_NS = 1000
 
@@ -341,6 +343,7 @@ class FolderSource:
         state, path = candidate.state, self._folder / candidate.state.name
         try:
             file = describe_image_file(path)
+            _check_size(state.name, file.pages)
             images = [np.ascontiguousarray(image) for image in file.read()]
             frames = self._frames_of(state, file.pages, images)
         except (SemcalError, OSError) as error:
@@ -419,6 +422,17 @@ class FolderSource:
             file_conditions(settings),
             file_stage(settings, self._first_rotation_rad),
             name,
+        )
+
+
+def _check_size(name: str, pages: tuple[ImagePage, ...]) -> None:
+    """Refuse a stack that would fill the memory: it is a recording, not a frame."""
+    pixels = sum(page.size_px[0] * page.size_px[1] for page in pages)
+    if len(pages) > 1 and pixels > _MOST_PIXELS:
+        raise UnusableFrameError(
+            f"{name} has {len(pages)} pages",
+            expected=f"at most {_MOST_PIXELS // 1_000_000} million pixels in one file",
+            do="read it as a recording, by semcal import",
         )
 
 

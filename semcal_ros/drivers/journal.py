@@ -32,6 +32,7 @@ __all__ = ["FileState", "Journal", "default_journal"]
 
 # Months of a busy microscope, in 15 MB. Older entries are forgotten when the journal is opened.
 _KEPT = 100_000
+_SECOND_NS = 1_000_000_000
 _HEADER = {"semcal_ros": "journal of a folder", "version": 1}
 
 
@@ -67,7 +68,8 @@ class Journal:
     """The files of a folder that are done with: published, refused, or there before the start.
 
     A file is known by name, size and time, which costs no look into it; else by its picture, under the same name (it
-    was saved again as it was) or with the same size and time (it was renamed). One line of JSON for each file is
+    was saved again as it was) or with the same size and time (it was renamed). One that was never looked into, since it
+    was there before the start, is known after a rename by size and time. One line of JSON for each file is
     appended as soon as the file is done. What was appended outlives the end of the process, ``kill -9`` too; after a
     power failure the last files may be published once more. A line that was cut off is ignored.
 
@@ -86,6 +88,7 @@ class Journal:
         self.path = path
         self._states: set[FileState] = set()
         self._pictures: set[tuple[object, ...]] = set()
+        self._unread: set[tuple[int, int]] = set()
         self._handle = -1
         with self._writing():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,13 +139,16 @@ class Journal:
         if picture:
             self._pictures.add((state.name, picture))
             self._pictures.add((state.size, state.mtime_ns, picture))
+        elif state.mtime_ns % _SECOND_NS:
+            # Where times are whole seconds, another file may well have the same.
+            self._unread.add((state.size, state.mtime_ns))
 
     def __len__(self) -> int:
         return len(self._states)
 
     def knows(self, state: FileState) -> bool:
         """Return whether this file is done with, without a look into it."""
-        return state in self._states
+        return state in self._states or (state.size, state.mtime_ns) in self._unread
 
     def knows_picture(self, state: FileState, picture: str) -> bool:
         """Return whether this picture is done with under this name, or was before it was renamed."""

@@ -253,10 +253,10 @@ class Microscope(SemNode):
             found.append("stopped")
         elif state.phase == "lost":
             found.append(f"source lost, trying again: {state.reason}")
+        elif state.phase == "connecting":
+            found.append(f"connecting for {state.blocked_s:.0f} s")
         elif state.blocked_s > _HUNG_S:
             found.append(f"source does not answer for {state.blocked_s:.0f} s")
-        elif state.phase == "connecting":
-            found.append("connecting")
         elif self._is_silent(state.silent_s):
             found.append(f"no frame for {state.silent_s:.0f} s")
         if self._waits_for_subscribers():

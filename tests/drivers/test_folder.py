@@ -101,6 +101,7 @@ def test_files_of_before_are_left_alone_and_none_comes_twice(
 ) -> None:
     save_sem_tiff(folder / "before.tif", numbered_image(1))
     source = make()
+    (folder / "before.tif").rename(folder / "sorted.tif")
     save_sem_tiff(folder / "a.tif", numbered_image(2))
     assert read_all(source, 1) == [2]
     (folder / "a.tif").rename(folder / "b.tif")
