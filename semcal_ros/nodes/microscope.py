@@ -215,6 +215,9 @@ class Microscope(SemNode):
         self._phase = ""
         self._frame_s = 0.0
         self._last_published_s = -1.0
+        # When the magnification was last set from here, and the stage moved.
+        self._set_ns = self._stands_since_ns = 0
+        self._moving_since_ns: int | None = None
         # Subscribers that are known to hear this node, and the frame by which that is found out.
         self._heard_by = 0
         self._probe: tuple[SourceFrame, int, float] | None = None
@@ -345,10 +348,15 @@ class Microscope(SemNode):
     def _publish(self, frame: SourceFrame) -> None:
         self.reporter.count_received()
         self._frame_s = frame.acquisition_s or 0.0
+        if frame.start_ns < self._set_ns and not self._source.lossless:
+            # Scanned, at least in part, at the magnification of before, for which receivers would not take it.
+            self.reporter.statistics.drop()
+            return
         try:
             for news in self._watch.see(frame):
                 self.reporter.warn(news)
-            stamp_ns = self._output.publish(frame)
+            stands = self._moving_since_ns is None and frame.start_ns >= self._stands_since_ns
+            stamp_ns = self._output.publish(frame, stage=stands)
             self._last_published_s = self.now_s()
             self.reporter.count_published(stamp_ns)
         except SemcalError as error:
@@ -391,6 +399,17 @@ class Microscope(SemNode):
     def note_field_width(self, width_m: float, now_ns: int) -> None:
         """Take note of a field width that was set from here, at this time."""
         self._watch.asked(width_m, now_ns)
+        self._set_ns = now_ns
+
+    def note_move(self, position: Mapping[str, float] | None, now_ns: int) -> None:
+        """Take note that the stage begins to move (None), or where it has arrived.
+
+        Meanwhile its position is not known, whatever frames say that were begun before.
+        """
+        self._moving_since_ns = now_ns if position is None else None
+        if position is not None:
+            self._stands_since_ns = now_ns
+        self._output.publish_stage(position or {}, now_ns)
 
 
 class _Hands:
@@ -423,7 +442,19 @@ class _Hands:
 
     def move(self, target: Mapping[str, float]) -> None:
         assert isinstance(self._source, MovesStage)
-        self._source.move_stage(target)
+        self._note_move(None)
+        try:
+            self._source.move_stage(target)
+        finally:
+            position: Mapping[str, float] = {}
+            with contextlib.suppress(Exception):  # the move itself tells what is wrong
+                position = self._source.stage_position()
+            self._note_move(position)
+
+    def _note_move(self, position: Mapping[str, float] | None) -> None:
+        now_ns = time.time_ns()
+        self._results.append(lambda: self._node.note_move(position, now_ns))
+        _quietly(self._guard.trigger)()
 
     def set_magnification(self, magnification: float) -> None:
         if not isinstance(self._source, SetsFieldWidth):

@@ -280,7 +280,8 @@ def test_a_stage_that_refuses_or_hangs_moves_no_more_until_somebody_has_looked(
         assert peer.trigger(f"{NODE}/start").success
         move(0.05)
         wait_told("has not returned")
-        peer.wait_for(lambda: joints[-1].position[0] == 0.1, "the end of the move all the same")
+        what = "the end of the move all the same"
+        peer.wait_for(lambda: list(joints[-1].position) == [0.1], what)
 
         # It works again; and somebody turns the magnification that was set from here.
         knob.publish(Float64(data=DISPLAY_M / 2e-5))

@@ -118,8 +118,15 @@ class SourceOutput:
                 do="correct magnification.field in the configuration",
             ) from error
 
-    def publish(self, frame: SourceFrame) -> int:
+    def publish(self, frame: SourceFrame, *, stage: bool = True) -> int:
         """Publish a frame, after what has changed since the one before.
+
+        Parameters
+        ----------
+        frame
+            The frame.
+        stage
+            Whether what it says about the stage holds.
 
         Returns
         -------
@@ -137,7 +144,8 @@ class SourceOutput:
                 expected="grey levels of 8 or 16 bit",
             )
         self._publish_magnification(frame)
-        self.publish_stage(frame.stage, frame.start_ns)
+        if stage:
+            self.publish_stage(frame.stage, frame.start_ns)
         self.publish_conditions(frame.conditions)
         acquisition_s = frame.acquisition_s
         if acquisition_s is None and self._config.scan is not None:
