@@ -22,7 +22,7 @@ from typing import Any
 
 from semcal_ros.bridge.fields import new_nested, require_fields
 
-__all__ = ["NUMBERS", "TEXTS", "fill_conditions", "read_conditions"]
+__all__ = ["CONDITIONS_TYPE", "NUMBERS", "TEXTS", "fill_conditions", "read_conditions"]
 
 NUMBERS = (
     "accelerating_voltage_v",
@@ -37,7 +37,9 @@ NUMBERS = (
 TEXTS = ("detector", "maker", "model", "serial")
 """Keys whose values are texts."""
 
-_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
+CONDITIONS_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
+"""Type of the topic."""
+
 # A detector has a name of a few words; what is longer is something else.
 _LONGEST = 200
 
@@ -71,10 +73,11 @@ def read_conditions(message: Any) -> dict[str, float | str]:
     MessageError
         It is a message of another type.
     """
-    require_fields(message, ("values",), _TYPE)
+    require_fields(message, ("values",), CONDITIONS_TYPE)
     found: dict[str, float | str] = {}
     for pair in message.values:
-        key, text = str(pair.key), str(pair.value).strip()
+        # A recording may redefine the type.
+        key, text = str(getattr(pair, "key", "")), str(getattr(pair, "value", "")).strip()
         if key in TEXTS and text:
             found[key] = text[:_LONGEST]
         elif key in NUMBERS:

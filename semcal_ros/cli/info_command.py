@@ -16,16 +16,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import click
 
 from semcal_ros.cli.options import json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
 from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.conditions import describe_condition, format_time
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.describe_recording import (
@@ -38,31 +35,8 @@ from semcal_ros.workflows.describe_recording import (
 __all__ = ["command"]
 
 
-def _format_time(time_s: float) -> str:
-    """A time in the unit that suits it."""
-    for unit, scale in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
-        if abs(time_s) * scale >= 1.0:
-            return f"{time_s * scale:.4g} {unit}"
-    return f"{time_s * 1e9:.4g} ns" if time_s else "0 s"
-
-
 # A sweep has as many magnifications as frames: of more than this, the middle ones are left out.
 _MOST_ROWS = 24
-_CONDITIONS: Mapping[str, tuple[str, Callable[[float], str]]] = {
-    "maker": ("maker", str),
-    "model": ("model", str),
-    "serial_number": ("serial number", str),
-    "beam": ("beam", str),
-    "detector": ("detector", str),
-    "acceleration_voltage_v": ("voltage", lambda v: f"{1e-3 * v:g} kV"),
-    "working_distance_m": ("working distance", lambda v: f"{1e3 * v:.4g} mm"),
-    "dwell_s": ("dwell", _format_time),
-    "frame_time_s": ("frame time", _format_time),
-    "frame_interval_s": ("frame interval", _format_time),
-    "scan_rotation_rad": ("scan rotation", lambda v: f"{math.degrees(v):.4g} deg"),
-    "stage_tilt_rad": ("stage tilt", lambda v: f"{math.degrees(v):.4g} deg"),
-    "stage_rotation_rad": ("stage rotation", lambda v: f"{math.degrees(v):.4g} deg"),
-}
 
 
 @click.command("info")
@@ -91,8 +65,7 @@ def command(recording: RecordedFiles, config: MicroscopeConfig, as_json: bool) -
         _echo_intervals(found.intervals)
     _echo_pixels(found)
     for name, values in found.conditions.items():
-        label, show = _CONDITIONS[name]
-        click.echo(f"{label}: {_format_values(values, show)}")
+        click.echo(": ".join(describe_condition(name, values)))
     echo_notes(found.notes)
 
 
@@ -132,8 +105,8 @@ def _echo_settings(found: RecordingSummary) -> None:
 
 def _echo_intervals(times: Intervals) -> None:
     click.echo(
-        f"interval: median {_format_time(times.median_s)}, {_format_time(times.least_s)} to "
-        f"{_format_time(times.greatest_s)}{'' if times.regular else ' (not regular)'}"
+        f"interval: median {format_time(times.median_s)}, {format_time(times.least_s)} to "
+        f"{format_time(times.greatest_s)}{'' if times.regular else ' (not regular)'}"
     )
     if times.gaps:
         click.echo(f"gaps: {times.gaps}, as if {counted(times.missing, 'frame')} were missing")
@@ -172,13 +145,6 @@ def _describe_levels(levels: GreyLevels) -> str:
         if part >= 5e-5  # what rounds to 0.01 %
     ]
     return ", ".join([f"{span} ({bits})", *ends])
-
-
-def _format_values(values: tuple[Any, ...], show: Callable[[Any], str]) -> str:
-    if isinstance(values[0], str):
-        return ", ".join(values)
-    shown = list(dict.fromkeys(show(value) for value in values))
-    return " to ".join(shown)
 
 
 def _format_bytes(count: int) -> str:

@@ -29,20 +29,7 @@ _TURNED_RAD = 1e-3
 
 def file_conditions(settings: VendorSettings | None) -> dict[str, float | str]:
     """Return how an image was taken, by the keys of the topic ``conditions``; what is not known is missing."""
-    if settings is None:
-        return {}
-    found = {
-        "accelerating_voltage_v": settings.acceleration_voltage_v,
-        "working_distance_m": settings.working_distance_m,
-        "detector": settings.detector,
-        "dwell_s": settings.dwell_s,
-        "frame_time_s": settings.frame_time_s,
-        "scan_rotation_rad": settings.scan_rotation_rad,
-        "maker": settings.maker,
-        "model": settings.model,
-        "serial": settings.serial_number,
-    }
-    return {key: value for key, value in found.items() if value not in (None, "")}
+    return {} if settings is None else settings.topic_values()
 
 
 def file_stage(

@@ -40,6 +40,7 @@ from semcal_ros.core.calibration.nominal_scale import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted
+from semcal_ros.files.bags.conditions import find_conditions
 from semcal_ros.files.bags.errors import reading
 from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
@@ -187,7 +188,7 @@ class RecordedFrame:
     file_name
         Name of the file that the frame comes from, for a folder of images; else empty.
     conditions
-        How the image was taken, where its file says it.
+        How the image was taken, where its file or the recording says it.
     """
 
     image: NDArray[Any]
@@ -453,6 +454,7 @@ class _BagRecording(Recording):
             self._note_bad_magnifications(magnification_topic, self._track)
         self._stage, notes = find_stage(self._reader, config, self._image_topic.name)
         self._notes.extend(notes)
+        self._conditions = find_conditions(self._reader, self._image_topic.name)
         self._moved = 0
 
     def _find_magnification(self, source: MagnificationConfig) -> BagTopic | None:
@@ -598,6 +600,9 @@ class _BagRecording(Recording):
         pixels, encoding = decoded_image(message)
         return self._place(raw, message, without_databar(pixels, self._databar_rows), encoding)
 
+    def _conditions_at(self, stamp_ns: int, log_time_ns: int) -> Conditions | None:
+        return None if self._conditions is None else self._conditions.at(stamp_ns, log_time_ns)
+
     def _place(
         self, raw: RawMessage, message: Any, image: NDArray[Any], encoding: str
     ) -> tuple[RecordedFrame | None, bool]:
@@ -620,6 +625,7 @@ class _BagRecording(Recording):
                 frame_id=str(message.header.frame_id),
                 encoding=encoding,
                 stage=stage,
+                conditions=self._conditions_at(stamp_ns or raw.log_time_ns, raw.log_time_ns),
             ),
             stamp_ns != 0,
         )

@@ -300,7 +300,8 @@ class _Seen:
                 value = getattr(outline.conditions, item.name)
                 if item.name != "time" and value not in (None, ""):
                     self.conditions[item.name].add(value)
-        elif outline.stage is not None and outline.stage.tilt_rad is not None:
+        known = None if outline.conditions is None else outline.conditions.stage_tilt_rad
+        if known is None and outline.stage is not None and outline.stage.tilt_rad is not None:
             self.conditions["stage_tilt_rad"].add(outline.stage.tilt_rad)
 
     def _add_levels(self, image: NDArray[Any]) -> None:

@@ -20,13 +20,14 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import semcal_ros
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.files.images.image_series import find_image_files
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
@@ -36,9 +37,11 @@ from semcal_ros.workflows.inputs import Source
 __all__ = [
     "describe_computation",
     "describe_provenance",
+    "describe_views",
     "format_date",
     "list_recording_files",
     "sum_up",
+    "sum_up_conditions",
 ]
 
 # Stamps before 2001 count from the start of a recording, not from 1970.
@@ -72,22 +75,42 @@ def describe_provenance(
     views
         The frames used, by the names of the views; their pixels are not looked at.
     """
-    now = describe_computation()
     stamps = [frame.stamp_ns for frame in views.values()]
-    dates = [format_date(stamp) for stamp in (min(stamps), max(stamps))] if stamps else []
+    seen = {name: (frame.conditions, frame.stage) for name, frame in views.items()}
     path = source.path if isinstance(source, RecordedFiles) else source
     name = Path(path).resolve().name if isinstance(path, (str, os.PathLike)) else ""
+    return replace(
+        describe_views(config, seen, stamps),
+        recording=name[:_MOST_CHARACTERS],
+        recording_sha256=_digest(list_recording_files(source)),
+    )
+
+
+def describe_views(
+    config: MicroscopeConfig,
+    views: Mapping[str, tuple[Conditions | None, StageReading | None]],
+    stamps_ns: Sequence[int] = (),
+) -> Provenance:
+    """Tell where a calibration from live frames comes from, which have no file.
+
+    Parameters
+    ----------
+    config
+        The settings in effect.
+    views
+        Conditions and stage of the views used, by their names.
+    stamps_ns
+        Stamps of the views.
+    """
+    dates = [format_date(stamp) for stamp in (min(stamps_ns), max(stamps_ns))] if stamps_ns else []
     settings = json.dumps(asdict(config), sort_keys=True, default=str)
-    return Provenance(
-        now.calibrated,
-        tuple(date for date in dates if date),
-        now.software_version,
-        name[:_MOST_CHARACTERS],
-        _digest(list_recording_files(source)),
-        config.name,
-        hashlib.sha256(settings.encode()).hexdigest(),
-        tuple(views),
-        _sum_up_conditions(views.values()),
+    return replace(
+        describe_computation(),
+        recorded=tuple(date for date in dates if date),
+        configuration=config.name,
+        configuration_sha256=hashlib.sha256(settings.encode()).hexdigest(),
+        views=tuple(views),
+        conditions=sum_up_conditions(views.values()),
     )
 
 
@@ -141,14 +164,18 @@ def _digest(files: Sequence[Path]) -> str:
     return hashlib.sha256("".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _sum_up_conditions(frames: Iterable[RecordedFrame]) -> dict[str, tuple[Any, ...]]:
+def sum_up_conditions(
+    views: Iterable[tuple[Conditions | None, StageReading | None]],
+) -> dict[str, tuple[Any, ...]]:
+    """Conditions of all views, for a :class:`Provenance`: the different texts, or the least and the greatest number."""
     found: dict[str, set[Any]] = {}
-    for frame in frames:
-        if frame.conditions is not None:
+    for conditions, stage in views:
+        if conditions is not None:
             for item in fields(Conditions):
-                value = getattr(frame.conditions, item.name)
+                value = getattr(conditions, item.name)
                 if item.name != "time" and value not in (None, ""):
                     found.setdefault(item.name, set()).add(value)
-        elif frame.stage is not None and frame.stage.tilt_rad is not None:
-            found.setdefault("stage_tilt_rad", set()).add(frame.stage.tilt_rad)
+        tilted = None if conditions is None else conditions.stage_tilt_rad
+        if tilted is None and stage is not None and stage.tilt_rad is not None:
+            found.setdefault("stage_tilt_rad", set()).add(stage.tilt_rad)
     return {name: sum_up(values) for name, values in found.items()}

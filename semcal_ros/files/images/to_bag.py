@@ -25,6 +25,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import published_number
@@ -38,6 +39,7 @@ from semcal_ros.config.config import (
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
+from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
 from semcal_ros.files.images.image_series import (
@@ -48,7 +50,7 @@ from semcal_ros.files.images.image_series import (
     group_skipped,
 )
 from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
-from semcal_ros.files.tiff.sem_image import SemImage
+from semcal_ros.files.tiff.sem_image import Conditions, SemImage
 
 __all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_images"]
 
@@ -157,6 +159,12 @@ def _stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: 
     return message
 
 
+def _conditions_message(conditions: Conditions, name: str) -> Any:
+    message = blank_message(CONDITIONS_TYPE)
+    fill_conditions(message, conditions.topic_values(), name)
+    return message
+
+
 def _write_image(
     writer: BagWriter,
     config: MicroscopeConfig,
@@ -191,6 +199,7 @@ def _write_all(
     on_progress: Callable[[int, int], object] | None,
 ) -> tuple[list[dict[str, Any]], list[Skipped]]:
     written, skipped = [], []
+    told: dict[str, float | str] = {}
     stage = config.stage if any(image.stage is not None for image in series.images) else None
     for number, (image, pixels) in enumerate(series.read(), 1):
         if on_progress is not None:
@@ -198,6 +207,13 @@ def _write_all(
         if isinstance(pixels, SemcalError):
             skipped.append(Skipped(image.name, str(pixels)))
             continue
+        conditions = image.conditions or Conditions()
+        if conditions.topic_values() != told:
+            told = conditions.topic_values()
+            before_ns = max(0, image.stamp_ns - _BEFORE_IMAGE_NS)
+            topic = _topic(CONDITIONS_TOPIC)
+            writer.add_topic(topic, CONDITIONS_TYPE, latched=True, depth=1)
+            writer.write(topic, before_ns, _conditions_message(conditions, config.name))
         written.append(_write_image(writer, config, image, pixels, stage))
     if not written:
         raise BagError(

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from pathlib import Path
@@ -24,6 +25,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from semcal_ros.bridge.conditions import NUMBERS, TEXTS
+from semcal_ros.core.camera.conditions import FILE_NAMES
 
 __all__ = ["Conditions", "SemImage", "VendorSettings"]
 
@@ -47,6 +51,8 @@ class Conditions:
         Acceleration voltage, without its sign.
     working_distance_m
         Working distance.
+    beam_current_a
+        Current of the beam on the specimen.
     scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
         Angles in the maker's sense of rotation.
     dwell_s
@@ -66,6 +72,7 @@ class Conditions:
     beam: str = ""
     acceleration_voltage_v: float | None = None
     working_distance_m: float | None = None
+    beam_current_a: float | None = None
     scan_rotation_rad: float | None = None
     stage_tilt_rad: float | None = None
     stage_rotation_rad: float | None = None
@@ -78,6 +85,17 @@ class Conditions:
         """All conditions by name as plain values for JSON."""
         values = {item.name: getattr(self, item.name) for item in fields(Conditions)}
         return {**values, "time": None if self.time is None else self.time.isoformat()}
+
+    def topic_values(self) -> dict[str, float | str]:
+        """What is known of what the topic ``conditions`` tells, by its keys."""
+        found = {key: getattr(self, FILE_NAMES.get(key, key)) for key in (*NUMBERS, *TEXTS)}
+        return {key: value for key, value in found.items() if value not in (None, "")}
+
+    @classmethod
+    def from_topic(cls, values: Mapping[str, float | str]) -> Conditions:
+        """Make them of the values of the topic ``conditions``; other keys are left out."""
+        known = {FILE_NAMES.get(k, k): v for k, v in values.items() if k in (*NUMBERS, *TEXTS)}
+        return Conditions(**known)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, kw_only=True)

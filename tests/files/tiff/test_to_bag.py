@@ -224,3 +224,20 @@ def test_refusals(tmp_path: Path) -> None:
     )
     with pytest.raises(BagError, match="--config generic"):
         import_images(folder, tmp_path / "bag2", config=odd)
+
+
+def test_conditions_are_told_once_and_latched(tmp_path: Path) -> None:
+    folder = tmp_path / "tiffs"
+    folder.mkdir()
+    for number, voltage in ((1, 5000), (2, 5000), (3, 10000)):
+        settings = f"HV={voltage}\nWD=0.0101\nSerialNumber=7\n"
+        write_tescan(folder / f"{number}.tif", 2.5e-9, (8, 8), f"12:00:0{number}", angles=settings)
+    import_images(folder, tmp_path / "bag")
+    with open_bag(tmp_path / "bag") as reader:
+        topics = {topic.name: topic for topic in reader.topics}
+    assert topics["/sem/conditions"].count == 2
+    assert topics["/sem/conditions"].latched
+    with open_recording(tmp_path / "bag") as recording:
+        found = [frame.conditions for frame in recording.frames()]
+    assert [c and c.acceleration_voltage_v for c in found] == [5000.0, 5000.0, 10000.0]
+    assert all(c is not None and c.working_distance_m == 0.0101 for c in found)
