@@ -34,10 +34,13 @@ _COMMANDS = {
     "at": "camera at a magnification: K, P, distortion, nm per pixel",
     "calibrate": "calibrate from a recording of the chess grid",
     "check": "whether a calibration still holds, by a few views of the grid",
+    "compare": "by how much two calibrations differ",
     "doctor": "what keeps a live stream from working",
     "drift": "specimen drift of a recording, as a table",
     "evaluate": "reprojection error of a calibration on a recording",
+    "export": "a calibration as a file of OpenCV, ROS, mrcal, COLMAP, Fiji, or a table",
     "import": "make a bag from a folder of SEM TIFF files",
+    "import-calibration": "a calibration from a table of pixel sizes",
     "info": "what a recording contains",
     "measure": "measurements in nanometres: bending of a cantilever",
     "plan": "which views to record next for a more certain calibration",
@@ -58,7 +61,7 @@ class _Group(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         try:
-            module = import_module(f"semcal_ros.cli.{cmd_name}_command")
+            module = import_module(f"semcal_ros.cli.{cmd_name.replace('-', '_')}_command")
         except ImportError as error:
             raise SemcalError(
                 f"semcal {cmd_name} cannot be loaded ({error})",

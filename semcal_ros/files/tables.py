@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tables of numbers as CSV, Parquet and Excel files."""
+"""Tables as CSV, Parquet and Excel files, written and read."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from types import MappingProxyType
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.text_files import read_text_file
 
-__all__ = ["DRIFT_COLUMNS", "SIMILARITY_COLUMNS", "TABLE_SUFFIXES", "write_table"]
+__all__ = ["DRIFT_COLUMNS", "SIMILARITY_COLUMNS", "TABLE_SUFFIXES", "read_table", "write_table"]
 
 DRIFT_COLUMNS = (
     "stamp_ns",
@@ -150,3 +151,90 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[obje
             do="pip install 'semcal_ros[tables]', or name the table .csv",
         ) from error
     atomic_write_bytes(path, data)
+
+
+# A table of pixel sizes or drifts has some hundred kilobytes; what is longer is something else.
+_MOST_BYTES = 64 * 2**20
+
+
+def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Read a table: the names of its columns, and its rows as texts.
+
+    Comma, semicolon and tab separate the values of a CSV file; empty lines and lines that begin with ``#`` are
+    left out. Of an Excel file, the first sheet is read.
+
+    Parameters
+    ----------
+    path
+        ``.csv``, ``.parquet`` (which needs pyarrow) or ``.xlsx`` (which needs openpyxl).
+
+    Raises
+    ------
+    InvalidValueError
+        The file cannot be read, is no such table, or its library is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in TABLE_SUFFIXES:
+        raise InvalidValueError(
+            f"{path} for a table", expected="a name that ends in " + ", ".join(TABLE_SUFFIXES)
+        )
+    try:
+        if suffix == ".csv":
+            text = read_text_file(
+                path, _MOST_BYTES, error=InvalidValueError, expected="a table as UTF-8 text"
+            )
+            rows = _split_csv(text)
+        else:
+            rows = _read_parquet(path) if suffix == ".parquet" else _read_excel(path)
+    except ImportError as error:
+        raise InvalidValueError(
+            f"{path} without {_LIBRARIES[suffix]}: {error}",
+            expected="the library that reads it",
+            do="pip install 'semcal_ros[tables]', or save the table as .csv",
+        ) from error
+    except InvalidValueError:
+        raise
+    except Exception as error:  # the libraries raise what they like on broken files
+        raise InvalidValueError(
+            f"{path}: not a table ({error})",
+            expected=f"a {suffix} file",
+            do="save it anew, or as .csv",
+        ) from error
+    if len(rows) < 2:
+        raise InvalidValueError(
+            f"{path} without rows",
+            expected="a line with the names of the columns, then their values",
+        )
+    return rows[0], rows[1:]
+
+
+def _split_csv(text: str) -> list[list[str]]:
+    lines = [t for t in text.lstrip("\ufeff").splitlines() if t.strip() and not t.startswith("#")]
+    if not lines:
+        return []
+    # Where commas are decimal, semicolons separate.
+    separator = next((c for c in (";", "\t", ",") if c in lines[0]), ",")
+    rows = csv.reader(lines, delimiter=separator)
+    return [[cell.strip() for cell in row] for row in rows]
+
+
+def _read_parquet(path: Path) -> list[list[str]]:
+    from pyarrow import parquet
+
+    table = parquet.read_table(path).to_pydict()
+    columns = [[_text(value) for value in values] for values in table.values()]
+    return [list(table), *(list(row) for row in zip(*columns, strict=True))]
+
+
+def _read_excel(path: Path) -> list[list[str]]:
+    from openpyxl import load_workbook
+
+    book = load_workbook(path, read_only=True, data_only=True)
+    rows = [
+        [_text(value) for value in row] for row in book.worksheets[0].iter_rows(values_only=True)
+    ]
+    return [row for row in rows if any(row)]
+
+
+def _text(value: object) -> str:
+    return "" if value is None else _cell(value).strip()

@@ -1,0 +1,214 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From a calibration to the files of other programs."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tifffile
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.camera.pinhole_model import PinholeModel, fit_pinhole
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.atomic import atomic_write_bytes, atomic_write_text
+from semcal_ros.files.foreign_cameras.imagej import compute_raw_map, format_macro
+from semcal_ros.files.foreign_cameras.pinhole_text import (
+    format_colmap,
+    format_mrcal,
+    format_opencv,
+    format_ros,
+)
+from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
+from semcal_ros.workflows.describe_camera import parameter_sigma
+
+__all__ = ["EXPORT_FORMATS", "ExportedCamera", "export_calibration"]
+
+#: Formats, and the suffixes of their files.
+EXPORT_FORMATS = {
+    "opencv": (".yaml", ".yml"),
+    "ros": (".yaml", ".yml"),
+    "mrcal": (".cameramodel",),
+    "colmap": (".txt",),
+    "fiji": (".ijm",),
+    "csv": TABLE_SUFFIXES,
+}
+# Suffixes of parameters that have a unit.
+_UNITS = {"m": "_px_per_m", "px": "_px", "py": "_px", "rho": "_1_per_m", "ex": "_px", "ey": "_px"}
+
+
+@dataclass(frozen=True)
+class ExportedCamera:
+    """What was written.
+
+    Attributes
+    ----------
+    paths
+        The files.
+    worst_px, rms_px
+        Largest and RMS distance in px of the model in the file from the calibration, over the image and heights
+        within a tenth of the field width; 0 for formats that hold it exactly.
+    """
+
+    paths: tuple[Path, ...]
+    worst_px: float = 0.0
+    rms_px: float = 0.0
+
+
+def export_calibration(
+    calibration: Calibration,
+    kind: str,
+    path: str | os.PathLike[str],
+    *,
+    magnifications: Sequence[float] = (),
+    rectified: bool = False,
+) -> ExportedCamera:
+    """Write a calibration as a file of another program.
+
+    Parameters
+    ----------
+    calibration
+        The calibration.
+    kind
+        ``"opencv"`` and ``"ros"``: YAML; ``"mrcal"``: ``.cameramodel``; ``"colmap"``: ``cameras.txt``; ``"fiji"``: a
+        macro ``.ijm`` that sets the pixel size, and beside it, for raw images, a TIFF with the x and y of the raw
+        pixel that each rectified pixel shows; ``"csv"``: a table (``.csv``, ``.parquet``, ``.xlsx``) of all
+        parameters and their 1-sigma over the magnification.
+    path
+        The file to write.
+    magnifications
+        One for a camera; for ``"csv"`` as many as wanted, the calibrated ones by default.
+    rectified
+        The camera of rectified images, which all formats hold, instead of that of raw ones.
+
+    Raises
+    ------
+    InvalidValueError
+        For an unknown format, a name that contradicts it, the wrong number of magnifications, or ``rectified`` for
+        a table.
+    OSError
+        If a file cannot be written.
+    """
+    file = Path(path)
+    _check(kind, file, magnifications, rectified=rectified)
+    if kind == "csv":
+        _write_parameters(calibration, magnifications or calibration.magnifications, file)
+        return ExportedCamera((file,))
+    raw = calibration.at(float(magnifications[0]))
+    camera: ScanCamera = raw.rectified if rectified else raw
+    notes = _describe(calibration, camera, rectified=rectified)
+    if kind == "fiji":
+        return _write_imagej(camera, file, notes, rectified=rectified)
+    pinhole = fit_pinhole(camera)
+    notes.append(
+        f"Distance from the calibration: up to {pinhole.worst_px:.3g} px, RMS {pinhole.rms_px:.3g} px."
+    )
+    atomic_write_text(file, _format(kind, pinhole, camera, notes))
+    return ExportedCamera((file,), pinhole.worst_px, pinhole.rms_px)
+
+
+def _check(
+    kind: str,
+    file: Path,
+    magnifications: Sequence[float],
+    *,
+    rectified: bool,
+) -> None:
+    suffixes = EXPORT_FORMATS.get(kind)
+    if suffixes is None:
+        raise InvalidValueError(f"format {kind!r}", expected=", ".join(EXPORT_FORMATS))
+    if file.suffix.lower() not in suffixes:
+        raise InvalidValueError(
+            f"{file} for the format {kind}", expected="a name that ends in " + ", ".join(suffixes)
+        )
+    if kind == "csv":
+        if rectified:
+            raise InvalidValueError("rectified with the format csv", expected="one of them")
+    elif len(magnifications) != 1:
+        raise InvalidValueError(
+            f"{len(magnifications) or 'no'} magnifications for the format {kind}",
+            expected="one: the file holds one camera",
+            do="give --magnification once",
+        )
+
+
+def _describe(calibration: Calibration, camera: ScanCamera, *, rectified: bool) -> list[str]:
+    """Return what a reader of the file should know, in ASCII."""
+    x_nm, y_nm = (1e9 * size for size in camera.pixel_size_m)
+    notes = [
+        f"SEM at magnification {camera.magnification:g}, {'rectified' if rectified else 'raw'} images.",
+        f"nm per px in the plane of the calibration: {x_nm:.6g} along x, {y_nm:.6g} along y.",
+        "The camera looks along +Z of the sem frame, whose plane Z = 0 is at the translation given.",
+    ]
+    if camera.rho <= 0.0:
+        notes.append("The projection is parallel; a very long focal length stands for it.")
+    if not camera.in_range:
+        low, high = calibration.magnification_range
+        notes.append(f"Outside the calibrated range {low:g} to {high:g}: extrapolated.")
+    return notes
+
+
+def _format(kind: str, pinhole: PinholeModel, camera: ScanCamera, notes: Sequence[str]) -> str:
+    if kind == "opencv":
+        return format_opencv(pinhole, camera.pixel_size_m, notes)
+    if kind == "ros":
+        return format_ros(pinhole, f"sem_{camera.magnification:g}x".replace(".", "_"), notes)
+    return format_mrcal(pinhole, notes) if kind == "mrcal" else format_colmap(pinhole, notes)
+
+
+def _write_imagej(
+    camera: ScanCamera, file: Path, notes: list[str], *, rectified: bool
+) -> ExportedCamera:
+    paths = [file]
+    if not rectified:
+        paths.append(file.with_name(f"{file.stem}_map.tif"))
+        notes.append(
+            f"{paths[1].name}: x and y of the raw pixel that each rectified pixel shows, px."
+        )
+        data = io.BytesIO()
+        tifffile.imwrite(data, compute_raw_map(camera), imagej=True, metadata={"axes": "CYX"})
+        atomic_write_bytes(paths[1], data.getvalue())
+    atomic_write_text(file, format_macro(camera.pixel_size_m, notes))
+    return ExportedCamera(tuple(paths))
+
+
+def _write_parameters(
+    calibration: Calibration, magnifications: Sequence[float], file: Path
+) -> None:
+    columns = ["magnification", "in_range"]
+    columns += [
+        f"{prefix}nm_per_px_{axis}" for axis in ("x", "y", "rectified") for prefix in ("", "sigma_")
+    ]
+    for name in PARAMETER_NAMES:
+        full = {"m": "scale"}.get(name, name) + _UNITS.get(name, "")
+        columns += [full, f"sigma_{full}"]
+    rows = []
+    for magnification in magnifications:
+        camera = calibration.at(float(magnification))
+        row: list[object] = [float(magnification), camera.in_range]
+        sizes = [*zip(camera.pixel_size_m, camera.pixel_size_sigma_m, strict=True)]
+        sizes.append((camera.rectified.pixel_size_m[0], max(camera.rectified.pixel_size_sigma_m)))
+        row += [1e9 * float(value) for pair in sizes for value in pair]
+        sigma = parameter_sigma(camera)
+        for name, value in zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True):
+            row += [value, sigma[name]]
+        rows.append(row)
+    write_table(file, columns, rows)

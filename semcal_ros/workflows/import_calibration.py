@@ -1,0 +1,108 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From a table of pixel sizes to a nominal calibration."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.camera.nominal_calibration import KnownPixelSize, make_nominal_calibration
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.tables import read_table
+from semcal_ros.workflows.provenance import describe_computation
+
+__all__ = ["import_calibration"]
+
+_METRES = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "m": 1.0}
+# The pixel size in a header: "nm per px", "nm/pixel", "pixel size (nm)", "nm_per_px".
+_UNIT = re.compile(r"(?<![a-zµμ])(pm|nm|um|µm|μm|mm|m)(?![a-zµμ])")
+
+
+def import_calibration(
+    table: str | os.PathLike[str],
+    *,
+    image_size: tuple[int, int],
+    sigma: float,
+    display_width_m: float | None = None,
+) -> Calibration:
+    """Make a nominal calibration from a table of magnifications and pixel sizes.
+
+    Parameters
+    ----------
+    table
+        A ``.csv``, ``.parquet`` or ``.xlsx`` file with a column of magnifications and one of pixel sizes, whose header
+        names the unit, such as ``nm per px``; optionally one of their 1-sigma, in the same unit or ``%``.
+    image_size
+        (width, height) of the images whose pixels they are, px.
+    sigma
+        Relative 1-sigma of the sizes that have none of their own.
+    display_width_m
+        As for :func:`.make_nominal_calibration`.
+
+    Raises
+    ------
+    InvalidValueError
+        If the table cannot be read, has no such columns, or its numbers cannot be pixel sizes; with the line.
+    """
+    path = Path(table)
+    columns, rows = read_table(path)
+    lower = [re.sub(r"[_\-]", " ", name.lower()) for name in columns]
+    magnification = _find(
+        path, columns, [k for k, n in enumerate(lower) if "mag" in n], "magnification"
+    )
+    spreads = [k for k, n in enumerate(lower) if "sigma" in n or "uncertainty" in n]
+    sized = [
+        k for k, n in enumerate(lower) if _UNIT.search(n) and k not in (*spreads, magnification)
+    ]
+    size = _find(path, columns, sized, "nm per px")
+    unit = _METRES[_UNIT.search(lower[size])[1]]  # type: ignore[index]  # it was found there
+    known = []
+    for number, row in enumerate(rows, start=2):
+        where = f"{path}, row {number}: "
+        if len(row) <= max(magnification, size):
+            raise InvalidValueError(f"{where}{len(row)} values", expected=f"{len(columns)}")
+        value_m = unit * _number(row[size], where)
+        own = sigma
+        if spreads and len(row) > spreads[0] and row[spreads[0]].strip():
+            spread = _number(row[spreads[0]], where)
+            percent = "%" in columns[spreads[0]] or "percent" in lower[spreads[0]]
+            own = 0.01 * spread if percent else unit * spread / value_m
+        known.append(KnownPixelSize(_number(row[magnification], where), value_m, own, where))
+    model = make_nominal_calibration(known, image_size, display_width_m)
+    origin = replace(describe_computation(), recording=f"{path.name} (a table of pixel sizes)")
+    return Calibration.from_model(replace(model, provenance=origin))
+
+
+def _find(path: Path, columns: list[str], found: list[int], example: str) -> int:
+    if len(found) != 1:
+        raise InvalidValueError(
+            f"{path} with the columns {', '.join(columns)}",
+            expected=f"one column with a header such as {example}",
+        )
+    return found[0]
+
+
+def _number(text: str, where: str) -> float:
+    clean = text.strip().removesuffix("x").removesuffix("×").replace("\u00a0", "").replace(" ", "")
+    if clean.count(",") == 1 and "." not in clean:
+        clean = clean.replace(",", ".")
+    try:
+        return float(clean)
+    except ValueError as error:
+        raise InvalidValueError(f"{where}{text!r}", expected="a number") from error
