@@ -65,8 +65,9 @@ PLAYER = {
     ),
     "topics": suite.Argument(
         "inputs",
-        "What is played. inputs: images, magnification and stage by the configuration; all: whatever was recorded, also"
-        " what the suite publishes itself, which then comes twice; or names, with commas between them.",
+        "What is played. inputs: images, magnification and stage by the configuration, and conditions; all: whatever"
+        " was recorded, also what the suite publishes itself, which then comes twice; or names, with commas between"
+        " them.",
     ),
     "exclude": suite.Argument("", "Topics that are not played, with commas between them."),
     "rate": suite.Argument("1.0", "Seconds of recording per second.", suite.number(0.001, 1000.0)),

@@ -25,6 +25,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import HEIGHT, LENGTH, PATH, json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table
+from semcal_ros.core.camera.provenance import NOT_RECORDED
 from semcal_ros.core.camera.uncertainty_budget import (
     UncertaintyBudget,
     budget_of_length,
@@ -105,6 +106,13 @@ def command(
         echo_json(described)
     else:
         _echo_camera(described)
+        origin = model.provenance
+        click.echo(f"calibrated   {origin.describe_origin()}")
+        click.echo(
+            f"conditions   microscope {origin.describe_microscope()}; {origin.describe_conditions()}"
+            if origin.conditions
+            else f"conditions   {NOT_RECORDED}"
+        )
 
 
 def _echo_budget(budget: UncertaintyBudget, *, of_length: bool, as_json: bool) -> None:

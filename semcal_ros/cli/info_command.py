@@ -16,15 +16,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
 from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.conditions import describe_condition, format_time
-from semcal_ros.core.wording import counted
+from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.wording import counted, printable
 from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.workflows.describe_calibration import describe_calibration
 from semcal_ros.workflows.describe_recording import (
     GreyLevels,
     Intervals,
@@ -45,11 +52,21 @@ _MOST_ROWS = 24
 def command(recording: RecordedFiles, config: MicroscopeConfig, as_json: bool) -> None:
     """What RECORDING contains: frames, scale, times, grey levels, and how it was taken.
 
+    Of a calibration file: where it comes from, its range, conditions and warnings.
+
     \b
     Example:
       semcal info recordings/grid
       semcal info 'scan_*.tif' --json
+      semcal info cal.yaml
     """
+    if len(recording.paths) == 1 and _is_calibration(recording.paths[0]):
+        described = describe_calibration(Calibration.load(recording.paths[0]))
+        if as_json:
+            echo_json(described)
+        else:
+            _echo_calibration(described)
+        return
     with show_progress() as on_progress:
         found = describe_recording(recording, config=config, on_progress=on_progress)
     if as_json:
@@ -67,6 +84,56 @@ def command(recording: RecordedFiles, config: MicroscopeConfig, as_json: bool) -
     for name, values in found.conditions.items():
         click.echo(": ".join(describe_condition(name, values)))
     echo_notes(found.notes)
+
+
+def _is_calibration(path: Path) -> bool:
+    # The only other YAML file of ours is that in a bag.
+    return (
+        path.suffix.lower() in (".yaml", ".yml") and path.name != "metadata.yaml" and path.is_file()
+    )
+
+
+def _echo_calibration(known: Mapping[str, Any]) -> None:
+    def told(name: str, show: Callable[[Any], str] = str) -> str:
+        value = known[name]
+        return NOT_RECORDED if value is None else show(value)
+
+    low, high = known["magnification_range"]
+    rows = [
+        ("method", known["method"]),
+        ("calibrated", told("calibrated", "{} UTC".format)),
+        ("software", told("software_version", "semcal_ros {}".format)),
+        ("recording", told("recording")),
+        ("  SHA-256", told("recording_sha256")),
+        ("  recorded", told("recorded", lambda dates: " to ".join(dict.fromkeys(dates)) + " UTC")),
+        ("configuration", told("configuration")),
+        ("  SHA-256", told("configuration_sha256")),
+        (
+            "range",
+            f"{low:g}x to {high:g}x, {counted(len(known['magnifications']), 'magnification')}",
+        ),
+        ("image", f"{known['image_width_px']} x {known['image_height_px']} px"),
+        ("display width", f"{known['display_width_m']:g} m"),
+        ("squares", told("squares_m", lambda s: ", ".join(f"{1e6 * v:g} um" for v in s))),
+        ("certificate", told("grid_certificate")),
+        ("views", told("views_used")),
+        ("corners", told("corners")),
+        ("RMS", told("rms_px", lambda v: f"{v:.4f} px")),
+    ]
+    if known["conditions"] is None:
+        rows.append(("conditions", NOT_RECORDED))
+    else:
+        rows += [describe_condition(name, values) for name, values in known["conditions"].items()]
+    width = max(len(label) for label, _ in rows) + 2
+    click.echo(known["verdict"])
+    for label, text in rows:
+        click.echo(printable(f"{label:{width}}{text}"))
+    if known["warnings"] is None:
+        click.echo(f"{'warnings':{width}}{NOT_RECORDED}")
+    else:
+        click.echo(f"{'warnings':{width}}{len(known['warnings']) or 'none'}")
+    for warning in known["warnings"] or ():
+        click.echo(printable(f"  {warning}"))
 
 
 def _echo_frames(found: RecordingSummary) -> None:

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Callable, Iterable
 from typing import SupportsIndex
 
-__all__ = ["counted", "did_you_mean", "group_by_kind", "nearest_name", "omit_numbers"]
+__all__ = ["counted", "did_you_mean", "group_by_kind", "nearest_name", "omit_numbers", "printable"]
 
 _NUMBER = re.compile(r"-?\d[\d.]*")
 
@@ -64,6 +65,13 @@ def group_by_kind(
         same[0] if len(same) == 1 else f"{same[0]} (and {len(same) - 1} more of this kind)"
         for same in kinds.values()
     ]
+
+
+def printable(text: object, longest: int = 1000) -> str:
+    """Return a text of others as one line: without control characters, and cut off where it is too long."""
+    # Category C: control characters, those that turn the direction of writing, and halves of characters.
+    shown = "".join(" " if unicodedata.category(c)[0] == "C" else c for c in str(text)[:longest])
+    return shown.rstrip() + "..." * (len(str(text)) > longest)
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

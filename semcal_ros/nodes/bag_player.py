@@ -29,8 +29,10 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.bridge.headers import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, InvalidValueError, SemcalError
+from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
 from semcal_ros.files.bags.topics import topic_matches
 from semcal_ros.middleware.message_types import message_class
@@ -87,8 +89,8 @@ _PARAMETERS = (
     ParameterDeclaration(
         "topics",
         "all",
-        "What is played: all; inputs (images, magnification and stage by the configuration); or names of topics, with"
-        " commas between them. A name without a leading / stands for every topic that ends with it.",
+        "What is played: all; inputs (images, magnification and stage by the configuration, and conditions); or names"
+        " of topics, with commas between them. A name without a leading / stands for every topic that ends with it.",
         fixed=True,
     ),
     ParameterDeclaration(
@@ -227,7 +229,9 @@ class BagPlayer(SemNode):
         )
 
     def _role(self, topic: BagTopic) -> str:
-        """Return ``image``, ``magnification`` or ``stage`` for an input of the suite, else nothing."""
+        """Return ``image``, ``magnification``, ``stage`` or ``conditions`` for an input of the suite, else nothing."""
+        if topic.type == CONDITIONS_TYPE and topic_matches(CONDITIONS_TOPIC, topic.name):
+            return "conditions"
         sources: dict[str, Any] = {
             "image": self.config.image,
             "magnification": self.config.magnification,
@@ -261,8 +265,8 @@ class BagPlayer(SemNode):
         except ConfigError as error:
             self.reporter.reject(error)
             return None
-        # A magnification stays valid, so a node that is started later must receive it.
-        is_latched = topic.latched or self._role(topic) == "magnification"
+        # A magnification stays valid, as conditions do, so a node that is started later must receive it.
+        is_latched = topic.latched or self._role(topic) in ("magnification", "conditions")
         if is_latched:
             self._latched.add(topic.name)
         profile = value_input(1) if is_latched else stream_output(_DEPTH)

@@ -36,14 +36,17 @@ from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, Calib
 from semcal_ros.core.calibration.check import Verdict
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.core.wording import counted
+from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
 from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import calibration_digest, report_scale_warnings
+from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stage import StageInput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
@@ -55,6 +58,7 @@ from semcal_ros.nodes.workers.calibration_worker import (
 )
 from semcal_ros.workflows.calibrate import options_for
 from semcal_ros.workflows.check_and_update import check_found, update_found
+from semcal_ros.workflows.provenance import describe_views
 
 __all__ = ["CalibrationServer", "main"]
 
@@ -84,6 +88,7 @@ class _Candidate:
     frame: StreamFrame
     visit: int
     stage: StageReading | None
+    conditions: Conditions
 
 
 class CalibrationServer(StreamNode):
@@ -100,6 +105,8 @@ class CalibrationServer(StreamNode):
         self._newest: _Candidate | None = None
         self._added: StreamFrame | None = None
         self._views: list[FoundView] = []
+        # Of the same views: their stamps, ns, and how they were taken.
+        self._taken: list[tuple[int, Conditions]] = []
         self._calibration: Calibration | None = None
         self._running: CalibrationProcess | None = None
         self._stage: Stage | None = None
@@ -112,6 +119,7 @@ class CalibrationServer(StreamNode):
         stream = MutuallyExclusiveCallbackGroup()
         # Before the images, as the magnification.
         self._position = StageInput(self.config.stage, self.endpoints, self.reporter, stream)
+        self._known = ConditionsInput(self.endpoints, self.reporter, group=stream)
         self.receive_frames(self._on_frame, group=stream)
         quick, compared = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         handlers = (
@@ -179,11 +187,13 @@ class CalibrationServer(StreamNode):
             with self._lock:
                 self._newest = None
             return
+        self._known.take_waiting()
+        conditions = Conditions.from_topic(self._known.current)
         with self._lock:
             before = self._newest
             visit = 0 if before is None else before.visit
             visit += before is not None and before.frame.magnification != magnification
-            self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns))
+            self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns), conditions)
 
     # -- services ----------------------------------------------------------------------------------
 
@@ -220,6 +230,7 @@ class CalibrationServer(StreamNode):
         view = without_images([found])[0]
         with self._lock:
             self._views.append(view)
+            self._taken.append((frame.stamp_ns, newest.conditions))
             self._added = frame
             count = len(self._views)
         self.reporter.count_published(frame.stamp_ns)
@@ -235,6 +246,7 @@ class CalibrationServer(StreamNode):
         with self._lock:
             count = len(self._views)
             self._views.clear()
+            self._taken.clear()
             self._added = None
             self._position.forget_doubt()
         return f"{counted(count, 'view')} removed"
@@ -313,9 +325,16 @@ class CalibrationServer(StreamNode):
                 ),
                 config.grid_certificate,
                 notes,
+                self._describe(views),
+                {v.name: told for v, (_, told) in zip(views, self._taken, strict=True)},
             )
             self._running = CalibrationProcess(job)
             return self._running
+
+    def _describe(self, views: Sequence[FoundView]) -> Provenance:
+        """Where a calibration from these views, all that there are, comes from; call it with the lock."""
+        seen = {v.name: (told, v.stage) for v, (_, told) in zip(views, self._taken, strict=True)}
+        return describe_views(self.config, seen, [stamp_ns for stamp_ns, _ in self._taken])
 
     def _finish(self, running: CalibrationProcess, *, done: bool) -> bool:
         """Allow the next calibration; return False if this one was cancelled."""
@@ -345,14 +364,15 @@ class CalibrationServer(StreamNode):
             f" after {running.elapsed_s:.1f} s"
         )
 
-    def _compared(self) -> tuple[Calibration, tuple[FoundView, ...]]:
-        """The calibration that is checked or renewed, and the views that say so."""
+    def _compared(self) -> tuple[Calibration, tuple[FoundView, ...], Provenance]:
+        """The calibration that is checked or renewed, the views that say so, and their origin."""
         self._refuse_rivals()
         with self._lock:
             calibration = self._calibration
             views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
             if self._position.doubt:
                 views = tuple(replace(v, stage=None) for v in views)
+            origin = self._describe(views)
         if not views:
             raise CalibrationError("no usable view yet", do="call ~/add_view first")
         if calibration is None:
@@ -364,18 +384,18 @@ class CalibrationServer(StreamNode):
                     do="set it, or call ~/calibrate",
                 )
             calibration = Calibration.load(self.parameters.allowed_path(path))
-        return calibration, views
+        return calibration, views, origin
 
     def _check(self) -> str:
-        calibration, views = self._compared()
+        calibration, views, _ = self._compared()
         result = check_found(calibration, views, self.config)
         if result.verdict is not Verdict.VALID:
             raise CalibrationError(result.summary, do="call ~/update, or calibrate anew")
         return result.summary
 
     def _update(self) -> str:
-        calibration, views = self._compared()
-        done = update_found(calibration, views, self.config)
+        calibration, views, origin = self._compared()
+        done = update_found(calibration, views, self.config, origin)
         self._adopt(Calibration.from_model(done.model))
         return f"updated; before, it was {done.check.summary}"
 

@@ -40,6 +40,7 @@ from semcal_ros.nodes.common.parameters import (
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
+from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 
 __all__ = ["ParameterServer", "main"]
@@ -81,6 +82,9 @@ class ParameterServer(SemNode):
             self.reporter,
             on_change=self._on_calibration,
         )
+        self._watch = ConditionsWatch(
+            self.endpoints, self.reporter, lambda: self._calibration.current
+        )
         for setting in _SIZE:
             self.parameters.on_change(setting.name, lambda _value: self._refresh())
         self._magnification = MagnificationInput(
@@ -104,10 +108,11 @@ class ParameterServer(SemNode):
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report a calibration that is missing, or that does not cover the
-        magnification, or whose scale is in doubt.
+        magnification, or whose scale is in doubt, or that was made under other conditions.
         """
         outside = ["magnification outside the calibrated range"] * self._range.is_outside
-        return super().conditions() + outside + self._calibration.conditions()
+        doubts = self._calibration.conditions() + self._watch.conditions()
+        return super().conditions() + outside + doubts
 
     # -- topics ------------------------------------------------------------------------------------
 

@@ -22,11 +22,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Twist
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, Header
 
+from semcal_ros.bridge.conditions import fill_conditions
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
@@ -98,6 +100,17 @@ _PARAMETERS = (
     ),
     ParameterDeclaration(
         "height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3
+    ),
+    ParameterDeclaration(
+        "voltage_v", 10e3, "Voltage that is told; the image does not depend on it.", "V", 10.0, 1e6
+    ),
+    ParameterDeclaration(
+        "working_distance_m",
+        10e-3,
+        "Working distance that is told; the image does not depend on it.",
+        "m",
+        1e-4,
+        0.2,
     ),
     ParameterDeclaration(
         "stage",
@@ -186,7 +199,7 @@ _ENCODINGS = {8: "mono8", 16: "mono16"}
 
 
 class VirtualSem(SemNode):
-    """Publishes ``image_raw`` and, whenever they change, ``magnification`` and ``stage``.
+    """Publishes ``image_raw`` and, whenever they change, ``magnification``, ``stage`` and ``conditions``.
 
     Listens to ``~/stage``, ``~/move_stage`` and ``~/set_magnification``.
     """
@@ -222,6 +235,11 @@ class VirtualSem(SemNode):
         if self._position is not None and self.config.stage is not None:
             self._joints = self.endpoints.latched_publisher(JointState, self.config.stage.topic)
             self._announce_stage()
+        self._conditions = self.endpoints.latched_publisher(DiagnosticStatus, "conditions")
+        self._told: dict[str, float | str] | None = None
+        self._announce_conditions()
+        for name in ("voltage_v", "working_distance_m"):
+            self.parameters.on_change(name, lambda _value: self._announce_conditions())
         self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
         self._motion = MotionInterface(
             self, self.endpoints, self.parameters, self.reporter, self.config.stage, self
@@ -317,6 +335,7 @@ class VirtualSem(SemNode):
         pose, self._position = self._placed()
         self._scene.set_pose(pose, self._now_s())
         self._announce_stage()
+        self._announce_conditions()
 
     def _set_bits(self, bits: int) -> None:
         self._scene.set_detector(bits=bits)
@@ -447,6 +466,27 @@ class VirtualSem(SemNode):
         fill_header(message.header, self._start_ns + round(since_s * 1e9), "")
         self._joints.publish(message)
         self.reporter.note("stage_tilt_rad", position.tilt_rad)
+
+    def _announce_conditions(self) -> None:
+        """Publish how the frames are taken if that has changed."""
+        timing = self._scene.microscope.timing
+        told: dict[str, float | str] = {
+            "accelerating_voltage_v": self.parameters["voltage_v"],
+            "working_distance_m": self.parameters["working_distance_m"],
+            "scan_rotation_rad": math.radians(self.parameters["scan_rotation_deg"]),
+            "frame_time_s": timing.frame_time_s,
+            "dwell_s": timing.frame_time_s
+            * (1.0 - timing.flyback_fraction)
+            / (self.parameters["width"] * self.parameters["height"] * timing.line_averages),
+            "detector": "simulated",
+            "maker": "semcal_ros",
+            "model": self.parameters["preset"],
+        }
+        if told != self._told:
+            self._told = told
+            message = DiagnosticStatus()
+            fill_conditions(message, told, self.config.name)
+            self._conditions.publish(message)
 
     def _take_frame(self) -> None:
         # The frame that has just been completed: the stamp is the time at which its first pixel was scanned.

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,9 +44,11 @@ from semcal_ros.core.calibration.views import (
     SquareAssignment,
     assign_squares,
 )
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
+from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import (
     CollectedViews,
     collect_views,
@@ -63,7 +65,11 @@ from semcal_ros.workflows.inputs import (
     open_source,
     resolve_config,
 )
-from semcal_ros.workflows.provenance import describe_provenance
+from semcal_ros.workflows.provenance import (
+    describe_computation,
+    describe_provenance,
+    sum_up_conditions,
+)
 from semcal_ros.workflows.workers import open_workers
 
 __all__ = [
@@ -212,12 +218,16 @@ def calibrate_found(
     squares_m: Sequence[float],
     options: CalibrationOptions | None = None,
     grid_certificate: str = "",
+    provenance: Provenance | None = None,
+    conditions: Mapping[str, Conditions | None] | None = None,
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> RecordingCalibration:
     """Calibrate from found corners.
 
     Views that ``options.untilted`` lists may be named by their number or file, too.
-    ``grid_certificate`` is kept in the statistics. ``on_stage`` is called with what begins and the
+    ``grid_certificate`` is kept in the statistics. ``provenance`` is what is known of the origin,
+    ``conditions`` how each view was taken, by its name; the names and conditions of the views that are used are
+    added, and the date. ``on_stage`` is called with what begins and the
     fraction of the work that is done.
     """
     options = options or CalibrationOptions()
@@ -267,7 +277,14 @@ def calibrate_found(
         **({"grid_certificate": grid_certificate} if grid_certificate else {}),
         "warnings": warnings,
     }
-    model = replace(result.model, statistics=statistics)
+    taken = conditions or {}
+    seen = {view.name: (taken.get(view.name), view.stage) for view in result.views}
+    origin = replace(
+        provenance or describe_computation(),
+        views=tuple(seen),
+        conditions=sum_up_conditions(seen.values()),
+    )
+    model = replace(result.model, statistics=statistics, provenance=origin)
     result = replace(result, model=model, warnings=tuple(warnings))
     return RecordingCalibration(Calibration.from_model(model), result, collected)
 

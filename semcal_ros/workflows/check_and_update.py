@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 from semcal_ros.calibration import Calibration
@@ -30,6 +31,8 @@ from semcal_ros.core.calibration.update import (
     update_calibration,
 )
 from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
+from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.calibrate import name_untilted, options_for
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
@@ -44,7 +47,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
-from semcal_ros.workflows.provenance import describe_computation
+from semcal_ros.workflows.provenance import describe_computation, describe_provenance
 
 __all__ = ["RecordingCheck", "RecordingUpdate", "check", "check_found", "update", "update_found"]
 
@@ -187,19 +190,25 @@ def update(
     model = require_calibration(calibration)
     seen = _see(model, source, config, squares_m, untilted, pattern, on_progress)
     on_progress("adjusting", 0, None)
-    result = _update(model, seen, ageing)
+    used = {view.name: seen.frames[view.name] for view in seen.views}
+    result = _update(model, seen, ageing, describe_provenance(source, seen.config, used))
     return RecordingUpdate(Calibration.from_model(result.model), result, seen.rejected, seen.notes)
 
 
 def update_found(
-    calibration: Calibration, found: Sequence[FoundView], config: MicroscopeConfig
+    calibration: Calibration,
+    found: Sequence[FoundView],
+    config: MicroscopeConfig,
+    provenance: Provenance | None = None,
 ) -> CalibrationUpdate:
-    """As :func:`update`, from found corners."""
+    """As :func:`update`, from found corners; ``provenance`` is that of the views."""
     seen = _arrange(found, (), config, config.squares_m, "auto", ())
-    return _update(calibration, seen, DEFAULT_AGEING)
+    return _update(calibration, seen, DEFAULT_AGEING, provenance or describe_computation())
 
 
-def _update(model: Calibration, seen: _Seen, ageing: float) -> CalibrationUpdate:
+def _update(
+    model: Calibration, seen: _Seen, ageing: float, provenance: Provenance
+) -> CalibrationUpdate:
     result = update_calibration(
         model,
         seen.views,
@@ -209,7 +218,7 @@ def _update(model: Calibration, seen: _Seen, ageing: float) -> CalibrationUpdate
         ageing=ageing,
     )
     # Recording and conditions of the old one are not those of the new one.
-    return replace(result, model=replace(result.model, provenance=describe_computation()))
+    return replace(result, model=replace(result.model, provenance=provenance))
 
 
 class _Seen(NamedTuple):
@@ -221,6 +230,9 @@ class _Seen(NamedTuple):
     axis: StageAxis
     rejected: int
     notes: tuple[str, ...]
+    config: MicroscopeConfig
+    # Without their pixels, by the names of the views; none for views that were found elsewhere.
+    frames: Mapping[str, RecordedFrame]
 
 
 def _see(
@@ -235,13 +247,21 @@ def _see(
     """Find the grid in a recording."""
     microscope = resolve_config(config, model)
     sizes = microscope.squares_m if squares_m is None else check_positives(squares_m, "squares_m")
+    frames: dict[str, RecordedFrame] = {}
+
+    def note_frame(name: str, frame: RecordedFrame) -> None:
+        frames[name] = replace(frame, image=frame.image[:0])
+
     with open_source(source, microscope) as opened:
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
-            named_frames(opened), on_progress=advance, keep_images=False, pattern=pattern
+            named_frames(opened, note_frame),
+            on_progress=advance,
+            keep_images=False,
+            pattern=pattern,
         )
         notes = opened.notes
-    return _arrange(found, rejected, microscope, sizes, untilted, notes)
+    return _arrange(found, rejected, microscope, sizes, untilted, notes, frames)
 
 
 def _arrange(
@@ -251,6 +271,7 @@ def _arrange(
     squares_m: Sequence[float],
     untilted: str | Sequence[str],
     notes: tuple[str, ...],
+    frames: Mapping[str, RecordedFrame] = MappingProxyType({}),
 ) -> _Seen:
     """Give found corners their places on the grid."""
     collected = collect_views(
@@ -263,4 +284,6 @@ def _arrange(
         options_for(microscope).axis,
         len(collected.rejected),
         notes,
+        microscope,
+        frames,
     )

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist
 from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import JointState
@@ -310,8 +311,14 @@ def test_a_file_that_became_a_link_to_elsewhere_is_not_written(
 
 def test_a_calibration_is_checked_and_renewed_by_new_views(calibrated: Session) -> None:
     calibrated.call("clear")
+    publisher = calibrated.peer.node.create_publisher(DiagnosticStatus, "conditions", LATCHED)
+    calibrated.peer.wait_for(lambda: publisher.get_subscription_count() == 1, "the subscription")
+    pairs = {"accelerating_voltage_v": "5000", "working_distance_m": "near", "serial": "7"}
+    values = [KeyValue(key=key, value=value) for key, value in pairs.items()]
+    publisher.publish(DiagnosticStatus(values=values))
     for index in (0, 1, VIEWS, VIEWS + 1):
         calibrated.add_view(index)
+    calibrated.peer.node.destroy_publisher(publisher)
     answer = calibrated.call("check")
     assert answer.success, answer.message
     assert answer.message.startswith("valid: nm per px off by ")
@@ -322,6 +329,16 @@ def test_a_calibration_is_checked_and_renewed_by_new_views(calibrated: Session) 
     calibrated.peer.wait_for(lambda: len(calibrated.texts) > before, "the renewed calibration")
     renewed = Calibration.loads(calibrated.texts[-1].data)
     assert [entry["views"] for entry in renewed.statistics["updates"]] == [4]
+    # The first one, without a message, has neither conditions nor a recording.
+    first, origin = Calibration.loads(calibrated.texts[0].data).provenance, renewed.provenance
+    assert not first.conditions.keys() & {"acceleration_voltage_v", "serial_number"}
+    assert first.configuration == origin.configuration == "virtual SEM"
+    assert len(first.views) > len(origin.views) == 4
+    assert (first.recording, origin.recording) == ("", "")
+    assert origin.calibrated >= first.calibrated > "2026"
+    assert origin.conditions["acceleration_voltage_v"] == (5000.0, 5000.0)
+    assert origin.conditions["serial_number"] == ("7",)
+    assert "working_distance_m" not in origin.conditions
     # Said to be at another magnification than they have, views contradict it.
     calibrated.call("clear")
     calibrated.show(PLAN.render(VIEWS), 1.3 * PLAN.frames[VIEWS].magnification)

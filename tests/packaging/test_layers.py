@@ -65,7 +65,7 @@ CORE_MAY_IMPORT = {
     "arrays": {"errors"},
     "caches": set(),
     "wording": set(),
-    "camera": {"errors", "arrays"},
+    "camera": {"errors", "arrays", "wording"},
     "corners": {"errors", "arrays"},
     "registration": {"errors", "arrays", "caches"},
     "rectification": {"errors", "arrays", "caches", "camera"},

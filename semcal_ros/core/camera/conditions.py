@@ -20,6 +20,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from semcal_ros.core.wording import printable
+
 __all__ = [
     "FILE_NAMES",
     "ConditionDifference",
@@ -108,7 +110,7 @@ def describe_condition(name: str, values: Sequence[str] | Sequence[float]) -> tu
     """
     label, show = _SHOWN.get(FILE_NAMES.get(name, name), (name.replace("_", " "), str))
     if all(isinstance(value, str) for value in values):
-        return label, ", ".join(map(str, values))
+        return label, printable(", ".join(map(str, values)), 300)
     return label, " to ".join(dict.fromkeys(show(float(value)) for value in values))
 
 

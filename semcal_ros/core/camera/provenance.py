@@ -19,7 +19,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Provenance"]
+from semcal_ros.core.camera.conditions import describe_condition
+from semcal_ros.core.wording import printable
+
+__all__ = ["NOT_RECORDED", "Provenance"]
+
+NOT_RECORDED = "not recorded"
+"""What people read in the place of what is not known."""
+
+# The microscope is named by these alone, without a label.
+_MICROSCOPE = ("maker", "model", "serial_number")
+# Of interest with the views, not with the microscope.
+_OF_VIEWS = ("beam", "stage_tilt_rad", "stage_rotation_rad", "frame_interval_s")
 
 
 @dataclass(frozen=True)
@@ -53,3 +64,33 @@ class Provenance:
     configuration_sha256: str = ""
     views: tuple[str, ...] = ()
     conditions: Mapping[str, tuple[str, ...] | tuple[float, ...]] = field(default_factory=dict)
+
+    def describe_origin(self) -> str:
+        """When, with what, and from what it was computed, in one line."""
+        parts = [
+            f"{self.calibrated} UTC" if self.calibrated else "",
+            f"recording {self.recording}" if self.recording else "",
+            f"configuration {self.configuration}" if self.configuration else "",
+            f"semcal_ros {self.software_version}" if self.software_version else "",
+        ]
+        return printable(", ".join(filter(None, parts))) or NOT_RECORDED
+
+    def describe_microscope(self) -> str:
+        """Maker, model and serial number of the microscope, in one line."""
+        known = [" or ".join(map(str, self.conditions.get(name, ()))) for name in _MICROSCOPE]
+        return printable(" ".join(filter(None, known))) or NOT_RECORDED
+
+    def describe_conditions(self) -> str:
+        """The conditions of the beam and the scan, in one line."""
+        parts = [
+            " ".join(describe_condition(name, values))
+            for name, values in self.conditions.items()
+            if name not in (*_MICROSCOPE, *_OF_VIEWS)
+        ]
+        return ", ".join(parts) or NOT_RECORDED
+
+    def describe(self) -> str:
+        """All three, in one line for a log."""
+        parts = (self.describe_origin(), self.describe_microscope(), self.describe_conditions())
+        known = [part for part in parts if part != NOT_RECORDED]
+        return printable(", ".join(known), 300) or NOT_RECORDED

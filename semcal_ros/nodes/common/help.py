@@ -51,7 +51,7 @@ class ExecutableHelp:
 EXECUTABLES = {
     "stream_corrector": ExecutableHelp(
         "Removes drift and distortion from the live stream in one interpolation.",
-        "image_raw, magnification, calibration",
+        "image_raw, magnification, calibration, conditions",
         "image_rect, camera_info, projection_stamped, drift, drift_velocity",
         "~/reset",
         "-p config:=jsm820 -p calibration:=cal.yaml",
@@ -65,21 +65,21 @@ EXECUTABLES = {
     ),
     "rectifier": ExecutableHelp(
         "Removes distortion from the live stream.",
-        "image_raw or image_stabilized, magnification, calibration",
+        "image_raw or image_stabilized, magnification, calibration, conditions",
         "image_rect, camera_info, projection_stamped",
         "",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
     "parameter_server": ExecutableHelp(
         "Serves the calibration at any magnification, on topics and as parameters.",
-        "magnification, calibration",
+        "magnification, calibration, conditions",
         "calibration, camera_info, projection; parameters such as `p@5250`",
         "~/reload",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
     "calibration_server": ExecutableHelp(
         "Collects views of the grid from the live stream, and calibrates from them.",
-        "image_raw, magnification, stage",
+        "image_raw, magnification, stage, conditions",
         "calibration, ~/progress, ~/overlay",
         "~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/check, ~/update, ~/save, ~/clear",
         "-p config:=jsm820 -p output:=live.yaml",
@@ -87,7 +87,7 @@ EXECUTABLES = {
     "virtual_sem": ExecutableHelp(
         "A simulated live microscope with a stage and a magnification knob.",
         "~/stage, ~/move_stage, ~/set_magnification",
-        "image_raw, magnification, stage, ~/motion",
+        "image_raw, magnification, stage, conditions, ~/motion",
         "~/start, ~/stop",
         "-p specimen:=gold -p drift:=slow -p magnification:=5000.0",
     ),

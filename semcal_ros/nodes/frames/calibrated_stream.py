@@ -30,6 +30,7 @@ from semcal_ros.nodes.common.parameters import (
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.compressed import compressed_parameters
+from semcal_ros.nodes.frames.conditions import ON_MISMATCH, ConditionsWatch
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 
@@ -44,6 +45,7 @@ _WITHOUT_CAMERA = (
         choices=("pass", "drop"),
     ),
     OUT_OF_RANGE,
+    ON_MISMATCH,
 )
 
 
@@ -75,7 +77,11 @@ class CalibratedStreamNode(StreamNode):
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._range = RangeWatch(self.reporter)
+        self._watch = ConditionsWatch(
+            self.endpoints, self.reporter, lambda: self.calibration.current
+        )
         self._dropped = 0
+        self._refused = 0
         # Only the latest: most frames have the magnification of the frame before.
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
 
@@ -106,6 +112,11 @@ class CalibratedStreamNode(StreamNode):
             self._dropped += 1
             self.reporter.note("frames_uncalibrated", self._dropped)
             return
+        self._watch.check()
+        if self._watch.differs and self.parameters["on_mismatch"] == "refuse":
+            self._refused += 1
+            self.reporter.note("frames_refused", self._refused)
+            return
         extrapolated = camera is not None and not camera.in_range
         if frame.mixed or (extrapolated and self.parameters["out_of_range"] == "flag"):
             camera = None
@@ -117,9 +128,9 @@ class CalibratedStreamNode(StreamNode):
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report a calibration that is missing, or that does not cover the
-        magnification, or whose scale is in doubt.
+        magnification, or whose scale is in doubt, or that was made under other conditions.
         """
         found = super().conditions()
         if self.calibration.current is not None and self._range.is_outside:
             found.append("magnification outside the calibrated range")
-        return found + self.calibration.conditions()
+        return found + self.calibration.conditions() + self._watch.conditions()

@@ -303,7 +303,8 @@ class CalibrationInput:
         self._config = replace(self._node_config, display_width_m=calibration.display_width_m)
         low, high = calibration.magnification_range
         digest = calibration_digest(loaded.text)
-        text = f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}"
+        made = calibration.provenance.describe()
+        text = f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}; made: {made}"
         if displaced is not None and source == _TOPIC != displaced.source:
             self._reporter.warn(f"{text}; it displaces {displaced.source}")
         else:

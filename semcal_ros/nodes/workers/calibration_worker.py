@@ -22,16 +22,18 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationOptions
 from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.core.wording import counted
+from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
 
@@ -55,7 +57,9 @@ _NICE = 5
 
 @dataclass(frozen=True)
 class CalibrationJob:
-    """Everything that a calibration needs; the images of the views are not needed. Notes go into the summary."""
+    """Everything that a calibration needs; the images of the views are not needed. Notes go into the summary,
+    provenance and conditions (by the names of the views) into the file.
+    """
 
     views: tuple[FoundView, ...]
     display_width_m: float
@@ -63,6 +67,8 @@ class CalibrationJob:
     options: CalibrationOptions
     grid_certificate: str = ""
     notes: tuple[str, ...] = ()
+    provenance: Provenance | None = None
+    conditions: Mapping[str, Conditions | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,8 @@ def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> J
             squares_m=job.squares_m,
             options=job.options,
             grid_certificate=job.grid_certificate,
+            provenance=job.provenance,
+            conditions=job.conditions,
             on_stage=on_stage,
         )
     except SemcalError as error:

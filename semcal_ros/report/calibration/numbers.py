@@ -26,6 +26,8 @@ from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.findings import find_weaknesses
 from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.camera.conditions import describe_condition
+from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
 __all__ = [
@@ -171,6 +173,7 @@ def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:
             "converged" if result.fit.converged else "not converged",
         ),
     ]
+    pairs += _collect_origin(model.provenance)
     squares = statistics.get("squares_m")
     if squares:
         pairs.append(("Squares of the grid", ", ".join(f"{1e6 * s:g} µm" for s in squares)))
@@ -190,6 +193,20 @@ def collect_facts(result: CalibrationResult) -> list[tuple[str, str]]:
             )
         )
     return [(name, remove_control_characters(value)) for name, value in pairs]
+
+
+def _collect_origin(origin: Provenance) -> list[tuple[str, str]]:
+    """Where the calibration comes from; what is not known is said to be not recorded."""
+    recorded = " to ".join(dict.fromkeys(origin.recorded))
+    pairs = [
+        ("Calibrated", origin.describe_origin()),
+        ("Views recorded", f"{recorded} UTC" if recorded else NOT_RECORDED),
+        ("SHA-256 of the recording", origin.recording_sha256 or NOT_RECORDED),
+    ]
+    conditions = [describe_condition(name, values) for name, values in origin.conditions.items()]
+    if not conditions:
+        return [*pairs, ("Conditions", NOT_RECORDED)]
+    return pairs + [(label[:1].upper() + label[1:], text) for label, text in conditions]
 
 
 def _collect_fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
