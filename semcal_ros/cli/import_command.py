@@ -22,7 +22,7 @@ import click
 
 from semcal_ros.cli.options import PATH, overwrite_option
 from semcal_ros.cli.output import show_progress
-from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.cli.recording_input import recording_input, refuse_mask
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.images.to_bag import import_images
 from semcal_ros.files.recordings import RecordedFiles
@@ -47,6 +47,7 @@ def command(
     Example:
       semcal import tiffs/ recordings/from_tiff
     """
+    refuse_mask(recording, "--mask for the commands that read the bag")
     with show_progress() as on_progress:
         done = import_images(
             recording,

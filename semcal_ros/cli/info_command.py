@@ -25,7 +25,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
-from semcal_ros.cli.recording_input import recording_input
+from semcal_ros.cli.recording_input import recording_input, refuse_mask
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.conditions import describe_condition, format_time
 from semcal_ros.core.camera.provenance import NOT_RECORDED
@@ -60,6 +60,7 @@ def command(recording: RecordedFiles, config: MicroscopeConfig, as_json: bool) -
       semcal info 'scan_*.tif' --json
       semcal info cal.yaml
     """
+    refuse_mask(recording, "--mask for the commands that measure")
     if len(recording.paths) == 1 and _is_calibration(recording.paths[0]):
         described = describe_calibration(Calibration.load(recording.paths[0]))
         if as_json:

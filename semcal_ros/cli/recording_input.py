@@ -31,7 +31,7 @@ from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import resolve_config
 
-__all__ = ["check_outputs", "check_spared", "recording_input", "recordings_input"]
+__all__ = ["check_outputs", "check_spared", "recording_input", "recordings_input", "refuse_mask"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
@@ -103,6 +103,12 @@ _READING_OPTIONS = (
         metavar="X,Y,W,H",
         help="Part of each image that is used, px.",
     ),
+    click.option(
+        "--mask",
+        type=PATH,
+        metavar="FILE",
+        help="Image of the images' size, black where they do not show the specimen: nothing is measured there.",
+    ),
 )
 
 
@@ -132,6 +138,7 @@ def _reading(command: Command, *, several: bool) -> Command:
         frame_time: float | None,
         databar_rows: int | None,
         roi: tuple[int, int, int, int] | None,
+        mask: Path | None,
         **others: Any,
     ) -> Any:
         microscope = resolve_config(config, frame_time_s=frame_time)
@@ -144,6 +151,7 @@ def _reading(command: Command, *, several: bool) -> Command:
                 databar_rows,
                 roi,
                 display_width,
+                mask,
             )
             for part in (_split(paths) if several else [paths])
         ]
@@ -164,6 +172,20 @@ def _split(paths: tuple[Path, ...]) -> list[tuple[Path, ...]]:
     if all(path.is_file() and is_image_file(path) for path in paths):
         return [paths]
     return [(path,) for path in paths]
+
+
+def refuse_mask(recording: RecordedFiles, instead: str) -> None:
+    """Refuse ``--mask`` for a command that measures nothing in the images.
+
+    Raises
+    ------
+    InvalidValueError
+        A mask was given.
+    """
+    if recording.mask is not None:
+        raise InvalidValueError(
+            "--mask for a command that measures nothing in the images", expected=instead
+        )
 
 
 def check_outputs(outputs: Sequence[Output], *, recording: RecordedFiles | None = None) -> None:

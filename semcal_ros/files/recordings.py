@@ -35,7 +35,7 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
-from semcal_ros.core.arrays import check_range
+from semcal_ros.core.arrays import Mask, check_range
 from semcal_ros.core.calibration.nominal_scale import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
@@ -52,6 +52,7 @@ from semcal_ros.files.images.image_series import (
     find_image_files,
     list_image_series,
 )
+from semcal_ros.files.images.mask import fill_masked, fit_mask, read_mask
 from semcal_ros.files.tiff.sem_image import Conditions
 
 if TYPE_CHECKING:
@@ -111,6 +112,9 @@ class RecordedFiles:
         width, so that the pixel size stays.
     display_width_m
         Display width that ``magnification`` refers to, where it is not that of the configuration or calibration.
+    mask
+        An image of the size of the images before ``roi``, black where they do not show the specimen. There, no grid is
+        looked for and no drift measured; images that are written keep these pixels.
 
     Raises
     ------
@@ -125,6 +129,7 @@ class RecordedFiles:
     databar_rows: int | None = None
     roi: tuple[int, int, int, int] | None = None
     display_width_m: float | None = None
+    mask: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high, unit, do) in _RANGES.items():
@@ -189,6 +194,8 @@ class RecordedFrame:
         Name of the file that the frame comes from, for a folder of images; else empty.
     conditions
         How the image was taken, where its file or the recording says it.
+    mask
+        (h, w) true where the image shows the specimen, or None for all of it.
     """
 
     image: NDArray[Any]
@@ -200,6 +207,12 @@ class RecordedFrame:
     stage: StageReading | None = None
     file_name: str = ""
     conditions: Conditions | None = None
+    mask: Mask | None = None
+
+    @property
+    def visible(self) -> NDArray[Any]:
+        """The image to measure in: outside the mask, its surroundings continue without texture."""
+        return self.image if self.mask is None else fill_masked(self.image, self.mask)
 
 
 @dataclass(frozen=True)
@@ -272,10 +285,12 @@ class Recording(ABC):
         config: MicroscopeConfig,
         *,
         roi: tuple[int, int, int, int] | None = None,
+        mask: str | os.PathLike[str] | None = None,
     ) -> None:
         self.path = path
         self.config = config
         self._roi = roi
+        self._mask = None if mask is None else read_mask(mask)
         self._notes: list[str] = []
         self._pass_notes: list[str] = []
         self._rejected: list[RejectedFrame] = []
@@ -326,6 +341,9 @@ class Recording(ABC):
         self._pass_notes.clear()
         count = 0
         for frame in self._frames():
+            if self._mask is not None:
+                height, width = frame.image.shape[:2]
+                frame = replace(frame, mask=fit_mask(self._mask, (height, width)))
             if self._roi is not None:
                 try:
                     frame = _crop(frame, self._roi)
@@ -428,14 +446,16 @@ def _crop(frame: RecordedFrame, roi: tuple[int, int, int, int]) -> RecordedFrame
     full = frame.image.shape[:2]
     _check_region(roi, (full[1], full[0]))
     image = frame.image[y : y + height, x : x + width]
-    return replace(frame, image=image, magnification=frame.magnification * full[1] / width)
+    mask = None if frame.mask is None else frame.mask[y : y + height, x : x + width]
+    magnification = frame.magnification * full[1] / width
+    return replace(frame, image=image, magnification=magnification, mask=mask)
 
 
 class _BagRecording(Recording):
     """Images and magnifications of a rosbag2 recording."""
 
     def __init__(self, path: Path, config: MicroscopeConfig, given: RecordedFiles) -> None:
-        super().__init__(path, config, roi=given.roi)
+        super().__init__(path, config, roi=given.roi, mask=given.mask)
         self._given = given
         rows = given.databar_rows
         self._databar_rows = config.image.databar_rows if rows is None else rows
@@ -637,7 +657,7 @@ class _ImageRecording(Recording):
     def __init__(
         self, path: Path, config: MicroscopeConfig, series: ImageSeries, given: RecordedFiles
     ) -> None:
-        super().__init__(path, config, roi=given.roi)
+        super().__init__(path, config, roi=given.roi, mask=given.mask)
         self._given = given
         self._series = series
         self._notes.extend(series.notes)

@@ -144,7 +144,7 @@ def named_frames(
 ) -> Iterator[NamedFrame]:
     """Each usable frame of an open recording, with the name ``frame N``; ``on_frame`` is told of each."""
     for index, frame in enumerate(recording.frames()):
-        grey = to_gray(frame.image, frame.encoding)
+        grey = to_gray(frame.visible, frame.encoding)
         on_frame(f"frame {index}", frame)
         yield NamedFrame(
             f"frame {index}",

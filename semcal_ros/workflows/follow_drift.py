@@ -87,7 +87,7 @@ class DriftFollower:
         self, frame: RecordedFrame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
     ) -> DriftUpdate:
         """Update with the next frame and return its drift."""
-        update = self.tracker.update(frame.image, time_s, camera, scan)
+        update = self.tracker.update(frame.visible, time_s, camera, scan)
         if self.history is not None:
             self.updates.append(update)
         return update

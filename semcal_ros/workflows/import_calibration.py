@@ -47,7 +47,8 @@ def import_calibration(
     ----------
     table
         A ``.csv``, ``.parquet`` or ``.xlsx`` file with a column of magnifications and one of pixel sizes, whose header
-        names the unit, such as ``nm per px``; optionally one of their 1-sigma, in the same unit or ``%``.
+        names the unit, such as ``nm per px``; optionally one of their 1-sigma, in ``%``, in
+        the unit that its header names, or else in that of the sizes.
     image_size
         (width, height) of the images whose pixels they are, px.
     sigma
@@ -72,6 +73,11 @@ def import_calibration(
     ]
     size = _find(path, columns, sized, "nm per px")
     unit = _METRES[_UNIT.search(lower[size])[1]]  # type: ignore[index]  # it was found there
+    percent, spread_unit = False, unit
+    if spreads:
+        percent = "%" in columns[spreads[0]] or "percent" in lower[spreads[0]]
+        named = _UNIT.search(lower[spreads[0]])
+        spread_unit = unit if named is None else _METRES[named[1]]
     known = []
     for number, row in enumerate(rows, start=2):
         where = f"{path}, row {number}: "
@@ -81,8 +87,7 @@ def import_calibration(
         own = sigma
         if spreads and len(row) > spreads[0] and row[spreads[0]].strip():
             spread = _number(row[spreads[0]], where)
-            percent = "%" in columns[spreads[0]] or "percent" in lower[spreads[0]]
-            own = 0.01 * spread if percent else unit * spread / value_m
+            own = 0.01 * spread if percent else spread_unit * spread / value_m
         known.append(KnownPixelSize(_number(row[magnification], where), value_m, own, where))
     model = make_nominal_calibration(known, image_size, display_width_m)
     origin = replace(describe_computation(), recording=f"{path.name} (a table of pixel sizes)")
@@ -100,6 +105,11 @@ def _find(path: Path, columns: list[str], found: list[int], example: str) -> int
 
 def _number(text: str, where: str) -> float:
     clean = text.strip().removesuffix("x").removesuffix("×").replace("\u00a0", "").replace(" ", "")
+    if re.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+", clean):
+        raise InvalidValueError(
+            f"{where}{text!r}, a thousand or a decimal number",
+            expected="a number without separators of thousands",
+        )
     if clean.count(",") == 1 and "." not in clean:
         clean = clean.replace(",", ".")
     try:

@@ -270,7 +270,7 @@ class _Run:
 
     def add(self, frame: RecordedFrame, microscope: MicroscopeConfig) -> None:
         first_ns = self.stamps_ns[0] if self.stamps_ns else frame.stamp_ns
-        self.images.append(np.array(to_gray(frame.image, frame.encoding)))
+        self.images.append(np.array(to_gray(frame.visible, frame.encoding)))
         self.stamps_ns.append(frame.stamp_ns)
         self.times_s.append(start_time_s(frame, first_ns, microscope))
 

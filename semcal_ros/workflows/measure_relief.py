@@ -197,7 +197,7 @@ def measure_relief(
         notes.append("the calibration gives the pixel size; distortion is left in the pictures")
     on_progress("measuring heights", 0, None)
     found = measure_heights(
-        [to_gray(frame.image, frame.encoding) for frame in frames],
+        [to_gray(frame.visible, frame.encoding) for frame in frames],
         tilts,
         size,
         pixel_size_sigma_m=sigma or 0.0,

@@ -239,7 +239,7 @@ def _track(
         first_ns = frame.stamp_ns if first_ns is None else first_ns
         camera = camera_for(frame, model, opened.config)
         outside += not camera.in_range
-        grey = to_gray(frame.image, frame.encoding)
+        grey = to_gray(frame.visible, frame.encoding)
         tracker.add(grey, camera, start_time_s(frame, first_ns, opened.config))
         advance(1)
     return outside
@@ -261,7 +261,7 @@ def _read_images(opened: Recording, keyframes: list[TrackKeyframe]) -> list[Trac
     for index, frame in zip(range(last + 1), opened.frames(), strict=False):
         number = wanted.get(index)
         if number is not None:
-            image = to_gray(frame.image, frame.encoding).copy()
+            image = to_gray(frame.visible, frame.encoding).copy()
             filled[number] = replace(keyframes[number], image=image)
     return filled
 

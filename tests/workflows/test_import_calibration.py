@@ -77,6 +77,12 @@ def test_tables_as_people_write_them(tmp_path: Path, text: str) -> None:
     assert made.at(5000.0).pixel_size_m[0] == pytest.approx(46.8e-9)
 
 
+def test_a_sigma_has_the_unit_of_its_header(tmp_path: Path) -> None:
+    for text in ("mag,nm/px,sigma (um)\n1000,120,0.0012\n", "mag,nm/px,sigma\n1000,120,1.2\n"):
+        camera = import_calibration(table(tmp_path, text), image_size=SIZE, sigma=0.5).at(1000.0)
+        assert camera.pixel_size_sigma_m[0] == pytest.approx(1.2e-9, rel=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".xlsx"])
 def test_every_kind_of_table(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"sizes{suffix}"
@@ -98,6 +104,7 @@ def test_every_kind_of_table(tmp_path: Path, suffix: str) -> None:
         ("mag,nm/px\n500,470\n500,430\n", "row 3: 430 and 470 nm per px at 500x"),
         ("mag,nm/px\n500,-470\n", "row 2: pixel size -4.7e-07; expected a number above 0"),
         ("mag,nm/px\n500,abc\n", "row 2: 'abc'; expected a number"),
+        ('mag;nm/px\n"10,000";12\n', "row 2: '10,000', a thousand or a decimal number"),
         ("mag,size\n500,470\n", "one column with a header such as nm per px"),
         ("mag,nm/px,um/px\n500,470,0.47\n", "one column with a header such as nm per px"),
         ("nm/px\n470\n", "one column with a header such as magnification"),
