@@ -35,8 +35,11 @@ __all__ = [
     "read_parameter",
 ]
 
-PARAMETER_KINDS = ("p", "k", "d", "e", "p_affine", "pixel_size", "sigma")
-"""Projection, K, distortion, its centre, affine-safe projection, pixel size, predicted error."""
+PARAMETER_KINDS = (
+    *("p", "k", "d", "e", "p_affine", "p_affine_covariance"),
+    *("pixel_size", "sigma"),
+)
+"""Projection, K, distortion, its centre, affine-safe projection and its covariance, pixel size, predicted error."""
 
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 # Characters of a wrong name that an error repeats: the error stays one line.
@@ -94,7 +97,8 @@ def continuous_value(kind: str, camera: ScanCamera) -> list[float]:
 
     Returns
     -------
-    ``p``, ``p_affine``: 12 numbers, 3 x 4 row by row. ``k``: 9, row by row. ``d``: [xi_r, xi_t].
+    ``p``, ``p_affine``: 12 numbers, 3 x 4 row by row. ``p_affine_covariance``: 144, row by row, the
+    covariance of the 12 numbers of ``p_affine``. ``k``: 9, row by row. ``d``: [xi_r, xi_t].
     ``e``: [ex, ey] in px. ``pixel_size``: [x, y] in m. ``sigma``: length of the predicted 1-sigma
     error in px at the image centre and at the corners (top left, top right, bottom left, bottom
     right).
@@ -103,7 +107,7 @@ def continuous_value(kind: str, camera: ScanCamera) -> list[float]:
     ------
     InvalidValueError
         The kind is unknown, or this camera has no such value (``p`` and ``k`` of a parallel
-        projection, ``sigma`` of a camera without covariance).
+        projection, ``sigma`` and ``p_affine_covariance`` of a camera without covariance).
     """
     values: Array
     if kind == "p":
@@ -116,6 +120,8 @@ def continuous_value(kind: str, camera: ScanCamera) -> list[float]:
         values = np.array([camera.ex, camera.ey])
     elif kind == "p_affine":
         values = camera.P_affine.reshape(-1)
+    elif kind == "p_affine_covariance":
+        values = camera.P_affine_covariance.reshape(-1)
     elif kind == "pixel_size":
         values = np.array(camera.pixel_size_m)
     elif kind == "sigma":

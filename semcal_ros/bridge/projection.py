@@ -12,11 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The affine-safe projection matrix of rectified images, as a message without and with a stamp.
+"""The affine-safe projection matrix of rectified images and its covariance, as messages without and with a stamp.
 
 ``projection`` is a std_msgs/msg/Float64MultiArray, which has no header. ``projection_stamped`` is a
 sensor_msgs/msg/Image of 3 rows and 4 columns in the encoding ``64FC1``: the one standard message that
-holds a matrix of any size and has a header, so that it pairs with its image by the stamp.
+holds a matrix of any size and has a header, so that it pairs with its image by the stamp. The covariance goes out
+beside them, as ``projection_covariance`` and ``projection_covariance_stamped`` of 12 rows and columns: subscribers of
+the matrix need not know of it.
 """
 
 from __future__ import annotations
@@ -34,12 +36,15 @@ from semcal_ros.core.errors import MessageError
 
 __all__ = [
     "fill_projection",
+    "fill_projection_covariance",
     "fill_stamped_projection",
+    "fill_stamped_projection_covariance",
+    "projection_covariance_from_message",
     "projection_from_message",
+    "stamped_projection_covariance_from_message",
     "stamped_projection_from_message",
 ]
 
-_SHAPE = (("rows", 3), ("columns", 4))
 _STAMPED_ENCODING = "64FC1"
 _STAMPED_ENCODINGS = {_STAMPED_ENCODING: PixelFormat(np.dtype(np.float64), 1)}
 
@@ -50,9 +55,24 @@ def fill_projection(message: Any, camera: ScanCamera) -> None:
 
     It is finite for every camera, parallel ones too, and its last row is ``[0 0 rho 1]``.
     """
-    stride = 12
+    _fill_array(message, camera.rectified.P_affine)
+
+
+def fill_projection_covariance(message: Any, camera: ScanCamera) -> None:
+    """Set a 12 x 12 array, row by row: the covariance of the 12 numbers of :func:`fill_projection`, in their order.
+
+    Raises
+    ------
+    InvalidValueError
+        The camera carries no covariance.
+    """
+    _fill_array(message, camera.rectified.P_affine_covariance)
+
+
+def _fill_array(message: Any, matrix: Array) -> None:
+    stride = matrix.size
     dimensions = []
-    for label, size in _SHAPE:
+    for label, size in zip(("rows", "columns"), matrix.shape, strict=True):
         dimensions.append(
             new_nested(
                 message.layout,
@@ -65,7 +85,7 @@ def fill_projection(message: Any, camera: ScanCamera) -> None:
         stride //= size
     message.layout.dim = dimensions
     message.layout.data_offset = 0
-    assign_floats(message, "data", camera.rectified.P_affine)
+    assign_floats(message, "data", matrix)
 
 
 def projection_from_message(message: Any) -> Array:
@@ -76,20 +96,36 @@ def projection_from_message(message: Any) -> Array:
     MessageError
         The array has another size or holds values that are not finite.
     """
+    return _read_array(message, "projection", (3, 4))
+
+
+def projection_covariance_from_message(message: Any) -> Array:
+    """Return the (12, 12) matrix of a message filled by :func:`fill_projection_covariance`.
+
+    Raises
+    ------
+    MessageError
+        As :func:`projection_from_message`.
+    """
+    return _read_array(message, "covariance of a projection", (12, 12))
+
+
+def _read_array(message: Any, what: str, shape: tuple[int, int]) -> Array:
+    size = shape[0] * shape[1]
     offset = whole_number(message.layout.data_offset, "data_offset")
     try:
         values = np.array(message.data, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise MessageError(
-            f"a projection of type {type(message.data).__name__}", expected="12 finite numbers"
+            f"a {what} of type {type(message.data).__name__}", expected=f"{size} finite numbers"
         ) from error
-    fits = values.ndim == 1 and 0 <= offset == values.size - 12
+    fits = values.ndim == 1 and 0 <= offset == values.size - size
     if not (fits and np.all(np.isfinite(values[offset:]))):
         raise MessageError(
-            f"a projection of {values.size} numbers from index {offset} on",
-            expected="12 finite numbers, 3 rows of 4",
+            f"a {what} of {values.size} numbers from index {offset} on",
+            expected=f"{size} finite numbers, {shape[0]} rows of {shape[1]}",
         )
-    return values[offset:].reshape(3, 4)
+    return values[offset:].reshape(shape)
 
 
 def fill_stamped_projection(
@@ -125,10 +161,43 @@ def stamped_projection_from_message(message: Any) -> Array:
     MessageError
         The message is not an image of 3 x 4 double-precision numbers, or they are not finite.
     """
+    return _read_image(message, "projection", (3, 4))
+
+
+def fill_stamped_projection_covariance(
+    message: Any, camera: ScanCamera | None, header: HeaderMessage, width: int, height: int
+) -> None:
+    """Set an image message to the matrix of :func:`fill_projection_covariance`, with the header of an image.
+
+    Parameters and an image without a camera are as for :func:`fill_stamped_projection`.
+
+    Raises
+    ------
+    InvalidValueError
+        The camera carries no covariance.
+    """
+    matrix = np.zeros((12, 12))
+    if camera is not None:
+        matrix = camera.resized(width, height).rectified.P_affine_covariance
+    fill_image(message, matrix, _STAMPED_ENCODING, header, _STAMPED_ENCODINGS)
+
+
+def stamped_projection_covariance_from_message(message: Any) -> Array:
+    """Return the (12, 12) matrix of a message filled by :func:`fill_stamped_projection_covariance`.
+
+    Raises
+    ------
+    MessageError
+        As :func:`stamped_projection_from_message`.
+    """
+    return _read_image(message, "covariance of a projection", (12, 12))
+
+
+def _read_image(message: Any, what: str, shape: tuple[int, int]) -> Array:
     matrix = image_from_message(message, _STAMPED_ENCODINGS)
-    if matrix.shape != (3, 4) or not np.all(np.isfinite(matrix)):
+    if matrix.shape != shape or not np.all(np.isfinite(matrix)):
         raise MessageError(
-            f"a projection of {matrix.shape[0]} x {matrix.shape[1]} numbers",
-            expected=f"3 rows of 4 finite numbers in {_STAMPED_ENCODING}",
+            f"a {what} of {matrix.shape[0]} x {matrix.shape[1]} numbers",
+            expected=f"{shape[0]} rows of {shape[1]} finite numbers in {_STAMPED_ENCODING}",
         )
     return np.array(matrix, dtype=np.float64)

@@ -83,6 +83,8 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
         ("drift_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", "drift rate", True),
         ("projection", "std_msgs/msg/Float64MultiArray", "projection", True),
         ("projection_stamped", _IMAGE, "projection of each image", True),
+        ("projection_covariance", "std_msgs/msg/Float64MultiArray", "its covariance", True),
+        ("projection_covariance_stamped", _IMAGE, "covariance of each projection", True),
         ("calibration", "std_msgs/msg/String", "calibration", False),
     )
     return (

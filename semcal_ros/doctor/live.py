@@ -125,6 +125,7 @@ class _Observer:
             f"{namespace}/image_rect": lambda _message: None,
             f"{namespace}/image_stabilized": lambda _message: None,
             f"{namespace}/projection_stamped": lambda _message: None,
+            f"{namespace}/projection_covariance_stamped": lambda _message: None,
         }
         self._takes.update({t.name: self._take_stage for t in topics if t.keys == "stage"})
         self._classes = {t.name: message_class(t.type) for t in topics if t.name in self._takes}

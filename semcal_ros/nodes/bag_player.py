@@ -142,7 +142,8 @@ _STEP_S = 5.0
 # Topics on which the suite publishes: played, they would come a second time, and the calibration would be replaced.
 _OUTPUTS = (
     *("calibration", "image_rect", "image_stabilized", "camera_info", "projection"),
-    *("projection_stamped", "drift", "drift_velocity"),
+    *("projection_stamped", "projection_covariance", "projection_covariance_stamped"),
+    *("drift", "drift_velocity"),
 )
 # Queue length per topic: a burst of messages with nearly the same log time goes out at once.
 _DEPTH = 10

@@ -29,7 +29,7 @@ from std_msgs.msg import Float64MultiArray, Header, String
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.bridge.projection import fill_projection
+from semcal_ros.bridge.projection import fill_projection, fill_projection_covariance
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.parameters import (
@@ -60,7 +60,7 @@ _TICK_S = 0.5
 
 
 class ParameterServer(SemNode):
-    """Publishes ``calibration``, ``camera_info`` and ``projection``, and answers ``p@5250`` and the like.
+    """Publishes ``calibration``, ``camera_info``, ``projection`` and its covariance; answers ``p@5250`` and the like.
 
     A calibration that another node publishes is taken over and republished for late subscribers.
     """
@@ -75,6 +75,9 @@ class ParameterServer(SemNode):
         self._text = self.endpoints.latched_publisher(String, "calibration")
         self._info = self.endpoints.latched_publisher(CameraInfo, "camera_info")
         self._projection = self.endpoints.latched_publisher(Float64MultiArray, "projection")
+        self._covariance = self.endpoints.latched_publisher(
+            Float64MultiArray, "projection_covariance"
+        )
         self._calibration = CalibrationInput(
             self.config,
             self.parameters,
@@ -166,8 +169,12 @@ class ParameterServer(SemNode):
         self.reporter.note("magnification", g)
 
     def _publish(self, camera: Any, width: int, height: int) -> None:
-        projection = Float64MultiArray()
+        covariance, projection = Float64MultiArray(), Float64MultiArray()
         fill_projection(projection, camera)
+        # First: who has the projection can then use its covariance at once.
+        if camera.covariance is not None:
+            fill_projection_covariance(covariance, camera)
+            self._covariance.publish(covariance)
         self._projection.publish(projection)
         self.reporter.count_published(None)
         # A node that publishes the camera of every image takes precedence; two sources would break its pairs.

@@ -265,7 +265,9 @@ class VisualServo(SemNode):
         self._shortest_s = min(self._shortest_s, self._interval_s)
         try:
             projection = choose_projection(frame.k, frame.projections)
-            camera = PlaneCamera.from_projection(projection, self.parameters["height_m"])
+            camera = PlaneCamera.from_projection(
+                projection, self.parameters["height_m"], frame.covariance
+            )
         except NODE_ERRORS as error:
             self.reporter.warn_seldom(str(error))
             return self._servo.stop(ServoStatus.NOT_READY, " ".join(str(error).split()))

@@ -29,8 +29,12 @@ import pytest
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.projection import (
     fill_projection,
+    fill_projection_covariance,
     fill_stamped_projection,
+    fill_stamped_projection_covariance,
+    projection_covariance_from_message,
     projection_from_message,
+    stamped_projection_covariance_from_message,
     stamped_projection_from_message,
 )
 from semcal_ros.core.arrays import Array
@@ -194,3 +198,35 @@ def test_a_stamped_projection_must_be_finite(header: Any, camera: ScanCamera) ->
     message.data[:8] = np.array([np.nan]).view(np.uint8)
     with pytest.raises(MessageError, match="finite"):
         stamped_projection_from_message(message)
+
+
+# -- the covariance of the projection ---------------------------------------------------------------
+
+
+def test_a_covariance_round_trip(new: New, header: Any, camera: ScanCamera) -> None:
+    known = replace(camera, covariance=np.diag(np.arange(1.0, 11.0)))
+    message = new(ARRAY)
+    fill_projection_covariance(message, known)
+    message = through_the_wire(message)
+    assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
+        ("rows", 12, 144),
+        ("columns", 12, 12),
+    ]
+    expected = known.rectified.P_affine_covariance
+    np.testing.assert_array_equal(projection_covariance_from_message(message), expected)
+    with pytest.raises(MessageError, match="12 finite numbers"):
+        projection_from_message(message)
+    image = new(IMAGE)
+    fill_stamped_projection_covariance(image, known, header, 1024, 768)
+    image = through_the_wire(image)
+    assert (image.encoding, image.height, image.width, image.step) == ("64FC1", 12, 12, 96)
+    np.testing.assert_array_equal(
+        stamped_projection_covariance_from_message(image),
+        known.resized(1024, 768).rectified.P_affine_covariance,
+    )
+    empty, matrix = new(IMAGE), new(IMAGE)
+    fill_stamped_projection_covariance(empty, None, header, 512, 512)
+    assert not stamped_projection_covariance_from_message(through_the_wire(empty)).any()
+    fill_stamped_projection(matrix, known, header, 512, 512)
+    with pytest.raises(MessageError, match="12 rows of 12"):
+        stamped_projection_covariance_from_message(through_the_wire(matrix))

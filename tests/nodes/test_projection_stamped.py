@@ -21,9 +21,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Float64MultiArray
 
-from semcal_ros.bridge.projection import stamped_projection_from_message
+from semcal_ros.bridge.projection import (
+    projection_covariance_from_message,
+    stamped_projection_covariance_from_message,
+    stamped_projection_from_message,
+)
 from tests.helpers.node_scenes import (
     SIZE,
     image_message,
@@ -81,3 +85,41 @@ def test_without_a_calibration_the_projection_is_zero(peer: Peer) -> None:
         peer.wait_for(lambda: images and matrices, "the frame")
     assert matrices[0].header == images[0].header
     assert not stamped_projection_from_message(matrices[0]).any()
+
+
+def test_its_covariance_goes_beside_it(peer: Peer, tmp_path: Path) -> None:
+    CALIBRATION.save(tmp_path / "cal.yaml")
+    image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
+    magnification = peer.node.create_publisher(Float64, "magnification", LATCHED)
+    magnification.publish(magnification_message(2000.0))
+    images = peer.collect(Image, "image_rect")
+    matrices = peer.collect(Image, "projection_covariance_stamped")
+    latched = peer.collect(Float64MultiArray, "projection_covariance", LATCHED)
+    given = {"calibration": tmp_path / "cal.yaml"}
+    with running("rectifier", given), running("parameter_server", given):
+        peer.wait_heard("/sem/rectifier", "image_rect", "projection_covariance_stamped")
+        peer.wait_for(lambda: image.get_subscription_count() == 1, "the subscription")
+
+        def came() -> bool:
+            image.publish(image_message(texture(size=2 * SIZE), stamp_s=7.0))
+            peer.spin(0.1)
+            return bool(images and matrices)
+
+        peer.wait_for(came, "a frame")
+        peer.wait_for(lambda: latched, "the one of the magnification")
+        (value,) = peer.get_parameters("/sem/parameter_server", "p_affine_covariance@2000")
+    assert matrices[0].header == images[0].header
+    camera = CALIBRATION.at(2000.0)
+    np.testing.assert_allclose(
+        stamped_projection_covariance_from_message(matrices[0]),
+        camera.resized(2 * SIZE, 2 * SIZE).rectified.P_affine_covariance,
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(
+        projection_covariance_from_message(latched[-1]),
+        camera.rectified.P_affine_covariance,
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(
+        np.reshape(value.double_array_value, (12, 12)), camera.P_affine_covariance, rtol=1e-9
+    )

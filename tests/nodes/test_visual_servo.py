@@ -32,7 +32,11 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift
-from semcal_ros.bridge.projection import fill_projection, fill_stamped_projection
+from semcal_ros.bridge.projection import (
+    fill_projection,
+    fill_stamped_projection,
+    fill_stamped_projection_covariance,
+)
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -68,7 +72,9 @@ class Microscope:
         self.drifts = make(PoseWithCovarianceStamped, "drift", RELIABLE)
         self.projections = make(Float64MultiArray, "projection", LATCHED)
         self.matrices = make(Image, "projection_stamped", RELIABLE)
+        self.spreads = make(Image, "projection_covariance_stamped", RELIABLE)
         self.with_stamped = False
+        self.scale_sigma: float | None = None
         self.late_s = 0.0
         self._stamp_s = 0.0
         self.knob = make(Float64, "magnification", LATCHED)
@@ -92,6 +98,12 @@ class Microscope:
         info, drift = CameraInfo(), PoseWithCovarianceStamped()
         fill_camera_info(info, self.camera, image.header, SIZE, SIZE)
         fill_drift(drift, self.drift_m, np.eye(2) * 1e-18, image.header)
+        if self.scale_sigma is not None:
+            spread = Image()
+            sigmas = [self.scale_sigma * self.camera.m, *[0.0] * 9]
+            known = replace(self.camera, covariance=np.diag(sigmas) ** 2)
+            fill_stamped_projection_covariance(spread, known, image.header, SIZE, SIZE)
+            self.spreads.publish(spread)
         if self.with_stamped:
             matrix = Image()
             fill_stamped_projection(matrix, self.camera, image.header, SIZE, SIZE)
@@ -218,6 +230,29 @@ def test_the_stamped_projection_of_a_frame_is_enough(peer: Peer) -> None:
         microscope.frames_until(lambda: _stands(microscope), "the stop without a camera")
         microscope.camera = replace(SCOPE.camera_at(G), rho=0.0)
         microscope.frames_until(lambda: _moves(microscope), "a command by a parallel camera")
+
+
+def test_the_stated_uncertainty_has_that_of_the_calibrations_scale(peer: Peer) -> None:
+    microscope = Microscope(peer)
+    microscope.with_stamped, microscope.scale_sigma = True, 0.0
+    with running("visual_servo", {**NEVER_FAST, "start": False}):
+        peer.wait_heard(SERVO, "~/error")
+        inputs = (microscope.matrices, microscope.spreads, microscope.images, microscope.infos)
+        peer.wait_for(lambda: all(p.get_subscription_count() for p in inputs), "the node")
+
+        def stated_m() -> float:
+            return float(peer.state(SERVO).get("servo_sigma_m", "inf"))
+
+        microscope.frames_until(lambda: stated_m() < 5e-9, "the uncertainty of the image")
+        # 1 % of the 6 um by which the target is off the axis.
+        microscope.scale_sigma = 0.01
+        microscope.frames_until(lambda: 58e-9 < stated_m() < 65e-9, "that of the scale")
+        microscope.frames_until(
+            lambda: microscope.errors[-1].pose.covariance[0] > (55e-9) ** 2, "its covariance"
+        )
+        # Without it, as from bags of earlier versions, it is that of the image again.
+        microscope.scale_sigma = None
+        microscope.frames_until(lambda: stated_m() < 5e-9, "the uncertainty of the image alone")
 
 
 def test_a_lost_target_a_missing_camera_and_a_turned_knob_stop_it(peer: Peer) -> None:

@@ -69,7 +69,7 @@ class AxisObserver:
             return camera
         shift = np.eye(3)
         shift[:2, 2] = self.offset_px
-        return PlaneCamera(shift @ camera.matrix)
+        return PlaneCamera(shift @ camera.matrix, camera.scale_covariance)
 
     def update(
         self,

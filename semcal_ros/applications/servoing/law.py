@@ -83,11 +83,12 @@ class ServoStep:
     error
         (3,) target minus goal at the centre of the frame's acquisition: m, m, rad.
     error_covariance
-        (3, 3) covariance of the error, from the image.
+        (3, 3) covariance of the error, from the image and, where the camera tells it, its scale.
     error_px, error_m
         RMS over the features, px, and distance of the target's origin from the goal, m.
     sigma_px, sigma_m
-        1-sigma of the origin in the worst direction.
+        1-sigma of the origin in the worst direction, likewise. Whether the target is near its goal is judged by that
+        of the image alone: the scale is wrong by the same in the next frame.
     fit
         The pose in the frame; None if no pose was fitted.
     drift_m_s
@@ -330,17 +331,20 @@ class Servo:
         twist = -gain_hz * self._correction(fit, camera, ahead)
         twist[:2] -= drift
         twist, limited = self._limit(twist, fit, camera, interval_s)
-        sigma_m, sigma_px = _compute_origin_sigma(fit, camera)
+        sigma_px = _compute_origin_sigma(fit, camera)[1]
         error = fit.pose.minus(self.goal)
         own = fit.view.target_xy_m.reshape(-1, 2)
         away = camera.project(fit.pose.apply(own)) - camera.project(self.goal.apply(own))
         error_px = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
         is_near = error_px <= limits.tolerance_px and 2.0 * sigma_px <= limits.tolerance_px
         self._near = self._near + 1 if is_near else 0
+        spread = fit.covariance.copy()
+        spread[:2, :2] += camera.scale_spread(fit.pose.values[:2])
+        sigma_m, sigma_px = _compute_origin_sigma(fit, camera, spread[:2, :2])
         return ServoStep(
             twist=twist,
             error=error,
-            error_covariance=fit.covariance,
+            error_covariance=spread,
             error_px=error_px,
             error_m=float(np.hypot(error[0], error[1])),
             sigma_px=sigma_px,
@@ -406,9 +410,11 @@ def _shift_view(view: TargetView, camera: PlaneCamera, shift_m: Array) -> Target
     return view.with_corners(moved.reshape(view.xy.shape))
 
 
-def _compute_origin_sigma(fit: PoseFit, camera: PlaneCamera) -> tuple[float, float]:
-    """Compute the 1-sigma of the target's origin in the worst direction, m and px."""
-    block = fit.covariance[:2, :2]
+def _compute_origin_sigma(
+    fit: PoseFit, camera: PlaneCamera, covariance_m2: Array | None = None
+) -> tuple[float, float]:
+    """Compute the 1-sigma of the target's origin in the worst direction, m and px; that of the image by default."""
+    block = fit.covariance[:2, :2] if covariance_m2 is None else covariance_m2
     slope = camera.jacobian(fit.pose.values[None, :2])[0]
     worst = [float(np.linalg.eigvalsh(c)[-1]) for c in (block, slope @ block @ slope.T)]
     return math.sqrt(max(worst[0], 0.0)), math.sqrt(max(worst[1], 0.0))

@@ -32,6 +32,8 @@ __all__ = ["PlaneCamera", "choose_projection"]
 # Relative difference of two matrices from the same numbers, one divided and multiplied by rho
 # again.
 _SAME = 1e-9
+# Of the 12 elements of a projection, row by row, those that scale X and Y.
+_SCALE = (0, 1, 4, 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,9 @@ class PlaneCamera:
     ----------
     matrix
         (3, 3), homogeneous rectified pixel of (X, Y, 1) in m.
+    scale_covariance
+        (4, 4) covariance of the first two columns of its first two rows, row by row, px^2/m^2: how well the scale is
+        known. None where that is not known.
 
     Raises
     ------
@@ -50,6 +55,7 @@ class PlaneCamera:
     """
 
     matrix: Array
+    scale_covariance: Array | None = None
 
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, dtype=np.float64)
@@ -64,17 +70,32 @@ class PlaneCamera:
         object.__setattr__(self, "matrix", matrix)
 
     @classmethod
-    def from_projection(cls, projection: ArrayLike, height_m: float = 0.0) -> PlaneCamera:
-        """Create from P_g, the (3, 4) projection of points in m, and the height of the plane."""
+    def from_projection(
+        cls, projection: ArrayLike, height_m: float = 0.0, covariance: ArrayLike | None = None
+    ) -> PlaneCamera:
+        """Create from P_g, the (3, 4) projection of points in m, and the height of the plane.
+
+        ``covariance`` is the (12, 12) one of P_g, row by row; the part of the scale is used.
+        """
         p = np.asarray(projection, dtype=np.float64)
         if p.shape != (3, 4):
             raise InvalidValueError(f"a projection of shape {p.shape}", expected="(3, 4)")
-        return cls(np.column_stack([p[:, 0], p[:, 1], p[:, 2] * height_m + p[:, 3]]))
+        matrix = np.column_stack([p[:, 0], p[:, 1], p[:, 2] * height_m + p[:, 3]])
+        if covariance is None:
+            return cls(matrix)
+        full = np.asarray(covariance, dtype=np.float64)
+        if full.shape != (12, 12) or not np.all(np.isfinite(full)):
+            raise InvalidValueError(
+                f"a covariance of a projection of shape {full.shape}", expected="(12, 12), finite"
+            )
+        return cls(matrix, full[np.ix_(_SCALE, _SCALE)])
 
     @classmethod
     def from_camera(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
         """Create from a camera, for images that were rectified with it."""
-        return cls.from_projection(camera.rectified.P_affine, height_m)
+        own = camera.rectified
+        known = None if own.covariance is None else own.P_affine_covariance
+        return cls.from_projection(own.P_affine, height_m, known)
 
     def project(self, xy_m: ArrayLike) -> Array:
         """Project points (n, 2) of the plane, m, to rectified pixels (n, 2)."""
@@ -98,6 +119,18 @@ class PlaneCamera:
         linear, last = self.matrix[:2, :2], self.matrix[2, :2]
         slope: Array = linear[None] - pixels[:, :, None] * last[None, None, :]
         return slope / image[:, 2][:, None, None]
+
+    def scale_spread(self, xy_m: ArrayLike) -> Array:
+        """Compute the (2, 2) covariance, m^2, of a point (2,) of the plane that is seen at its pixel, by the scale.
+
+        It is zero at the optical axis, and where nothing is known of the scale.
+        """
+        x, y = np.asarray(xy_m, dtype=np.float64)
+        if self.scale_covariance is None:
+            return np.zeros((2, 2))
+        by = np.linalg.solve(self.matrix[:2, :2], [[x, y, 0.0, 0.0], [0.0, 0.0, x, y]])
+        spread: Array = by @ self.scale_covariance @ by.T
+        return spread
 
     def is_same(self, other: PlaneCamera | None) -> bool:
         """Return whether another camera is the same, up to rounding."""

@@ -411,6 +411,37 @@ class ScanCamera:
         )
 
     @property
+    def P_affine_covariance(self) -> Array:
+        """(12, 12) covariance of :attr:`P_affine`, row by row; its units are the products of those of the elements.
+
+        Five elements are constant, so rows and columns of zeros belong to them, and the rank is six at most. Distortion
+        and residual field are no part of it.
+
+        Raises
+        ------
+        InvalidValueError
+            If the camera carries no covariance.
+        """
+        if self.covariance is None:
+            raise InvalidValueError(
+                "a camera without covariance", expected="a camera from Calibration.at(g)"
+            )
+        m, a = self.m, self.aspect
+        by = np.zeros((12, 6))
+        # The derivatives of the elements by m, aspect, skew, px, py and rho.
+        by[0, :2] = a, m
+        by[1, 0], by[1, 2] = self.skew, m
+        by[2, 3], by[2, 5] = self.rho, self.px
+        by[3, 3] = 1.0
+        by[5, :2] = 1.0 / a, -m / a**2
+        by[6, 4], by[6, 5] = self.rho, self.py
+        by[7, 4] = 1.0
+        by[10, 5] = 1.0
+        covariance = _congruent(by, self.covariance[:6, :6])
+        # Symmetric to the last bit, as readers may check.
+        return np.asarray(0.5 * (covariance + covariance.T))
+
+    @property
     def P(self) -> Array:
         """(3, 4) projection ``K [I | (0, 0, 1/rho)]`` of sem-frame points.
 

@@ -84,8 +84,8 @@ def find_topic(
     )
 
 
-# An Image that is a matrix, and no picture (doc/nodes.md).
-_MATRIX = "projection_stamped"
+# Images that are matrices, and no pictures (doc/nodes.md).
+_MATRICES = ("projection_stamped", "projection_covariance_stamped")
 # What image_transport appends to the name of a topic for its compressed images.
 _SUFFIX = "/compressed"
 
@@ -103,8 +103,9 @@ def find_image_topic(
     BagError
         As :func:`~semcal_ros.files.bags.topics.find_topic`.
     """
-    if not topic_matches(_MATRIX, image.topic):
-        topics = [topic for topic in topics if not topic_matches(_MATRIX, topic.name)]
+    for matrix in _MATRICES:
+        if not topic_matches(matrix, image.topic):
+            topics = [topic for topic in topics if not topic_matches(matrix, topic.name)]
     wanted, type_name = _source(image, [topic for topic in topics if topic.count])
     found, note = find_topic(path, topics, what="image", wanted=wanted, type_name=type_name)
     notes = [note] if note else []

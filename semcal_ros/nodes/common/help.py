@@ -52,7 +52,7 @@ EXECUTABLES = {
     "stream_corrector": ExecutableHelp(
         "Removes drift and distortion from the live stream in one interpolation.",
         "image_raw, magnification, calibration, conditions",
-        "image_rect, camera_info, projection_stamped, drift, drift_velocity",
+        "image_rect, camera_info, projection_stamped, projection_covariance_stamped, drift, drift_velocity",
         "~/reset",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
@@ -66,14 +66,14 @@ EXECUTABLES = {
     "rectifier": ExecutableHelp(
         "Removes distortion from the live stream.",
         "image_raw or image_stabilized, magnification, calibration, conditions",
-        "image_rect, camera_info, projection_stamped",
+        "image_rect, camera_info, projection_stamped, projection_covariance_stamped",
         "",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
     "parameter_server": ExecutableHelp(
         "Serves the calibration at any magnification, on topics and as parameters.",
         "magnification, calibration, conditions",
-        "calibration, camera_info, projection; parameters such as `p@5250`",
+        "calibration, camera_info, projection, projection_covariance; parameters such as `p@5250`",
         "~/reload",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
@@ -100,7 +100,8 @@ EXECUTABLES = {
     ),
     "visual_servo": ExecutableHelp(
         "Brings a target to a pose in the sem frame by velocities of the stage.",
-        "image_rect, camera_info, projection_stamped or projection, drift, magnification",
+        "image_rect, camera_info, projection_stamped or projection, projection_covariance_stamped, drift,"
+        " magnification",
         "velocity of the stage, ~/error",
         "~/start, ~/stop",
         "-p goal_x_m:=1e-6 -p start:=true",

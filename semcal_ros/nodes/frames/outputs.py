@@ -32,7 +32,7 @@ from semcal_ros.bridge.drift import (
 )
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
-from semcal_ros.bridge.projection import fill_stamped_projection
+from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -78,7 +78,8 @@ class ImageOutput:
 
 
 class RectifiedOutput:
-    """Publishes ``image_rect`` with ``camera_info`` and ``projection_stamped``, which have its header.
+    """Publishes ``image_rect`` with ``camera_info``, ``projection_stamped`` and ``projection_covariance_stamped``,
+    which have its header.
 
     The same camera_info goes out on ``image_rect/camera_info``; that of the raw image, as image_pipeline means it, on
     ``image_raw/camera_info``.
@@ -103,7 +104,8 @@ class RectifiedOutput:
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
         beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
-        info, projection = CameraInfo(), Image()
+        covariance = "projection_covariance_stamped"
+        info, projection, spread = CameraInfo(), Image(), Image()
         self._outputs = [
             (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
             (
@@ -117,6 +119,12 @@ class RectifiedOutput:
                 projection,
             ),
         ]
+        # Apart, since few need it: it is only filled for a subscriber of its own.
+        self._spread = spread
+        self._spread_publisher = endpoints.stream_publisher(
+            Image, covariance, endpoints.beside(covariance, "image_rect")
+        )
+        self._spread_described: tuple[ScanCamera | None, tuple[int, int]] | None = None
         self._messages = info, projection
         raw = config.image.topic
         self._raw_info = CameraInfo()
@@ -142,6 +150,10 @@ class RectifiedOutput:
             self._describe_raw(camera, frame)
             copy_header(self._raw_info.header, frame.header)
             self._raw_publisher.publish(self._raw_info)
+        if self._spread_publisher.get_subscription_count():
+            self._describe_spread(camera, frame)
+            copy_header(self._spread.header, frame.header)
+            self._spread_publisher.publish(self._spread)
         for publisher, message in self._outputs:
             if publisher.get_subscription_count():
                 self._describe(camera, frame)
@@ -156,6 +168,12 @@ class RectifiedOutput:
             fill_camera_info(info, camera, frame.header, *frame.size)
             fill_stamped_projection(projection, camera, frame.header, *frame.size)
             self._described = camera, frame.size
+
+    def _describe_spread(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
+        known = self._spread_described
+        if known is None or known[0] is not camera or known[1] != frame.size:
+            fill_stamped_projection_covariance(self._spread, camera, frame.header, *frame.size)
+            self._spread_described = camera, frame.size
 
     def _describe_raw(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         known = self._raw_described

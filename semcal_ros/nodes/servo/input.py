@@ -32,6 +32,7 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.projection import (
     projection_from_message,
+    stamped_projection_covariance_from_message,
     stamped_projection_from_message,
 )
 from semcal_ros.core.arrays import Array
@@ -45,6 +46,8 @@ __all__ = ["ServoFrame", "ServoInput"]
 # Frames that wait for their other parts: more than the queues of all inputs hold. Projections: as many magnifications
 # as can be on their way with those frames.
 _WAITING, _PROJECTIONS = 16, 16
+# Frames are complete without these, which bags of earlier versions do not have.
+_OPTIONAL = ("projection_stamped", "projection_covariance_stamped")
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class ServoFrame:
         (2,) drift that was removed from the image, m.
     projections
         (3, 4) P_g with the frame's own stamp; without one, the latest of all, the oldest first.
+    covariance
+        (12, 12) covariance of the P_g with the frame's own stamp, or None where it is not known.
     header, stamp_ns
         Its header.
     """
@@ -71,13 +76,14 @@ class ServoFrame:
     projections: tuple[Array, ...]
     header: Any
     stamp_ns: int
+    covariance: Array | None = None
 
 
 class ServoInput:
-    """Subscribes to ``image_rect``, ``camera_info``, ``drift``, ``projection_stamped`` and ``projection``.
+    """Subscribes to ``image_rect``, ``camera_info``, ``drift``, ``projection_stamped``, its covariance, ``projection``.
 
     All but the last are paired by stamp. The newest complete frame counts; older ones are dropped. A frame is complete
-    without its ``projection_stamped``, which bags of earlier versions do not have.
+    without its ``projection_stamped`` and without the covariance of that.
 
     Parameters
     ----------
@@ -106,11 +112,15 @@ class ServoInput:
         self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
         self._projections: deque[Array] = deque(maxlen=_PROJECTIONS)
         self._stamped: dict[int, Array] = {}
+        self._covariances: dict[int, Array] = {}
         self._draining = False
         endpoints.subscribe(Float64MultiArray, "projection", self._on_projection, value_input())
         self._inputs = [
             endpoints.subscribe(
                 Image, "projection_stamped", self._on_stamped_projection, stream_output()
+            ),
+            endpoints.subscribe(
+                Image, "projection_covariance_stamped", self._on_covariance, stream_output()
             ),
             endpoints.subscribe(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
             endpoints.subscribe(Image, "image_rect", self._keeps("image"), image_input()),
@@ -124,7 +134,7 @@ class ServoInput:
     @property
     def required_topics(self) -> tuple[str, ...]:
         """The topics without which no frame is complete."""
-        return tuple(s.topic for s in self._inputs if s.topic != "projection_stamped")
+        return tuple(s.topic for s in self._inputs if s.topic not in _OPTIONAL)
 
     def _on_projection(self, message: Any, _info: MessageInfo) -> None:
         try:
@@ -136,6 +146,13 @@ class ServoInput:
         try:
             matrix = stamped_projection_from_message(message)
             _insert_newest(self._stamped, stamp_ns_from_msg(message), matrix)
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+
+    def _on_covariance(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            matrix = stamped_projection_covariance_from_message(message)
+            _insert_newest(self._covariances, stamp_ns_from_msg(message), matrix)
         except NODE_ERRORS as error:
             self._reporter.reject(error)
 
@@ -184,7 +201,17 @@ class ServoInput:
             k = np.array(parts["info"].k, dtype=np.float64).reshape(3, 3)
             own = self._stamped.get(stamp_ns)
             projections = tuple(self._projections) if own is None else (own,)
-            self._on_frame(ServoFrame(grey, k, drift_m, projections, image.header, stamp_ns))
+            self._on_frame(
+                ServoFrame(
+                    grey,
+                    k,
+                    drift_m,
+                    projections,
+                    image.header,
+                    stamp_ns,
+                    None if own is None else self._covariances.get(stamp_ns),
+                )
+            )
         except NODE_ERRORS as error:
             self._reporter.reject(error)
             self._on_error(" ".join(str(error).split()))

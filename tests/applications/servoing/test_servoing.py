@@ -438,3 +438,32 @@ def test_a_goal_is_only_reached_where_that_is_certain(sigmas: float, converged: 
     steps = [servo.update(view, camera, 0.5 * k, interval_s=0.5) for k in range(20)]
     assert steps[-1].rejection is None
     assert steps[-1].converged == converged
+
+
+@pytest.mark.parametrize("place_m", [(0.0, 0.0), (20e-6, 0.0), (6e-6, -15e-6)])
+def test_the_stated_uncertainty_has_that_of_the_scale_and_convergence_has_not(
+    place_m: tuple[float, float],
+) -> None:
+    scale_sigma = 0.003
+    own = SCOPE.camera_at(2000.0)
+    # The scale alone is uncertain, alike along both axes.
+    known = replace(own, covariance=np.diag([(scale_sigma * own.m) ** 2, *[0.0] * 9]))
+    camera, pose = PlaneCamera.from_camera(known), PlanePose(*place_m, 0.3)
+    plain = replace(camera, scale_covariance=None)
+    view = view_of(pose, camera)
+    steps = [Servo(pose).update(view, c, 0.0, interval_s=0.5) for c in (plain, camera)]
+    extra_m = math.sqrt(steps[1].sigma_m ** 2 - steps[0].sigma_m ** 2)
+    # A relative error of the scale moves a point by that part of its distance from the axis, and the image's own
+    # covariance is nearly the same in all directions.
+    expected_m = scale_sigma * math.hypot(*place_m)
+    assert extra_m == pytest.approx(expected_m, rel=0.02, abs=1e-12)
+    assert steps[1].sigma_px >= steps[0].sigma_px
+    spread = steps[1].error_covariance - steps[0].error_covariance
+    np.testing.assert_allclose(
+        spread[:2, :2], scale_sigma**2 * np.outer(place_m, place_m), rtol=1e-3, atol=1e-21
+    )
+    assert not spread[2].any()
+    # 60 nm are half a px here, as much as is tolerated, and the target is at its goal all the same.
+    servo = Servo(pose, ServoSettings(tolerance_px=0.5))
+    last = [servo.update(view, camera, 0.5 * k, interval_s=0.5) for k in range(20)][-1]
+    assert last.converged
