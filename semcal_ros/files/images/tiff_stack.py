@@ -142,6 +142,13 @@ def _check_page(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
             f"{path.name} has {samples} samples of type {kind} per pixel",
             expected="grey levels, or red, green and blue",
         )
+    if samples == 4 and page.planarconfig == tifffile.PLANARCONFIG.SEPARATE:
+        # What programs write for a stack of four images unless they are told that these are grey.
+        raise TiffError(
+            f"{path.name} has 4 planes, which are 4 images or the colours of one",
+            expected="one page for each image",
+            do='save the stack as pages (tifffile: photometric="minisblack")',
+        )
     return width, height
 
 
@@ -226,4 +233,6 @@ def read_tiff_stack(path: Path, pages: Sequence[int]) -> Iterator[NDArray[Any]]:
                 yield grey_image(path, page)
                 continue
             image = np.asarray(page.asarray(), dtype=np.float32)
+            if image.ndim == 3 and page.planarconfig == tifffile.PLANARCONFIG.SEPARATE:
+                image = np.moveaxis(image, 0, -1)
             yield np.ascontiguousarray(image if image.ndim == 2 else image[..., :3].mean(axis=-1))

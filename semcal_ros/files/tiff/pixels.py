@@ -144,6 +144,8 @@ def _to_grey(image: NDArray[Any], page: tifffile.TiffPage) -> NDArray[Any]:
     if page.colormap is not None and image.ndim == 2:
         return _lookup(image, page.colormap)
     if image.ndim == 3:
+        if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE:
+            image = np.moveaxis(image, 0, -1)
         mixed = image[..., :3].astype(np.float64) @ _LUMA
         return np.asarray(np.rint(mixed).astype(image.dtype))
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:

@@ -65,6 +65,31 @@ def test_a_plain_stack_needs_its_pixel_size(tmp_path: Path, dtype: str) -> None:
     assert any("as given" in note for note in notes)
 
 
+def test_colours_in_planes_are_those_of_pixels(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).integers(0, 255, (3, 40, 50), dtype=np.uint8)
+    planes, mixed = tmp_path / "planes.tif", tmp_path / "mixed.tif"
+    tifffile.imwrite(planes, colours, photometric="rgb", planarconfig="separate")
+    tifffile.imwrite(mixed, np.moveaxis(colours, 0, -1), photometric="rgb")
+    found = [only_image(path) for path in (planes, mixed)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_four_planes_are_four_images_or_one(tmp_path: Path) -> None:
+    """What tifffile writes for a stack of four where it is not told that they are grey."""
+    path = tmp_path / "stack.tif"
+    tifffile.imwrite(
+        path, np.zeros((4, 40, 50), np.uint8), photometric="rgb", planarconfig="separate"
+    )
+    with pytest.raises(SemcalError, match="4 planes"):
+        only_image(path)
+
+
+def only_image(path: Path) -> np.ndarray:
+    with open_recording(RecordedFiles(path, pixel_size_m=1e-8), load_config("generic")) as opened:
+        (frame,) = opened.frames()
+        return frame.image
+
+
 def test_an_ome_tiff_says_scale_and_interval(tmp_path: Path) -> None:
     tifffile.imwrite(
         tmp_path / "s.ome.tif",
