@@ -39,6 +39,7 @@ from semcal_ros.nodes.common.parameters import (
 )
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.calibration_monitor import MONITOR_PERIOD, CalibrationMonitor
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
@@ -67,7 +68,8 @@ class ParameterServer(SemNode):
 
     def __init__(self) -> None:
         super().__init__(
-            "parameter_server", (CALIBRATION, REPLAYED_CALIBRATION, OUT_OF_RANGE, *_SIZE)
+            "parameter_server",
+            (CALIBRATION, REPLAYED_CALIBRATION, OUT_OF_RANGE, *_SIZE, MONITOR_PERIOD),
         )
         self._reading: MagnificationReading | None = None
         self._published_g: float | None = None
@@ -93,6 +95,16 @@ class ParameterServer(SemNode):
         self._magnification = MagnificationInput(
             self.config, self.endpoints, self.reporter, self._on_reading
         )
+        self._monitor = None
+        if self.parameters[MONITOR_PERIOD.name] > 0.0:
+            self._monitor = CalibrationMonitor(
+                self.config,
+                self.endpoints,
+                self.reporter,
+                self._magnification,
+                lambda: (self._calibration.current, self._calibration.config),
+                self.parameters[MONITOR_PERIOD.name],
+            )
         self._reload = self.endpoints.trigger_service("~/reload", self._on_reload)
         # A restarted server must not set all nodes back to its file while another node, such as calibration_server,
         # still holds a calibration that has come into force since.
@@ -115,6 +127,7 @@ class ParameterServer(SemNode):
         """
         outside = ["magnification outside the calibrated range"] * self._range.is_outside
         doubts = self._calibration.conditions() + self._watch.conditions()
+        doubts += [] if self._monitor is None else self._monitor.conditions()
         return super().conditions() + outside + doubts
 
     # -- topics ------------------------------------------------------------------------------------

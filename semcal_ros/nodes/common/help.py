@@ -72,7 +72,7 @@ EXECUTABLES = {
     ),
     "parameter_server": ExecutableHelp(
         "Serves the calibration at any magnification, on topics and as parameters.",
-        "magnification, calibration, conditions",
+        "magnification, calibration, conditions; image_raw with monitor_period",
         "calibration, camera_info, projection, projection_covariance; parameters such as `p@5250`",
         "~/reload",
         "-p config:=jsm820 -p calibration:=cal.yaml",

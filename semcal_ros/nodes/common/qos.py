@@ -28,6 +28,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 __all__ = [
     "camera_output",
+    "glimpse_input",
     "image_input",
     "latched",
     "overridable",
@@ -58,6 +59,13 @@ def image_input() -> QoSProfile:
     Images that have waited too long are skipped by :class:`~semcal_ros.nodes.frames.stream.FrameInput`.
     """
     return _profile(10, DurabilityPolicy.VOLATILE)
+
+
+def glimpse_input() -> QoSProfile:
+    """Return the quality for images of which one in a while is looked at: whatever is lost, nobody waits for them."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+    )
 
 
 def value_input(depth: int = 100) -> QoSProfile:

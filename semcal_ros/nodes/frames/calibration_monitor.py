@@ -1,0 +1,190 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Looks at a frame from time to time, and says whether the calibration still holds where it shows the grid."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
+
+from semcal_ros.bridge.compressed import decoded_image
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import to_gray, without_databar
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.check import CalibrationCheck, Verdict
+from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.errors import Rejection, SemcalError
+from semcal_ros.middleware.message_types import message_class
+from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.latest_worker import LatestWorker
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.qos import glimpse_input
+from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
+from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.workflows.check_and_update import check_found
+
+__all__ = ["MONITOR_PERIOD", "CalibrationMonitor"]
+
+MONITOR_PERIOD = ParameterDeclaration(
+    "monitor_period",
+    0.0,
+    "Time between two frames that are looked at: where one shows the grid, the diagnostics say whether the calibration"
+    " still holds. 0: none is.",
+    "s",
+    0.0,
+    86400.0,
+    fixed=True,
+)
+# One check of a hundred calls a valid calibration degraded, and there are thousands of them: so many in a row have to.
+_IN_A_ROW = 2
+# What numerics raise where a view cannot be solved for.
+_NUMERIC = (cv2.error, ArithmeticError, ValueError, np.linalg.LinAlgError)
+
+
+@dataclass(frozen=True, order=True)
+class _Glimpse:
+    """A frame with what it is compared with; the later one is the greater."""
+
+    number: int
+    image: NDArray[Any] = field(compare=False)
+    magnification: float = field(compare=False)
+    calibration: Calibration = field(compare=False)
+    config: MicroscopeConfig = field(compare=False)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A check, or the reason why there is none."""
+
+    calibration: Calibration
+    result: CalibrationCheck | None
+    reason: str = ""
+
+
+def _look(glimpse: _Glimpse) -> _Seen:
+    try:
+        detection = find_lattice(glimpse.image)
+        if isinstance(detection, Rejection):
+            return _Seen(glimpse.calibration, None, f"no grid: {detection.reason}")
+        view = FoundView("view 0", glimpse.magnification, None, detection)
+        return _Seen(glimpse.calibration, check_found(glimpse.calibration, [view], glimpse.config))
+    except (SemcalError, *_NUMERIC) as error:
+        return _Seen(glimpse.calibration, None, " ".join(str(error).split()))
+
+
+class CalibrationMonitor:
+    """Checks the calibration in force with a frame every ``period_s``, in a thread of its own.
+
+    The frames in between are not decoded.
+
+    Parameters
+    ----------
+    config
+        Topic and type of the images.
+    endpoints, reporter
+        Where to subscribe, the log and the values of the diagnostics.
+    magnification
+        Tells at which magnification a frame was taken.
+    calibration
+        Returns the calibration in force, or None, and the configuration with its display width.
+    period_s
+        Time between two frames, s.
+    """
+
+    def __init__(
+        self,
+        config: MicroscopeConfig,
+        endpoints: Endpoints,
+        reporter: Reporter,
+        magnification: MagnificationInput,
+        calibration: Callable[[], tuple[Calibration | None, MicroscopeConfig]],
+        period_s: float,
+    ) -> None:
+        self._rows = config.image.databar_rows
+        self._reporter = reporter
+        self._magnification = magnification
+        self._calibration = calibration
+        self._period_s = period_s
+        self._next_s = time.monotonic()
+        self._number = 0
+        self._bad: list[str] = []
+        self._told: tuple[Calibration | None, bool] = (None, False)
+        self._worker = LatestWorker(endpoints.guard, _look, self._on_seen)
+        self._type = message_class(config.image.type)
+        self._subscription = endpoints.subscribe(
+            self._type, config.image.topic, self._on_bytes, glimpse_input(), raw=True
+        )
+
+    def _on_bytes(self, data: bytes, info: MessageInfo) -> None:
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        current, config = self._calibration()
+        if current is None:
+            return
+        self._next_s = now_s + self._period_s
+        try:
+            message = deserialize_message(data, self._type)
+            pixels, encoding = decoded_image(message)
+            image = without_databar(pixels, self._rows)
+            times = stamp_ns_from_msg(message), published_ns(info)
+            g = self._magnification.at(*times, image.shape[1], config)
+            if g is None or self._magnification.changed_during(*times):
+                return
+            grey = np.array(to_gray(image, encoding))
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+            return
+        self._number += 1
+        self._worker.submit(_Glimpse(self._number, grey, g, current, config))
+
+    def _on_seen(self, seen: _Seen) -> None:
+        current, _ = self._calibration()
+        if seen.calibration is not current:
+            return
+        if self._told[0] is not current:
+            self._told, self._bad = (current, False), []
+        if seen.result is None:
+            # What was found before still holds: the specimen is another one now.
+            self._reporter.note("monitor", seen.reason)
+            return
+        summary = seen.result.summary
+        self._reporter.note("monitor", summary)
+        if seen.result.verdict is Verdict.VALID:
+            self._bad = []
+        else:
+            self._bad.append(summary)
+        doubtful = len(self._bad) >= _IN_A_ROW
+        if doubtful and not self._told[1]:
+            self._reporter.warn(f"the calibration may not hold any more: {summary}")
+        elif self._told[1] and not doubtful:
+            self._reporter.info(f"the calibration holds: {summary}")
+        self._told = current, doubtful
+
+    def conditions(self) -> list[str]:
+        """Return what the diagnostics should say: a calibration that does not hold any more."""
+        current, _ = self._calibration()
+        doubtful = self._told[0] is current and self._told[1]
+        return [f"calibration {self._bad[-1]}"] if doubtful else []
