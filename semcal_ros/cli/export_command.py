@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -70,9 +71,8 @@ def command(
     for path in done.paths:
         click.echo(f"{kind}: {path}")
     if done.worst_px > 0.0:
-        click.echo(
-            f"differs from the calibration by up to {done.worst_px:.2g} px, RMS {done.rms_px:.2g} px"
-        )
+        rms = f", RMS {done.rms_px:.2g} px" if math.isfinite(done.rms_px) else ""
+        click.echo(f"differs from the calibration by up to {done.worst_px:.2g} px{rms}")
     if done.worst_px > _TOLD_PX:
         echo_notes(
             [

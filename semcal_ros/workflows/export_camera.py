@@ -26,6 +26,7 @@ import tifffile
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.pinhole_model import PinholeModel, fit_pinhole
+from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -65,7 +66,8 @@ class ExportedCamera:
         The files.
     worst_px, rms_px
         Largest and RMS distance in px of the model in the file from the calibration, over the image and heights
-        within a tenth of the field width; 0 for formats that hold it exactly.
+        within a tenth of the field width; 0 for formats that hold it exactly. The RMS is NaN for the camera
+        that ROS nodes state of raw images.
     """
 
     paths: tuple[Path, ...]
@@ -117,6 +119,14 @@ def export_calibration(
     notes = _describe(calibration, camera, rectified=rectified)
     if kind == "fiji":
         return _write_imagej(camera, file, notes, rectified=rectified)
+    if kind == "ros" and not rectified:
+        # As the nodes state it in the camera_info of raw images, with the rectification that image_proc applies.
+        fitted = fit_plumb_bob(raw, raw.width, raw.height)
+        if fitted is not None:
+            notes.append(f"Distance from the calibration: up to {fitted.worst_px:.3g} px.")
+            name = _name(camera)
+            atomic_write_text(file, format_ros(fitted, (raw.width, raw.height), name, notes))
+            return ExportedCamera((file,), fitted.worst_px, float("nan"))
     pinhole = fit_pinhole(camera)
     notes.append(
         f"Distance from the calibration: up to {pinhole.worst_px:.3g} px, RMS {pinhole.rms_px:.3g} px."
@@ -170,8 +180,12 @@ def _format(kind: str, pinhole: PinholeModel, camera: ScanCamera, notes: Sequenc
     if kind == "opencv":
         return format_opencv(pinhole, camera.pixel_size_m, notes)
     if kind == "ros":
-        return format_ros(pinhole, f"sem_{camera.magnification:g}x".replace(".", "_"), notes)
+        return format_ros(pinhole, (camera.width, camera.height), _name(camera), notes)
     return format_mrcal(pinhole, notes) if kind == "mrcal" else format_colmap(pinhole, notes)
+
+
+def _name(camera: ScanCamera) -> str:
+    return f"sem_{camera.magnification:g}x".replace(".", "_")
 
 
 def _write_imagej(

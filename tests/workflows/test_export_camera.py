@@ -113,6 +113,28 @@ def test_ros_reads_a_plumb_bob_camera(calibration, tmp_path):
     assert (data["image_width"], data["image_height"]) == (camera.width, camera.height)
 
 
+def test_ros_rectifies_raw_images_as_the_calibration_does(calibration, tmp_path):
+    """As image_proc does: a rectified pixel's ray is turned by R, distorted by D and projected by K."""
+    path = tmp_path / "sem.yaml"
+    done = export_calibration(calibration, "ros", path, magnifications=[G])
+    data = yaml.safe_load(path.read_text())
+    k, d, r, p = (
+        np.array(data[f"{name}"]["data"])
+        for name in (
+            *("camera_matrix", "distortion_coefficients"),
+            *("rectification_matrix", "projection_matrix"),
+        )
+    )
+    camera = calibration.at(G)
+    size = (camera.width, camera.height)
+    x, y = cv2.initUndistortRectifyMap(
+        k.reshape(3, 3), d, r.reshape(3, 3), p.reshape(3, 4)[:, :3], size, cv2.CV_32FC1
+    )
+    at = np.array([[10.0, 12.0], [48.0, 48.0], [85.0, 20.0]])
+    found = np.array([[x[int(v), int(u)], y[int(v), int(u)]] for u, v in at])
+    assert np.abs(found - camera.raw_from_rect(at)).max() < 1.05 * done.worst_px + 1e-3
+
+
 def test_mrcal_grammar(calibration, tmp_path):
     """A Python literal with comments, whose model projects as OpenCV's does."""
     path = tmp_path / "sem.cameramodel"

@@ -29,6 +29,7 @@ import yaml
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.pinhole_model import PinholeModel
+from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
 
 __all__ = ["format_colmap", "format_mrcal", "format_opencv", "format_ros"]
 
@@ -52,18 +53,28 @@ def format_opencv(
     return str(file.releaseAndGetString())
 
 
-def format_ros(camera: PinholeModel, name: str, notes: Sequence[str]) -> str:
-    """Format as the calibration file of ``camera_info_manager``."""
-    matrix = camera.matrix
+def format_ros(
+    camera: PinholeModel | PlumbBobCamera, size: tuple[int, int], name: str, notes: Sequence[str]
+) -> str:
+    """Format as the calibration file of ``camera_info_manager``, for images of (width, height) ``size``.
+
+    A :class:`.PlumbBobCamera` has the rectification that the nodes state in ``camera_info``; a pinhole model none.
+    """
+    if isinstance(camera, PlumbBobCamera):
+        matrix, distortion = camera.K, camera.D
+        rectification, projection = camera.R, camera.P
+    else:
+        matrix, distortion = camera.matrix, camera.distortion
+        rectification, projection = np.eye(3), np.hstack([camera.matrix, np.zeros((3, 1))])
     data = {
-        "image_width": camera.width,
-        "image_height": camera.height,
+        "image_width": size[0],
+        "image_height": size[1],
         "camera_name": name,
         "camera_matrix": _table(matrix),
-        "distortion_model": "plumb_bob" if len(camera.distortion) == 5 else "rational_polynomial",
-        "distortion_coefficients": _table(np.asarray(camera.distortion)[None]),
-        "rectification_matrix": _table(np.eye(3)),
-        "projection_matrix": _table(np.hstack([matrix, np.zeros((3, 1))])),
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": _table(np.asarray(distortion)[None]),
+        "rectification_matrix": _table(rectification),
+        "projection_matrix": _table(projection),
     }
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100_000)
     return "".join(f"# {note}\n" for note in notes) + str(text)
