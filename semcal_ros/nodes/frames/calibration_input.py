@@ -304,7 +304,7 @@ class CalibrationInput:
         low, high = calibration.magnification_range
         digest = calibration_digest(loaded.text)
         made = calibration.provenance.describe()
-        text = f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x, {digest}; made: {made}"
+        text = f"calibration from {source}: {calibration.method}, {low:g}x to {high:g}x (made: {made}), {digest}"
         if displaced is not None and source == _TOPIC != displaced.source:
             self._reporter.warn(f"{text}; it displaces {displaced.source}")
         else:
