@@ -32,6 +32,7 @@ from semcal_ros.core.calibration.check import CalibrationCheck, Change, Verdict
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import check
+from semcal_ros.workflows.check_specimen import check_specimen
 
 __all__ = ["command", "echo_check"]
 
@@ -42,6 +43,11 @@ _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
 @click.argument("calibration", type=PATH)
 @recording_input
 @grid_options
+@click.option(
+    "--specimen",
+    is_flag=True,
+    help="RECORDING shows one place of any specimen at several magnifications, not the grid: compare their scales.",
+)
 @json_option
 def command(
     calibration: Path,
@@ -50,16 +56,24 @@ def command(
     squares: tuple[float, ...] | None,
     untilted: str | tuple[str, ...],
     pattern: str,
+    specimen: bool,
     as_json: bool,
 ) -> None:
     """Whether CALIBRATION still holds, by one or more views of the grid in RECORDING.
+
+    With --specimen, by one place of any specimen at several magnifications; that shows whether their scales have
+    changed against each other, but nothing that is common to all of them.
 
     Exit status: 0 valid, 1 degraded or invalid, 2 bad input.
 
     \b
     Example:
       semcal check cal.yaml recordings/grid_today
+      semcal check cal.yaml recordings/gold_steps --specimen
     """
+    if specimen:
+        _check_specimen(calibration, recording, config, as_json=as_json)
+        return
     with show_progress() as on_progress:
         done = check(
             calibration,
@@ -78,6 +92,43 @@ def command(
         click.echo(_ADVICE[done.result.verdict])
         echo_notes(done.notes)
     if done.result.verdict is not Verdict.VALID:
+        sys.exit(1)
+
+
+def _check_specimen(
+    calibration: Path, recording: RecordedFiles, config: MicroscopeConfig, *, as_json: bool
+) -> None:
+    with show_progress() as on_progress:
+        done = check_specimen(calibration, recording, config=config, on_progress=on_progress)
+    if as_json:
+        echo_json({"holds": done.holds, "ratios": [asdict(ratio) for ratio in done.ratios]})
+    else:
+        click.echo(
+            f"{calibration}: the scales of the magnifications "
+            + ("agree" if done.holds else "DO NOT AGREE")
+        )
+        rows = [
+            [
+                f"{r.low:g} to {r.high:g}",
+                *(
+                    [r.reason or "-", "", ""]
+                    if r.reason
+                    else [
+                        f"{100.0 * value:+.3f} +- {100.0 * sigma:.3f}"
+                        for value, sigma in (
+                            (r.scale, r.scale_sigma),
+                            (r.aspect, r.aspect_sigma),
+                            (r.skew, r.skew_sigma),
+                        )
+                    ]
+                ),
+            ]
+            for r in done.ratios
+        ]
+        echo_table(["magnifications", "ratio of scales %", "aspect %", "skew %"], rows)
+        click.echo("a change that is common to all magnifications is not seen: that needs the grid")
+        echo_notes(done.notes)
+    if not done.holds:
         sys.exit(1)
 
 
