@@ -50,6 +50,7 @@ _COMMANDS = {
     "simulate": "record the virtual SEM to a bag, with its truth",
     "stack": "drift-corrected average of a recording, and a stabilised video",
     "update": "renew a calibration with a few views of the grid",
+    "view": "the live stream in the browser",
 }
 
 

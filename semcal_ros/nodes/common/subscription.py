@@ -140,11 +140,25 @@ class AdaptiveSubscription:
         # The override parameters are written into the profile.
         self._requested = self._profile = profile
         self._subscription = self._subscribe(overridable())
+        self._full_topic = str(self._subscription.topic_name)
+        self._paused = False
         self._received = 0
         self._watch: SourceWatch | None = None
         if source:
-            name, now_s = self._subscription.topic_name, time.monotonic()
-            self._watch = SourceWatch(source, name, streams=streams, now_s=now_s)
+            now_s = time.monotonic()
+            self._watch = SourceWatch(source, self._full_topic, streams=streams, now_s=now_s)
+
+    def pause(self) -> None:
+        """Unsubscribe until :meth:`resume`, so that publishers have one subscriber less."""
+        if not self._paused:
+            self._paused = True
+            self._node.destroy_subscription(self._subscription)
+
+    def resume(self) -> None:
+        """Subscribe again; a latched value comes once more."""
+        if self._paused:
+            self._paused = False
+            self._subscription = self._subscribe()
 
     @property
     def downgraded(self) -> str:
@@ -208,6 +222,8 @@ class AdaptiveSubscription:
 
     def take(self) -> tuple[Any, MessageInfo] | None:
         """Return the next message that has already arrived, with its information, or None."""
+        if self._paused:
+            return None
         handle = self._subscription.handle
         with handle:
             taken = handle.take_message(self._type, self._raw)
@@ -231,6 +247,8 @@ class AdaptiveSubscription:
             if weaker is None:
                 continue
             self._profile = weaker
+            if self._paused:
+                continue
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe()
             self._node.get_logger().warning(
@@ -244,7 +262,9 @@ class AdaptiveSubscription:
         Warns of publishers of another type, which the middleware ignores silently, and of those that are one too many
         or silent; returns to the requested quality once there are no publishers left.
         """
-        publishers = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
+        if self._paused:
+            return
+        publishers = self._node.get_publishers_info_by_topic(self._full_topic)
         foreign = {p.topic_type for p in publishers} - {self._type_name}
         for type_name in foreign - self._foreign_types:
             self._node.get_logger().warning(
@@ -276,7 +296,7 @@ class AdaptiveSubscription:
 
         The name of a node that has been found just now may not be known yet, and is empty.
         """
-        found = self._node.get_publishers_info_by_topic(self._subscription.topic_name)
+        found = self._node.get_publishers_info_by_topic(self._full_topic)
         return self._sources(found)
 
     def find_rivals(self) -> str:
@@ -293,7 +313,7 @@ class AdaptiveSubscription:
     @property
     def full_topic(self) -> str:
         """The name of the topic after namespace and remaps."""
-        return str(self._subscription.topic_name)
+        return self._full_topic
 
     @property
     def foreign_types(self) -> str:

@@ -1,0 +1,392 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node behind ``semcal view``: hears the stream while a page is open, and calls the services for its buttons."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+from numpy.typing import NDArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from sensor_msgs.msg import Image
+from std_srvs.srv import SetBool, Trigger
+
+from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.parameters import (
+    CALIBRATION,
+    REPLAYED_CALIBRATION,
+    ParameterDeclaration,
+)
+from semcal_ros.nodes.common.qos import latched, stream_output
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
+from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.frames.calibration_input import CalibrationInput
+from semcal_ros.nodes.frames.conditions import ConditionsInput
+from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, ViewedImages
+from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
+from semcal_ros.viewer.server import PageServer
+from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
+from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
+
+__all__ = ["Viewer", "main"]
+
+_PARAMETERS = (
+    CALIBRATION,
+    REPLAYED_CALIBRATION,
+    ParameterDeclaration("host", "localhost", "Address to listen on.", fixed=True),
+    ParameterDeclaration("port", 8060, "Port; 0 takes a free one.", "", 0, 65535, fixed=True),
+    ParameterDeclaration(
+        "token", "", "What must be brought to another host than localhost.", fixed=True
+    ),
+)
+# A person sees no more than ten pictures per second in a status display; see the server.
+_POLL_S = 0.1
+# How often the names of nodes and services are asked for, which takes milliseconds.
+_GRAPH_S = 2.0
+_STATUS_S = 0.25
+# A service answers at once, but for those that compute.
+_ANSWER_S = 20.0
+_COMPUTE_S = 600.0
+_CALIBRATION_ACTIONS = {
+    "add_view": "add_view",
+    "calibrate": "calibrate_start",
+    "cancel": "cancel",
+    "check": "check",
+    "save": "save",
+    "clear": "clear",
+}
+_SLOW = ("add_view", "check")
+_SERVER = "calibration_server"
+
+
+class Viewer(SemNode):
+    """A page in the browser; see :mod:`semcal_ros.viewer`. Nothing is subscribed while no page is open, but for
+    the magnification, the calibration and the conditions, which come seldom.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("viewer", _PARAMETERS)
+        self._lock = threading.Lock()
+        self._pages = 0
+        self._open = False
+        self._view: View | None = None
+        self._number = 0
+        self._camera: tuple[object, ScanCamera] | None = None
+        self._trace = DriftTrace()
+        self._speed_m_s: float | None = None
+        self._reports: dict[str, tuple[float, NodeReport]] = {}
+        self._progress: tuple[str, str, dict[str, str]] | None = None
+        self._overlay: tuple[int, NDArray[Any]] | None = None
+        self._offered: dict[str, tuple[str, Any]] = {}
+        self._callers: dict[str, Any] = {}
+        self._wanted: list[tuple[str, Any, Any, Future[Any]]] = []
+        self._graph_s = self._status_s = 0.0
+        self._magnification: float | None = None
+        self.calibration = CalibrationInput(
+            self.config, self.parameters, self.endpoints, self.reporter
+        )
+        self._magnifications = MagnificationInput(self.config, self.endpoints, self.reporter)
+        self._conditions = ConditionsInput(self.endpoints, self.reporter)
+        group = PolledGroup()
+        self._images = ViewedImages(self.config, self.endpoints, group)
+        listen = [
+            (PoseWithCovarianceStamped, "drift", stream_output(100), self._on_drift),
+            (TwistWithCovarianceStamped, "drift_velocity", stream_output(1), self._on_velocity),
+            (DiagnosticArray, "/diagnostics", stream_output(100), self._on_diagnostics),
+            (DiagnosticStatus, f"{_SERVER}/progress", latched(), self._on_progress),
+            (Image, f"{_SERVER}/overlay", stream_output(1), self._on_overlay),
+        ]
+        self._values = [
+            self.endpoints.subscribe(kind, topic, handler, profile, group)
+            for kind, topic, profile, handler in listen
+        ]
+        for subscription in self._streams:
+            subscription.pause()
+        self._changed = self.endpoints.guard(self._on_change)
+        # Ticks only while a page is open.
+        self._timer = self.create_timer(
+            _POLL_S, self._poll, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+        )
+        self._described = self._make_status(())
+        self.server = PageServer(
+            self, self.parameters["host"], self.parameters["port"], self.parameters["token"]
+        )
+        self.closing.callback(self.server.stop)
+        self.server.start()
+
+    def introduction(self) -> list[str]:
+        """Extend the base class: also where the page is."""
+        return ["shows the stream in the browser", f"open {self.server.address}"]
+
+    def idle(self) -> bool:
+        """Override the base class: nothing is late while nobody looks."""
+        return True
+
+    @property
+    def _streams(self) -> list[Any]:
+        return [*self._images.subscriptions, *self._values]
+
+    # -- called by the server, in its thread -----------------------------------------------------------
+
+    def watch(self, pages: int) -> None:
+        """Subscribe with the first page, and unsubscribe with the last."""
+        self._pages = pages
+        self._changed.trigger()
+
+    def newest(self) -> View | None:
+        """Return the newest frame."""
+        return self._view
+
+    def overlay(self) -> NDArray[Any] | None:
+        """Return the newest picture with corners."""
+        overlay = self._overlay
+        return None if overlay is None else overlay[1]
+
+    def describe(self) -> Status:
+        """Return the state at the last tick."""
+        return self._described
+
+    def act(self, action: str, value: float | None) -> str:
+        """Call the service of an action, and return its answer."""
+        found = self._offered.get(action)
+        if found is None:
+            raise InvalidValueError(
+                f"nobody offers {action!r}",
+                expected="a node of the suite that does",
+                do="start it, or look at the namespace",
+            )
+        service, kind = found
+        request = SetBool.Request(data=True) if kind is SetBool else Trigger.Request()
+        answer: Future[Any] = Future()
+        with self._lock:
+            self._wanted.append((service, kind, request, answer))
+        self._changed.trigger()
+        try:
+            response = answer.result(_COMPUTE_S if action in _SLOW else _ANSWER_S)
+        except TimeoutError as error:
+            raise InvalidValueError(
+                f"no answer from {service}", do="look whether its node still runs"
+            ) from error
+        if not response.success:
+            raise InvalidValueError(response.message or f"{service} refused")
+        return response.message or f"{service}: done"
+
+    # -- callbacks -----------------------------------------------------------------------------------
+
+    def _on_change(self) -> None:
+        """Follow the number of pages, and call the services that are wanted."""
+        wanted_open = self._pages > 0
+        if wanted_open != self._open:
+            self._open = wanted_open
+            for subscription in self._streams:
+                if wanted_open:
+                    subscription.resume()
+                else:
+                    subscription.pause()
+            if wanted_open:
+                self._images.forget()
+                self._graph_s = 0.0
+                self._reports.clear()
+                self._timer.reset()
+            else:
+                self._timer.cancel()
+        with self._lock:
+            wanted, self._wanted = self._wanted, []
+        for service, kind, request, answer in wanted:
+            self._call(service, kind, request, answer)
+
+    def _call(self, service: str, kind: Any, request: Any, answer: Future[Any]) -> None:
+        client = self._callers.get(service)
+        if client is None:
+            client = self._callers[service] = self.create_client(kind, service)
+        # A client that was made just now finds its service within moments.
+        threading.Thread(
+            target=self._call_when_found, args=(client, request, answer), daemon=True
+        ).start()
+
+    @staticmethod
+    def _call_when_found(client: Any, request: Any, answer: Future[Any]) -> None:
+        if client.wait_for_service(timeout_sec=5.0):
+            client.call_async(request).add_done_callback(
+                lambda done: answer.set_result(done.result())
+            )
+
+    def _poll(self) -> None:
+        for subscription in self._values:
+            subscription.take_waiting()
+        try:
+            frame = self._images.take()
+            if frame is not None:
+                self._show(frame)
+        except NODE_ERRORS as error:
+            self.reporter.reject(error)
+        now_s = time.monotonic()
+        if now_s - self._graph_s > _GRAPH_S:
+            self._graph_s = now_s
+            self._look_for_services()
+        if now_s - self._status_s > _STATUS_S:
+            self._status_s = now_s
+            self._described = self._make_status(
+                tuple(replace(r, age_s=now_s - at) for at, r in self._reports.values())
+            )
+
+    def _show(self, frame: ViewedFrame) -> None:
+        image = frame.pictures.get("corrected", frame.pictures.get("raw"))
+        assert image is not None
+        height, width = image.shape[:2]
+        config = self.calibration.config
+        g = self._magnifications.at(frame.stamp_ns, frame.sent_ns, width, config)
+        self._magnification = g
+        camera = None if g is None else self._camera_at(g, width, height)
+        drift = self._trace.last
+        drift_px = None
+        if camera is not None and drift is not None:
+            drift_px = drift_in_pixels(camera, drift[1:3])
+        self._number += 1
+        notes: dict[str, object] = dict(self._conditions.current)
+        if drift is not None:
+            notes.update(drift_x_m=drift[1], drift_y_m=drift[2], drift_sigma_m=drift[3])
+        notes["config"] = self.config.name
+        self._view = View(
+            self._number,
+            frame.stamp_ns,
+            frame.pictures,
+            camera,
+            self.calibration.current is not None,
+            drift_px,
+            notes=notes,
+        )
+
+    def _camera_at(self, g: float, width: int, height: int) -> ScanCamera | None:
+        key = (self.calibration.current, g, width, height)
+        if self._camera is None or self._camera[0] != key:
+            camera = self.calibration.camera(g, width, height)
+            if camera is None:
+                camera = ScanCamera.nominal(g, width, height, self.config.display_width_m)
+            self._camera = key, camera
+        return self._camera[1]
+
+    def _on_drift(self, message: Any, _info: Any) -> None:
+        position, covariance = message.pose.pose.position, message.pose.covariance
+        sigma_m = math.sqrt(max(covariance[0], covariance[7], 0.0))
+        self._trace.add(
+            stamp_ns_from_msg(message), position.x, position.y, sigma_m, self._speed_m_s
+        )
+
+    def _on_velocity(self, message: Any, _info: Any) -> None:
+        linear = message.twist.twist.linear
+        self._speed_m_s = math.hypot(linear.x, linear.y)
+
+    def _on_diagnostics(self, message: Any, _info: Any) -> None:
+        own = self.get_namespace().rstrip("/") + "/"
+        for status in message.status:
+            name, _, kind = status.name.partition(": ")
+            if not name.startswith(own) or kind != "stream" or name == own + self.get_name():
+                continue
+            values = {pair.key: pair.value for pair in status.values}
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            report = NodeReport(name.removeprefix(own), level, status.message, values)
+            self._reports[name] = time.monotonic(), report
+
+    def _on_progress(self, message: Any, _info: Any) -> None:
+        level = message.level[0] if isinstance(message.level, bytes) else int(message.level)
+        values = {pair.key: pair.value for pair in message.values}
+        self._progress = message.message, "ok" if level == 0 else "warn", values
+
+    def _on_overlay(self, message: Any, _info: Any) -> None:
+        try:
+            image = image_from_message(message)
+        except SemcalError as error:
+            self.reporter.reject(error)
+            return
+        number = 1 if self._overlay is None else self._overlay[0] + 1
+        self._overlay = number, image
+
+    def _look_for_services(self) -> None:
+        """Find out who offers what the buttons do: the nodes behind the images, and the calibration server."""
+        offered = {
+            name: kinds[0] for name, kinds in self.get_service_names_and_types() if len(kinds) == 1
+        }
+        kinds = {"std_srvs/srv/Trigger": Trigger, "std_srvs/srv/SetBool": SetBool}
+        found: dict[str, tuple[str, Any]] = {}
+
+        def offer(action: str, names: Sequence[str]) -> None:
+            for name in names:
+                if offered.get(name) in kinds and action not in found:
+                    found[action] = name, kinds[offered[name]]
+
+        sources = self._images.publishers("raw")
+        offer("start", [f"{node}/{verb}" for node in sources for verb in ("start", "resume")])
+        offer("stop", [f"{node}/{verb}" for node in sources for verb in ("stop", "pause")])
+        offer("reset", [f"{node}/reset" for node in self._images.publishers("corrected")])
+        own = self.get_namespace().rstrip("/")
+        for action, service in _CALIBRATION_ACTIONS.items():
+            offer(action, [f"{own}/{_SERVER}/{service}"])
+        self._offered = found
+
+    # -- what the page shows -----------------------------------------------------------------------------
+
+    def _make_status(self, reports: tuple[NodeReport, ...]) -> Status:
+        current = self.calibration.current
+        return Status(
+            title=f"{self.config.name}, {self.get_namespace()}",
+            kind="live",
+            magnification=self._describe_magnification(
+                None if current is None else current.magnification_range
+            ),
+            rates=describe_rates(reports),
+            notes=explain(reports),
+            drift=self._describe_drift(),
+            actions=tuple(self._offered),
+            calibration=self._describe_calibration(),
+        )
+
+    def _describe_magnification(
+        self, calibrated_range: tuple[float, float] | None
+    ) -> Magnification:
+        return describe_magnification(self._magnification, calibrated_range)
+
+    def _describe_drift(self) -> DriftPanel:
+        return self._trace.panel("no drift is published; start stream_corrector")
+
+    def _describe_calibration(self) -> CalibrationPanel | None:
+        if self._progress is None or "add_view" not in self._offered:
+            return None
+        answer, level, _values = self._progress
+        overlay = self._overlay
+        return CalibrationPanel(answer, level, overlay=0 if overlay is None else overlay[0])
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(Viewer, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,414 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The server of the page: files, pictures and state over one WebSocket, snapshots over HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import secrets
+import socket
+import tempfile
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tornado import httpserver, netutil, web, websocket
+
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.files.images.write import PixelScale, pixel_scale, write_image
+from semcal_ros.viewer.messages import Wish, encode_overlay, encode_view, measure, read_wish
+from semcal_ros.viewer.source import ACTIONS, View, ViewSource
+
+__all__ = ["LOCAL_HOSTS", "PageServer"]
+
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
+"""Names of this computer by which only its own users come in; no token is asked of them."""
+
+_PAGE = Path(__file__).parent / "page"
+# A person sees no more; the stream needs the processor.
+_PICTURE_INTERVAL_S = 0.1
+_STATUS_INTERVAL_S = 0.25
+# How often a connection looks for something new: well below the interval of the pictures.
+_POLL_S = 0.02
+# A browser that has not shown a picture for so long has lost it, or sleeps; it gets another one.
+_PATIENCE_S = 3.0
+# Messages of the page are a few hundred bytes.
+_LARGEST_MESSAGE = 1 << 16
+# An older clock than this is that of a replay; see the nodes' reporter.
+_OTHER_CLOCK_S = 3600.0
+_HEADERS = {
+    # Nothing from elsewhere: the page works without any network.
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+class PageServer:
+    """Serves the page in a thread of its own.
+
+    Parameters
+    ----------
+    source
+        What is shown.
+    host, port
+        Where to listen; port 0 takes a free one. For another host than :data:`LOCAL_HOSTS`, whoever comes must bring
+        the token.
+    token
+        The token; made up where there is none.
+
+    Raises
+    ------
+    InvalidValueError
+        The address cannot be used.
+    """
+
+    def __init__(
+        self, source: ViewSource, host: str = "localhost", port: int = 0, token: str = ""
+    ) -> None:
+        self.source = source
+        self.local = host in LOCAL_HOSTS
+        self.token = "" if self.local else token or secrets.token_urlsafe(16)
+        try:
+            self._sockets = netutil.bind_sockets(port, host)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InvalidValueError(
+                f"cannot listen on {host}:{port}: {reason}",
+                expected="an address of this computer and a free port",
+                do="give others by --host and --port; --port 0 takes a free one",
+            ) from error
+        self.port = int(self._sockets[0].getsockname()[1])
+        self._host = host
+        self._pages: set[_Live] = set()
+        # One picture at a time: pages must not take a second core from the stream.
+        self.pictures = ThreadPoolExecutor(1, "view-pictures")
+        self.actions = ThreadPoolExecutor(2, "view-actions")
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ended: asyncio.Event | None = None
+        self._thread = threading.Thread(target=self._run, name="view-server", daemon=True)
+        self._ready = threading.Event()
+        # Every request of a page that is open all day would be a line.
+        logging.getLogger("tornado.access").setLevel(logging.ERROR)
+
+    @property
+    def address(self) -> str:
+        """What to open in the browser."""
+        host = self._host
+        if host in ("0.0.0.0", "::", ""):
+            host = socket.gethostname()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+        self._ready.wait()
+
+    def stop(self) -> None:
+        """Close all pages and end; calling it again does nothing."""
+        loop, ended = self._loop, self._ended
+        if self._thread.is_alive() and loop is not None and ended is not None:
+            loop.call_soon_threadsafe(ended.set)
+            self._thread.join()
+        for sock in self._sockets:
+            sock.close()
+        self.pictures.shutdown(cancel_futures=True)
+        # An action may be waiting for an answer that takes minutes.
+        self.actions.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self) -> None:
+        asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
+        arguments = {"server": self}
+        application = web.Application(
+            [
+                (r"/", _Index, arguments),
+                (r"/live", _Live, arguments),
+                (r"/snapshot", _Snapshot, arguments),
+                (r"/(app\.js|style\.css|icon\.svg)", _Static, {**arguments, "path": str(_PAGE)}),
+            ],
+            websocket_max_message_size=_LARGEST_MESSAGE,
+        )
+        server = httpserver.HTTPServer(application)
+        server.add_sockets(self._sockets)
+        self._ready.set()
+        await self._ended.wait()
+        server.stop()
+        for page in list(self._pages):
+            page.close(1001, "the viewer has ended")
+        await server.close_all_connections()
+
+    # -- what the handlers ask ---------------------------------------------------------------------
+
+    def admits(self, handler: web.RequestHandler) -> bool:
+        """Return whether a request may come in."""
+        if self.local:
+            # Otherwise a page of a stranger whose name leads to this computer could look in.
+            name = (handler.request.host_name or "").strip("[]")
+            return name in LOCAL_HOSTS
+        cookie = handler.get_cookie(self.cookie) or ""
+        given = handler.get_query_argument("token", "") or cookie
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie that holds the token; cookies are shared by all ports of a host."""
+        return f"semcal_view_{self.port}"
+
+    def open_page(self, page: _Live) -> None:
+        """Take note of a page."""
+        self._pages.add(page)
+        self.source.watch(len(self._pages))
+
+    def close_page(self, page: _Live) -> None:
+        """Forget a page."""
+        if page in self._pages:
+            self._pages.remove(page)
+            self.source.watch(len(self._pages))
+
+
+class _Guarded(web.RequestHandler):
+    """Answers only those who may come in."""
+
+    def initialize(self, server: PageServer) -> None:
+        self._server = server
+
+    def prepare(self) -> None:
+        if not self._server.admits(self):
+            if self._server.local:
+                self.set_status(403)
+                self.finish("This page is for users of this computer; open it as localhost.\n")
+            else:
+                self.set_status(401)
+                self.finish(
+                    "Open this page with the token that `semcal view` has printed: /?token=...\n"
+                )
+
+    def set_default_headers(self) -> None:
+        for name, value in _HEADERS.items():
+            self.set_header(name, value)
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        self.finish(f"{status_code}: {self._reason}\n")
+
+
+class _Index(_Guarded):
+    def get(self) -> None:
+        if self._server.token and self.get_query_argument("token", ""):
+            # So that the token does not stay in the address and in the browser's history.
+            self.set_cookie(
+                self._server.cookie, self._server.token, httponly=True, samesite="Strict"
+            )
+            self.redirect("/")
+            return
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.finish((_PAGE / "index.html").read_bytes())
+
+
+class _Static(_Guarded, web.StaticFileHandler):
+    def initialize(self, server: PageServer, path: str) -> None:  # type: ignore[override]
+        _Guarded.initialize(self, server)
+        web.StaticFileHandler.initialize(self, path)
+
+
+class _Snapshot(_Guarded):
+    async def get(self) -> None:
+        """The picture that is shown now as TIFF, in the grey levels of the detector."""
+        view = self._server.source.newest()
+        name = self.get_query_argument("picture", "corrected")
+        if view is None or name not in view.pictures:
+            self.set_status(404)
+            self.finish(f"There is no picture {name!r} yet.\n")
+            return
+        loop = asyncio.get_running_loop()
+        data = await loop.run_in_executor(self._server.pictures, make_snapshot, view, name)
+        self.set_header("Content-Type", "image/tiff")
+        self.set_header(
+            "Content-Disposition", f'attachment; filename="{name_snapshot(view, name)}"'
+        )
+        self.finish(data)
+
+
+def name_snapshot(view: View, picture: str) -> str:
+    """Name the file of a snapshot after picture, magnification and time."""
+    g = "" if view.camera is None else f"_{view.camera.magnification:.6g}x"
+    when = datetime.fromtimestamp(view.stamp_ns * 1e-9, timezone.utc)
+    return f"{picture}{g}_{when:%Y%m%dT%H%M%S_%f}.tif"
+
+
+def make_snapshot(view: View, picture: str) -> bytes:
+    """Make an OME-TIFF of a picture, with its pixel size, time, and what else is known."""
+    image: NDArray[Any] = view.pictures[picture]
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    notes: dict[str, object] = {"picture": picture, **view.notes}
+    if view.name:
+        notes["name"] = view.name
+    if view.camera is None:
+        # A file needs some pixel size; one metre is certainly not that of an SEM.
+        scale = PixelScale(1.0)
+        notes["scale"] = "unknown: the magnification was not known"
+    else:
+        scale = pixel_scale(view.camera)
+        notes["magnification"] = view.camera.magnification
+        notes["scale"] = "calibrated" if view.calibrated else "nominal"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "snapshot.tif"
+        write_image(path, image, scale, stamp_ns=view.stamp_ns, notes=notes)
+        return path.read_bytes()
+
+
+class _Live(websocket.WebSocketHandler):
+    """One open page."""
+
+    def initialize(self, server: PageServer) -> None:
+        self._server = server
+        self._wish = Wish()
+        self._changed = True
+        self._sent = self._overlay = -1
+        self._waits_since_s: float | None = None
+        self._feeder: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def prepare(self) -> None:
+        if not self._server.admits(self):
+            self.set_status(403)
+            self.finish()
+
+    def open(self, *_: str, **__: str) -> None:
+        self.set_nodelay(True)
+        self._server.open_page(self)
+        self._feeder = asyncio.create_task(self._feed())
+
+    def on_close(self) -> None:
+        self._server.close_page(self)
+        if self._feeder is not None:
+            self._feeder.cancel()
+
+    # -- to the page -------------------------------------------------------------------------------
+
+    async def _feed(self) -> None:
+        status_s = picture_s = 0.0
+        try:
+            while True:
+                now_s = time.monotonic()
+                if now_s - status_s >= _STATUS_INTERVAL_S:
+                    status_s = now_s
+                    await self._send_status()
+                if now_s - picture_s >= _PICTURE_INTERVAL_S and self._may_send(now_s):
+                    picture_s = now_s
+                    await self._send_picture()
+                await asyncio.sleep(_POLL_S)
+        except websocket.WebSocketClosedError:
+            pass
+
+    def _may_send(self, now_s: float) -> bool:
+        """Whether the page has shown the picture before; otherwise this one is left out."""
+        return self._waits_since_s is None or now_s - self._waits_since_s > _PATIENCE_S
+
+    async def _send_status(self) -> None:
+        status = self._server.source.describe()
+        await self.write_message(json.dumps({"type": "status", **asdict(status)}))
+        panel = status.calibration
+        if panel is not None and panel.overlay and panel.overlay != self._overlay:
+            image = self._server.source.overlay()
+            if image is not None:
+                self._overlay = panel.overlay
+                data = await self._in_background(encode_overlay, panel.overlay, image, 720)
+                await self.write_message(data, binary=True)
+
+    async def _send_picture(self) -> None:
+        view = self._server.source.newest()
+        if view is None or (view.number == self._sent and not self._changed):
+            return
+        self._changed, self._sent = False, view.number
+        age_s: float | None = time.time() - view.stamp_ns * 1e-9
+        if age_s is not None and abs(age_s) > _OTHER_CLOCK_S:
+            age_s = None
+        data = await self._in_background(encode_view, view, self._wish, age_s=age_s)
+        self._waits_since_s = time.monotonic()
+        await self.write_message(data, binary=True)
+
+    async def _in_background(self, function: Any, *arguments: Any, **named: Any) -> bytes:
+        loop = asyncio.get_running_loop()
+        data: bytes = await loop.run_in_executor(
+            self._server.pictures, lambda: function(*arguments, **named)
+        )
+        return data
+
+    # -- from the page -----------------------------------------------------------------------------
+
+    def on_message(self, message: str | bytes) -> None:
+        """Extend the base class: what the page asks is answered, never raised."""
+        try:
+            told = json.loads(message)
+            if not isinstance(told, dict):
+                raise InvalidValueError("a message that is no object", expected="a JSON object")
+            self._answer(told)
+        except (SemcalError, ValueError, RecursionError) as error:
+            self._tell({"type": "refused", "text": " ".join(str(error).split())})
+
+    def _tell(self, answer: dict[str, object]) -> None:
+        # The page may have been closed meanwhile.
+        if self.ws_connection is not None and not self.ws_connection.is_closing():
+            self.write_message(json.dumps(answer))
+
+    def _answer(self, told: dict[str, Any]) -> None:
+        kind = told.get("type")
+        if kind == "seen":
+            self._waits_since_s = None
+        elif kind == "wish":
+            self._wish = read_wish(told, self._wish)
+            self._changed = True
+        elif kind == "measure":
+            view = self._server.source.newest()
+            self._tell({"type": "measured", "of": str(told.get("of", "")), **measure(view, told)})
+        elif kind == "act" and told.get("action") in ACTIONS:
+            value = told.get("value")
+            task = asyncio.create_task(
+                self._act(told["action"], float(value) if isinstance(value, (int, float)) else None)
+            )
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        else:
+            raise InvalidValueError(
+                f"a message of type {kind!r}", expected="seen, wish, measure or act"
+            )
+
+    async def _act(self, action: str, value: float | None) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            text = await loop.run_in_executor(
+                self._server.actions, self._server.source.act, action, value
+            )
+            done = True
+        except SemcalError as error:
+            text, done = " ".join(str(error).split()), False
+        self._changed = True
+        if action != "seek" or not done:
+            self._tell({"type": "done", "action": action, "success": done, "text": text})

@@ -1,0 +1,110 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the page says of magnification and drift, in words."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.files.images.scale_bar import format_length
+from semcal_ros.viewer.source import DriftPanel, Magnification
+
+__all__ = ["DriftTrace", "describe_magnification", "drift_in_pixels"]
+
+# Points of the trace that the page draws: as many as it has pixels across.
+_DRAWN = 300
+# About a day at ten frames per second would be a million; a smooth way needs far fewer.
+_KEPT = 20_000
+
+
+def describe_magnification(
+    magnification: float | None, calibrated_range: tuple[float, float] | None
+) -> Magnification:
+    """Describe a magnification, and whether a calibration covers it.
+
+    Parameters
+    ----------
+    magnification
+        None while it is not known.
+    calibrated_range
+        The least and greatest magnification of the calibration; None without one.
+    """
+    if magnification is None:
+        return Magnification("unknown", "unknown", "no magnification is published")
+    text = f"{magnification:.6g}×"
+    if calibrated_range is None:
+        return Magnification(text, "unknown", "not calibrated")
+    low, high = calibrated_range
+    told = f"{low:.4g}× to {high:.4g}×"
+    if low * (1 - 1e-9) <= magnification <= high * (1 + 1e-9):
+        return Magnification(text, "ok", f"calibrated, {told}")
+    return Magnification(text, "outside", f"outside the calibration, {told}")
+
+
+def drift_in_pixels(camera: ScanCamera, drift_m: ArrayLike) -> tuple[float, float]:
+    """Return a drift in the sem frame as a way in the raw picture, (x, y) px."""
+    x, y = camera.ideal_from_sem_jacobian @ np.asarray(drift_m, dtype=np.float64)
+    return float(x), float(y)
+
+
+class DriftTrace:
+    """The way of the drift so far."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        self._last: tuple[int, float, float, float] | None = None
+        self._speed_m_s: float | None = None
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._points.clear()
+        self._last = self._speed_m_s = None
+
+    def add(
+        self, stamp_ns: int, x_m: float, y_m: float, sigma_m: float, speed_m_s: float | None = None
+    ) -> None:
+        """Add the drift of a frame; one that is exactly zero, or older than the last, begins anew."""
+        if (x_m == 0.0 and y_m == 0.0) or (self._last and stamp_ns < self._last[0]):
+            self.clear()
+        self._points.append((1e9 * x_m, 1e9 * y_m))
+        self._last = stamp_ns, x_m, y_m, sigma_m
+        self._speed_m_s = speed_m_s
+
+    @property
+    def last(self) -> tuple[int, float, float, float] | None:
+        """Stamp, x, y and 1-sigma (ns, m) of the newest, or None."""
+        return self._last
+
+    def panel(self, missing: str = "no drift is published") -> DriftPanel:
+        """Describe the drift for the page; ``missing`` is said where there is none."""
+        if self._last is None:
+            return DriftPanel(missing)
+        _, x_m, y_m, sigma_m = self._last
+        length = format_length(math.hypot(x_m, y_m))
+        text = f"{length} ± {format_length(sigma_m, 2)} since the start" if sigma_m else length
+        if self._speed_m_s is not None:
+            text += f", {format_length(60.0 * self._speed_m_s)} per minute"
+        points = list(self._points)
+        step = max(1, math.ceil(len(points) / _DRAWN))
+        drawn = points[::step]
+        if drawn[-1] != points[-1]:
+            drawn.append(points[-1])
+        rounded = tuple((round(x, 3), round(y, 3)) for x, y in drawn)
+        return DriftPanel(text, rounded, round(1e9 * sigma_m, 3))
