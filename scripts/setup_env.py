@@ -66,7 +66,7 @@ def update(distro: str, this_python: bool) -> None:
     select(distro)
     files = [
         ROOT / "requirements" / f"{name}.txt"
-        for name in ("base", f"ros-{distro}", "microscope", "test")
+        for name in ("base", f"ros-{distro}", "microscope", "view", "test")
     ]
     wanted = {"distro": distro, "environment": f"{VENV} {digest(files)}"}
     stamp = read_stamp()

@@ -67,7 +67,7 @@ def command(
     """
     require_view()
     try:
-        from semcal_ros.nodes.viewer import main as view
+        from semcal_ros.nodes.viewer import run_viewer
     except ImportError as error:
         raise SemcalError(
             f"ROS 2 cannot be imported ({error})",
@@ -87,4 +87,4 @@ def command(
     for name, value in parameters.items():
         if value:
             arguments += ["-p", f"{name}:={value}"]
-    sys.exit(view(arguments) or 0)
+    sys.exit(run_viewer(arguments))

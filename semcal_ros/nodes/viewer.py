@@ -54,7 +54,7 @@ from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 
-__all__ = ["Viewer", "main"]
+__all__ = ["Viewer", "run_viewer"]
 
 _PARAMETERS = (
     CALIBRATION,
@@ -383,10 +383,6 @@ class Viewer(SemNode):
         return CalibrationPanel(answer, level, overlay=0 if overlay is None else overlay[0])
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
+def run_viewer(args: Sequence[str] | None = None) -> int:
+    """Run the node, which is no executable of its own: ``semcal view`` is its command."""
     return run_node(Viewer, args)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

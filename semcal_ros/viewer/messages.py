@@ -25,6 +25,7 @@ from typing import Any
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length
 from semcal_ros.files.images.write import pixel_scale
+from semcal_ros.viewer.lengths import digits_of, format_with_sigma
 from semcal_ros.viewer.measure import PICTURES, Distance, measure_distance
 from semcal_ros.viewer.pictures import (
     Contrast,
@@ -206,7 +207,7 @@ def describe_distance(distance: Distance, *, calibrated: bool) -> dict[str, obje
         Whether its scale is of a calibration; otherwise it is that of a display width.
     """
     sigma_m = distance.sigma_m
-    text = _with_sigma(distance.length_m, sigma_m)
+    text = format_with_sigma(distance.length_m, sigma_m)
     placing = format_length(distance.placing_sigma_m, 2)
     if distance.calibration_sigma_m is None:
         why = f"the scale is nominal, so its uncertainty is not known; placing the ends: {placing}"
@@ -225,22 +226,8 @@ def describe_distance(distance: Distance, *, calibrated: bool) -> dict[str, obje
     }
 
 
-def _with_sigma(length_m: float, sigma_m: float | None) -> str:
-    """Format a length in um with as many digits as two of its sigma."""
-    if sigma_m is None:
-        return f"{1e6 * length_m:.4g} µm (nominal)"
-    digits = _digits(sigma_m)
-    return f"{1e6 * length_m:.{digits}f} ± {1e6 * sigma_m:.{digits}f} µm"
-
-
 def _coordinate(value_m: float, sigma_m: float | None) -> str:
-    return f"{1e6 * value_m:.{3 if sigma_m is None else _digits(sigma_m)}f}"
-
-
-def _digits(sigma_m: float) -> int:
-    if not sigma_m > 0.0:
-        return 3
-    return min(max(1 - math.floor(math.log10(1e6 * sigma_m)), 0), 6)
+    return f"{1e6 * value_m:.{digits_of(0.0 if sigma_m is None else 1e6 * sigma_m)}f}"
 
 
 def measure(view: View | None, message: dict[str, Any]) -> dict[str, object]:

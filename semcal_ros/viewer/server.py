@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import hmac
 import json
 import logging
@@ -33,7 +34,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tornado import httpserver, netutil, web, websocket
+from tornado import httpserver, web, websocket
 
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.images.write import PixelScale, pixel_scale, write_image
@@ -92,7 +93,7 @@ class PageServer:
         self.local = host in LOCAL_HOSTS
         self.token = "" if self.local else token or secrets.token_urlsafe(16)
         try:
-            self._sockets = netutil.bind_sockets(port, host)
+            self._sockets = _listen(host, port)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise InvalidValueError(
@@ -190,6 +191,32 @@ class PageServer:
         if page in self._pages:
             self._pages.remove(page)
             self.source.watch(len(self._pages))
+
+
+def _listen(host: str, port: int) -> list[socket.socket]:
+    """Listen on all addresses of a host, at the same port."""
+    # tornado's own function leaves sockets open where one of the addresses is taken.
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    sockets: list[socket.socket] = []
+    failed: OSError | None = None
+    for family, _, _, _, address in dict.fromkeys(found):
+        if sockets:
+            address = (address[0], sockets[0].getsockname()[1], *address[2:])
+        try:
+            made = socket.create_server(address, family=family, backlog=128)
+        except OSError as error:
+            # A computer may know an address of IPv6 and not have it; a port that is taken counts for all.
+            if error.errno == errno.EADDRINUSE:
+                for one in sockets:
+                    one.close()
+                raise
+            failed = error
+            continue
+        made.setblocking(False)
+        sockets.append(made)
+    if not sockets:
+        raise failed or OSError(f"no address of {host}")
+    return sockets
 
 
 class _Guarded(web.RequestHandler):

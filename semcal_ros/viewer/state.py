@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.images.scale_bar import format_length
+from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.source import DriftPanel, Magnification
 
 __all__ = ["DriftTrace", "describe_magnification", "drift_in_pixels"]
@@ -52,10 +53,14 @@ def describe_magnification(
     if calibrated_range is None:
         return Magnification(text, "unknown", "not calibrated")
     low, high = calibrated_range
-    told = f"{low:.4g}× to {high:.4g}×"
+    told = f"{_round(low)}× to {_round(high)}×"
     if low * (1 - 1e-9) <= magnification <= high * (1 + 1e-9):
         return Magnification(text, "ok", f"calibrated, {told}")
     return Magnification(text, "outside", f"outside the calibration, {told}")
+
+
+def _round(magnification: float) -> str:
+    return f"{float(f'{magnification:.4g}'):.10g}"
 
 
 def drift_in_pixels(camera: ScanCamera, drift_m: ArrayLike) -> tuple[float, float]:
@@ -97,8 +102,7 @@ class DriftTrace:
         if self._last is None:
             return DriftPanel(missing)
         _, x_m, y_m, sigma_m = self._last
-        length = format_length(math.hypot(x_m, y_m))
-        text = f"{length} ± {format_length(sigma_m, 2)} since the start" if sigma_m else length
+        text = f"{format_with_sigma(math.hypot(x_m, y_m), sigma_m)} since the start"
         if self._speed_m_s is not None:
             text += f", {format_length(60.0 * self._speed_m_s)} per minute"
         points = list(self._points)

@@ -49,14 +49,16 @@ MAY_IMPORT = {
     },
     "nodes": {
         *("core", "applications", "synthetic", "config", "middleware"),
-        *("bridge", "files", "calibration", "drivers", "workflows"),
+        *("bridge", "files", "calibration", "drivers", "workflows", "viewer"),
     },
     # Microscopes are devices, as files are: they know messages by their values only.
     "drivers": {"core", "config", "bridge", "files"},
+    # The page knows streams and recordings by what they show, and no ROS.
+    "viewer": {"core", "config", "bridge", "files", "calibration", "workflows"},
     "doctor": {"core", "config", "middleware", "bridge", "files", "calibration"},
     "cli": {
         *("core", "applications", "synthetic", "config", "middleware", "bridge"),
-        *("files", "report", "calibration", "drivers", "workflows", "nodes", "doctor"),
+        *("files", "report", "calibration", "drivers", "workflows", "viewer", "nodes", "doctor"),
     },
 }
 # The same inside core.

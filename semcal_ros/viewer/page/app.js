@@ -115,7 +115,7 @@ function showStatus(s) {
   const rate = s.rates.find((r) => r.name.includes("corrector")) ?? s.rates[0];
   $("rate").textContent = rate ? `${rate.rate_hz.toFixed(1)} frames/s${rate.latency_ms === null ? "" : `, ${rate.latency_ms.toFixed(0)} ms old`}` : "no frames yet";
   fill($("rates"), s.rates, "tr", (row, r) => {
-    const latency = r.latency_ms === null ? "" : `${r.latency_ms.toFixed(0)} ms, up to ${r.longest_ms.toFixed(0)}`;
+    const latency = r.latency_ms === null ? "" : `${r.latency_ms.toFixed(0)}, ${r.longest_ms.toFixed(0)} ms`;
     fill(row, [r.name, r.rate_hz.toFixed(1), latency], "td", (cell, text) => setText(cell, text));
   });
   fill($("notes"), s.notes, "li", (item, note) => {

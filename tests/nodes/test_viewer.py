@@ -1,0 +1,213 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal view`` in a real browser, with the nodes behind it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from sensor_msgs.msg import Image
+
+from tests.helpers.chromium import BROWSER, Page, chromium
+from tests.helpers.project import ROOT
+from tests.helpers.ros_process import Peer, running
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.flaky(reruns=1),
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed"),
+]
+SIZE = 96
+SEM = {
+    "specimen": "gold",
+    "drift": "fast",
+    "magnification": 4000.0,
+    "rate": 10.0,
+    "width": SIZE,
+    "height": SIZE,
+}
+START_S = 60.0
+
+
+@contextmanager
+def viewing(*arguments: str) -> Iterator[str]:
+    """``semcal view`` as a user starts it; the address that it prints."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "semcal_ros", "view", "--port", "0", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            said = ""
+            deadline = time.monotonic() + START_S
+            while not (found := re.search(r"open (http://\S+?)(;|\s|$)", said)):
+                line = process.stdout.readline()
+                assert line and time.monotonic() < deadline, said
+                said += line
+            yield found[1]
+        finally:
+            process.terminate()
+            process.wait(30)
+        assert process.returncode == 0
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    with chromium(tmp_path / "profile") as made:
+        yield made
+
+
+def bright(page: Page, picture: str) -> float:
+    """Standard deviation of the grey levels on the canvas of a picture."""
+    return float(
+        page.evaluate(
+            f"(() => {{ const c = document.querySelector('figure[data-picture={picture}] canvas');"
+            " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let s = 0, q = 0, n = 0;"
+            " for (let i = 0; i < d.length; i += 4) { s += d[i]; q += d[i] * d[i]; n += 1; }"
+            " return Math.sqrt(q / n - (s / n) ** 2); })()"
+        )
+    )
+
+
+def press(page: Page, action: str) -> None:
+    """Press a button once somebody offers what it does."""
+    page.wait_for(f"!document.querySelector('[data-action={action}]').disabled")
+    page.click(f"[data-action={action}]")
+
+
+def fits(page: Page) -> None:
+    """Nothing is wider than the window, and no text is smaller than 12 px."""
+    wide, small = page.evaluate(
+        "[document.documentElement.scrollWidth - innerWidth,"
+        " [...document.querySelectorAll('body *')].filter(e => e.textContent.trim() &&"
+        " parseFloat(getComputedStyle(e).fontSize) < 12).length]"
+    )
+    assert (wide, small) == (0, 0)
+
+
+def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
+    raw = peer.node.get_publishers_info_by_topic
+    with (
+        running("virtual_sem", SEM),
+        running("stream_corrector", {"calibration": calibration_file}),
+        viewing("--calibration", str(calibration_file)) as address,
+    ):
+        peer.wait_for(lambda: raw("/sem/image_rect"), "the corrector")
+
+        def watched() -> int:
+            return sum(
+                one.node_name == "viewer"
+                for one in peer.node.get_subscriptions_info_by_topic("/sem/image_raw")
+            )
+
+        peer.wait_for(lambda: raw("/sem/image_raw"), "the microscope")
+        assert watched() == 0
+        for width in (1280, 390):
+            page.size(width, 844)
+            page.open(address)
+            page.wait_for(
+                "!document.querySelector('#snap-corrected').hasAttribute('aria-disabled')"
+            )
+            page.wait_for("document.querySelector('#magnification').textContent === '4000×'")
+            page.wait_for("document.querySelector('#range').textContent.startsWith('calibrated')")
+            assert "±" in page.text("#pixel")
+            for picture in ("raw", "corrected"):
+                # A picture of gold uses the whole range; an empty canvas is 0.
+                assert bright(page, picture) > 30.0
+            peer.wait_for(lambda: watched() == 1, "the subscription")
+            page.wait_for("document.querySelector('#drift-text').textContent.includes('±')")
+            page.wait_for(
+                "document.querySelector('#rates').textContent.includes('stream_corrector')"
+            )
+            fits(page)
+
+            x, y, w, h = page.box("figure[data-picture=corrected] canvas")
+            page.drag([(x + f * w, y + 0.5 * h) for f in (0.25, 0.5, 0.75)])
+            # While the mouse moves, shorter ways are measured.
+            page.wait_for("parseFloat(document.querySelector('#ruler').textContent) > 10")
+            found = re.match(r"([\d.]+) ± ([\d.]+) µm", page.text("#ruler"))
+            assert found is not None
+            # Half of the field of view of 0.12 m / 4000 on the nominal scale, which this calibration
+            # changes by a per cent or two; an end is placed to a pixel of the screen.
+            assert float(found[1]) == pytest.approx(15.0, rel=0.05)
+            assert "calibration" in page.text("#why")
+
+            press(page, "reset")
+            page.wait_for("document.querySelector('#answer').className === 'ok'")
+            press(page, "stop")
+            page.wait_for("document.querySelector('#answer').textContent.includes('stop')")
+            images = peer.collect(Image, "image_raw")
+            peer.spin(1.0)
+            count = len(images)
+            peer.spin(1.0)
+            assert len(images) == count
+            press(page, "start")
+            peer.wait_for(lambda n=count, i=images: len(i) > n, "frames again")
+
+            page.click("[data-layout=blink]")
+            for picture in ("raw", "corrected", "raw"):
+                page.wait_for(
+                    f"!document.querySelector('figure[data-picture={picture}]').hidden", 5.0
+                )
+            page.click("[data-layout=corrected]")
+            page.click("#zoom-in")
+            page.wait_for("document.querySelector('#zoom').textContent === '1.5×'")
+            fits(page)
+            page.click("#zoom-all")
+        page.open("about:blank")
+        peer.wait_for(lambda: watched() == 0, "the end of the subscription")
+    assert page.console == []
+
+
+def test_the_page_says_that_the_viewer_has_ended_and_goes_on_when_it_is_back(page: Page) -> None:
+    with viewing() as address:
+        page.size(390, 844)
+        page.open(address)
+        page.wait_for("document.querySelector('#link').textContent === 'connected'")
+        page.wait_for("document.querySelector('#notes').textContent.includes('no node')")
+        fits(page)
+    page.wait_for("document.querySelector('#link').className.includes('error')")
+    port = address.rstrip("/").rpartition(":")[2]
+    with viewing("--port", port):
+        page.wait_for("document.querySelector('#link').textContent === 'connected'")
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
+    with viewing() as address:
+        port = address.rstrip("/").rpartition(":")[2]
+        done = subprocess.run(
+            [sys.executable, "-m", "semcal_ros", "view", "--port", port],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            timeout=START_S,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert "--port 0" in done.stderr
+    assert "Traceback" not in done.stderr
