@@ -38,7 +38,8 @@ __all__ = [
 
 # Standard deviations of 1 km and of 1000 rad.
 UNKNOWN_VARIANCE = 1e6
-"""Variance of what is not observed (height in m2, rotations in rad2): beyond anything physical."""
+"""Variance of what is not observed (height in m2, rotations in rad2, a drift that was never measured): beyond anything
+physical, and finite, since filters that take such messages multiply with it."""
 
 # Relative to the largest entry: above the rounding of single precision (6e-8).
 _SYMMETRY_TOLERANCE = 1e-6
@@ -61,7 +62,7 @@ def fill_drift(
         (2,) displacement in m: what lay at X is seen at X + drift.
     covariance
         (4, 4) covariance of ``[x, y, vx, vy]`` as the tracker gives it, or its (2, 2) position
-        block, m2.
+        block, m2. Infinite variances become :data:`UNKNOWN_VARIANCE`.
     header
         Header of the image, copied verbatim.
     rotation
@@ -71,8 +72,8 @@ def fill_drift(
     Raises
     ------
     InvalidValueError
-        A value is not finite, or the covariance is not a symmetric matrix of that size with
-        positive diagonal.
+        A value is not finite (variances may be infinite), or the covariance is not a symmetric matrix of
+        that size with positive diagonal.
     """
     x, y = _pair(drift_m, "drift")
     block = _block(covariance, 0)
@@ -150,15 +151,25 @@ def _block(covariance: ArrayLike, first: int) -> Array:
     matrix = whole = _floats(covariance, "covariance")
     if matrix.shape == (4, 4):
         matrix = matrix[first : first + 2, first : first + 2]
+    if matrix.shape == (2, 2) and np.isfinite(matrix[0, 1] + matrix[1, 0]):
+        matrix = _bound(matrix)
     if matrix.shape != (2, 2) or not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
         raise InvalidValueError(
             f"a covariance of shape {whole.shape}",
-            expected="a finite (4, 4) or (2, 2) matrix with a diagonal that is not negative",
+            expected="a (4, 4) or (2, 2) matrix of numbers with a diagonal that is not negative",
         )
     scale = float(np.max(np.abs(matrix)))
     if abs(matrix[0, 1] - matrix[1, 0]) > _SYMMETRY_TOLERANCE * scale:
         raise InvalidValueError(f"a covariance {matrix.tolist()}", expected="a symmetric matrix")
     return matrix
+
+
+def _bound(matrix: Array) -> Array:
+    """A (2, 2) covariance with what is infinite in it at :data:`UNKNOWN_VARIANCE`."""
+    unknown = np.isposinf(np.diag(matrix))
+    bounded = np.where(unknown[:, None] | unknown[None, :], 0.0, matrix)
+    bounded[unknown, unknown] = UNKNOWN_VARIANCE
+    return bounded
 
 
 def _six_by_six(block: Array, about_z: tuple[float, float] | None) -> Array:

@@ -102,4 +102,10 @@ def command(
             err=True,
         )
     echo_states(done.states)
+    if not no_drift and done.frame_count > 1 and not done.followed:
+        click.echo(
+            f"warning: none of {counted(done.frame_count, 'frame')} was tracked: the drift is not known, "
+            "and was left in",
+            err=True,
+        )
     click.echo(f"{counted(done.frame_count, 'frame')}: {output}")

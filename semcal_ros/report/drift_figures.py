@@ -311,8 +311,8 @@ def _draw_drift(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) ->
 
 
 def _draw_rate(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array) -> None:
-    # A single frame gives no rate: its uncertainty is stated as zero.
-    known = path.velocity_sigma_m_s > 0.0
+    # Before a frame was matched there is no rate: its uncertainty is infinite; one of zero is none either.
+    known = np.isfinite(path.velocity_sigma_m_s) & (path.velocity_sigma_m_s > 0.0)
     rate = np.where(known, path.velocity_m_s, np.nan)
     unit = _choose_unit(path, rate, "/s")
     style_axes(axes, xlabel="", ylabel=f"drift rate ({unit.name})")
@@ -349,7 +349,8 @@ def _draw_residual(axes: Axes, path: DriftPath, kinds: list[_Kind], time: Array)
 def _draw_bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask) -> None:
     """Draw both axes with bands; a few very uncertain frames do not set the limits."""
     for k, (name, color, line) in enumerate((("x", OURS, "-"), ("y", SECOND, "--"))):
-        half = np.where(np.isfinite(values[:, k]), _BAND * sigma[:, k], np.nan)
+        known = np.isfinite(values[:, k]) & np.isfinite(sigma[:, k])
+        half = np.where(known, _BAND * sigma[:, k], np.nan)
         axes.fill_between(
             time,
             values[:, k] - half,
@@ -373,7 +374,7 @@ def _draw_bands(axes: Axes, time: Array, values: Array, sigma: Array, good: Mask
     shown = values[np.isfinite(values)]
     if not shown.size:
         return
-    usual = good[:, None] & np.isfinite(values)
+    usual = good[:, None] & np.isfinite(values) & np.isfinite(sigma)
     half_width = float(np.quantile(_BAND * sigma[usual], 0.9)) if usual.any() else 0.0
     low, high = float(shown.min()) - half_width, float(shown.max()) + half_width
     room = 0.06 * (high - low) if high > low else 1.0

@@ -109,6 +109,8 @@ class RectifiedRecording:
         Number of frames outside the calibrated range.
     notes
         Notes for the user.
+    followed
+        Whether any frame was matched with another one; if not, no drift was measured and it was left in.
     """
 
     frame_count: int
@@ -117,6 +119,7 @@ class RectifiedRecording:
     states: Mapping[str, int]
     extrapolated: int
     notes: tuple[str, ...]
+    followed: bool = False
 
     @property
     def images(self) -> tuple[AnyImage, ...]:
@@ -198,7 +201,7 @@ def rectify(
     target = None if output is None else Path(output)
     frames: list[RectifiedFrame] = []
     states: Counter[str] = Counter()
-    extrapolated, count = 0, 0
+    extrapolated, count, matched = 0, 0, 0
     with ExitStack() as open_files:
         workers = open_files.enter_context(open_workers(dask))
         opened = open_files.enter_context(open_source(source, microscope))
@@ -224,6 +227,7 @@ def rectify(
             extrapolated += not camera.in_range
             if update is not None:
                 states[update.kind] += 1
+                matched += update.accepted
             if write is None:
                 frames.append(RectifiedFrame(image, frame.stamp_ns, camera.rectified, update))
             else:
@@ -233,7 +237,9 @@ def rectify(
         on_progress("finishing", 0, None)
         notes = (*opened.notes, *_note_timing(microscope, follower, model))
     kinds = dict(states.most_common())
-    return RectifiedRecording(count, target, tuple(frames), kinds, extrapolated, notes)
+    return RectifiedRecording(
+        count, target, tuple(frames), kinds, extrapolated, notes, followed=matched > 1
+    )
 
 
 _Write = Callable[[RecordedFrame, AnyImage, ScanCamera, "DriftUpdate | None"], None]

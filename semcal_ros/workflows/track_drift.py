@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,10 +93,7 @@ class DriftTrack:
         InvalidValueError
             If that is negative or not finite.
         """
-        forecast = self.predictor.at(float(self.path.time_s[-1]) + after_s)
-        if self.path.followed:
-            return forecast
-        return replace(forecast, covariance=np.diag(np.full(4, np.inf)))
+        return self.predictor.at(float(self.path.time_s[-1]) + after_s)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table of ``semcal drift``.
@@ -189,7 +186,7 @@ def track_drift(
             stamps_ns, follower = _follow(opened, model, microscope, on_progress)
             on_progress("smoothing", 0, None)
         notes = [*opened.notes, *([note] if note else [])]
-    path = _state_ignorance(follower.path(live=live))
+    path = follower.path(live=live)
     if path.turns:
         notes.append(_describe_similarity(path))
     return DriftTrack(
@@ -199,19 +196,6 @@ def track_drift(
         follower.tracker.predictor(),
         microscope,
         tuple(notes),
-    )
-
-
-def _state_ignorance(path: DriftPath) -> DriftPath:
-    """Make the covariance infinite where no frame was matched: the filter's is that of a typical drift only."""
-    if path.followed:
-        return path
-    unknown = np.diag(np.full(4, np.inf))
-    return DriftPath(
-        [
-            update if trusted else replace(update, covariance=unknown)
-            for update, trusted in zip(path.updates, path.trusted, strict=True)
-        ]
     )
 
 

@@ -167,6 +167,19 @@ def test_drift_velocity(new: New, header: Any) -> None:
     np.testing.assert_array_equal(np.reshape(message.twist.covariance, (6, 6)), matrix)
 
 
+def test_a_drift_that_was_never_measured_has_the_variance_of_the_unknown(
+    new: New, header: Any
+) -> None:
+    message, twist = new(POSE), new(TWIST)
+    covariance = np.diag([4e-18, np.inf, np.inf, np.inf])
+    fill_drift(message, [0.0, 0.0], covariance, header)
+    fill_drift_velocity(twist, [0.0, 0.0], covariance, header)
+    sent = np.reshape(through_the_wire(message).pose.covariance, (6, 6))
+    assert np.array_equal(sent, np.diag([4e-18, *[UNKNOWN_VARIANCE] * 5]))
+    sent = np.reshape(through_the_wire(twist).twist.covariance, (6, 6))
+    assert np.array_equal(sent, UNKNOWN_VARIANCE * np.eye(6))
+
+
 def test_a_specimen_that_turns_does_so_about_z(new: New, header: Any) -> None:
     update = make_drift_update(
         similarity=np.array([0.02, 1e-3, 3e-4, 1e-5]),

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``semcal drift`` and ``semcal stack`` where little or nothing can be tracked."""
+"""``semcal drift``, ``stack`` and ``rectify`` where little or nothing can be tracked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from rosbags.highlevel import AnyReader
 
+from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
+from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import run
 
 GIVEN = ("--pixel-size", "10nm", "--frame-interval", "1s")
@@ -82,3 +85,26 @@ def test_a_single_frame_is_its_own_stack_and_drift(tmp_path, capsys):
     assert run("info", source, *GIVEN) == 0
     captured = capsys.readouterr()
     assert "rate" not in captured.out and "warning" not in captured.err
+
+
+def test_rectify_says_that_the_drift_was_left_in(tmp_path, capsys):
+    make_calibration().save(tmp_path / "cal.yaml")
+    given = (
+        "--pixel-size",
+        "600nm",
+        "--frame-interval",
+        "1s",
+        "--calibration",
+        tmp_path / "cal.yaml",
+    )
+    for seeds, expected in ((range(4), True), ((0, 0), False)):
+        source = folder(tmp_path / f"places{len(seeds)}", seeds)
+        assert run("rectify", source, *given, "-o", tmp_path / f"flat{len(seeds)}.tif") == 0
+        assert ("was tracked: the drift is not known" in capsys.readouterr().err) == expected
+    # On the topics of a bag, as on those of the nodes: what is not observed.
+    assert run("rectify", tmp_path / "places4", *given, "-o", tmp_path / "bag") == 0
+    with AnyReader([tmp_path / "bag"]) as reader:
+        links = [c for c in reader.connections if c.topic == "/sem/drift"]
+        drifts = [reader.deserialize(m[2], m[0].msgtype).pose for m in reader.messages(links)]
+    assert drifts[0].covariance[0] < 1e-12
+    assert len(drifts) == 4 and all(d.covariance[0] == UNKNOWN_VARIANCE for d in drifts[1:])

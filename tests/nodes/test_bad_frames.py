@@ -39,6 +39,7 @@ from tests.helpers.stream_bench import (
     Kind,
     Watch,
     bench_of,
+    noisy,
     pixels,
     resident_kib,
 )
@@ -200,6 +201,28 @@ ABSURD = [
     5e-324,  # the smallest denormal
     0.999,
 ]
+
+
+@pytest.mark.parametrize("kind", ["drift_compensator", "stream_corrector"], indirect=True)
+def test_a_stream_that_was_never_tracked_claims_no_drift(bench: Bench) -> None:
+    """Each frame shows another place: what the filter expects of a typical drift is no measurement."""
+    bench.set_magnification(MAGNIFICATION)
+    for seed in range(4):
+        bench.exchange(texture(seed + 10))
+    for messages in (bench.drifts, bench.velocities):
+        bench.peer.wait_for(lambda m=messages: len(m) >= 3, "drift")
+    drifts = {m.header.stamp.sec: m.pose.covariance for m in bench.drifts}
+    velocities = {m.header.stamp.sec: m.twist.covariance for m in bench.velocities}
+    pixel_m = CALIBRATION.at(MAGNIFICATION).pixel_size_m[0]
+    for stamp, covariance in drifts.items():
+        # At the first frame the drift is zero by definition.
+        known = 0.0 <= covariance[0] ** 0.5 < pixel_m
+        assert known if stamp == 1 else (covariance[0], covariance[7]) == (1e6, 1e6)
+    assert all((c[0], c[7]) == (1e6, 1e6) for c in velocities.values())
+    # The first frame but for its noise: now it is known.
+    bench.exchange(noisy(texture(10), 1))
+    bench.peer.wait_for(lambda: bench.drifts[-1].header.stamp.sec == bench.sent, "its drift")
+    assert bench.drifts[-1].pose.covariance[0] < 1e6
 
 
 def test_an_absurd_magnification_is_refused_and_the_old_one_not_used_on(bench: Bench) -> None:

@@ -458,6 +458,8 @@ class _SeriesMeasurement:
         """Fit the bending of a frame against the reference."""
         length, normal, path = self._settings.length_m, undeformed.axis.normal, self._path
         covariance = path.covariance[:, :2, :2]
+        # It is infinite where nothing was tracked at all.
+        covariance = np.where(np.isfinite(covariance), covariance, _UNTRACKED_M**2)
         before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
         offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
         if not _is_tied(path, frame, reference):

@@ -42,6 +42,7 @@ __all__ = [
     "DriftSettings",
     "DriftStatus",
     "DriftUpdate",
+    "forget_prior",
 ]
 
 
@@ -130,7 +131,8 @@ class DriftEstimate:
         px/s and px/s^2 of the raw image where there is no camera.
     covariance
         (4, 4) of ``[x, y, vx, vy]`` in those units: from the noise of all images on the way and
-        from the covariance of the camera's scale.
+        from the covariance of the camera's scale. Infinite where nothing was measured yet, except for
+        the position of the first frame, where the drift is zero by definition.
     similarity, similarity_covariance
         (4,) rotation of the image (rad, from x towards y) and logarithm of its scale since the first frame,
         about the origin of the sem frame (the middle of the image without a camera), and their rates
@@ -197,6 +199,9 @@ class DriftUpdate(DriftEstimate):
         Time of the keyframe that the frame was compared with; NaN where there was none.
     merged
         Whether the frame became part of that keyframe's mean.
+    doubt
+        (2, 2) the part of the covariance that is due to images that contradict the prediction, this one or
+        those before; zero where the drift rests on the frame's own image.
     """
 
     status: DriftStatus
@@ -210,6 +215,7 @@ class DriftUpdate(DriftEstimate):
     shear_covariance: Array
     keyframe_time_s: float
     merged: bool
+    doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
     @property
     def accepted(self) -> bool:
@@ -256,12 +262,18 @@ class DriftPredictor:
         Camera of the last frame, or None for drift in px.
     similarity
         Predictor of rotation and scale, or None where there are none.
+    doubt
+        (2, 2) by how much the drift may be off because the last frames contradict it.
+    measured
+        Whether any drift was measured; if not, a prediction has an infinite covariance.
     """
 
     state: DriftState
     process_noise: ProcessNoise
     camera: ScanCamera | None
     similarity: SimilarityPredictor | None = None
+    doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
+    measured: bool = field(default=True, kw_only=True)
 
     @property
     def time_s(self) -> float:
@@ -288,7 +300,11 @@ class DriftPredictor:
         covariance = both @ self.state.covariance[:MOTION_SIZE, :MOTION_SIZE] @ both.T
         covariance[0::2, 0::2] += noise[:2, :2]
         covariance[1::2, 1::2] += noise[:2, :2]
-        covariance[:2, :2] += self.process_noise.flicker_covariance
+        covariance[:2, :2] += self.process_noise.flicker_covariance + self.doubt
+        if not self.measured:
+            return DriftEstimate(
+                time_s, motion[0], motion[1], motion[2], forget_prior(covariance, is_first=False)
+            )
         if self.similarity is None:
             covariance += scale_covariance(self.camera, motion[0], motion[1])
             return DriftEstimate(time_s, motion[0], motion[1], motion[2], covariance)
@@ -304,6 +320,17 @@ class DriftPredictor:
             similarity=similarity.mean,
             similarity_covariance=similarity.covariance,
         )
+
+
+def forget_prior(covariance: Array, *, is_first: bool) -> Array:
+    """Covariance (4, 4) of a drift of which nothing was measured: the filter's is that of a typical drift only.
+
+    ``is_first`` keeps the (2, 2) block of the position of the first frame, which is zero by definition.
+    """
+    unknown = np.diag(np.full(4, np.inf))
+    if is_first:
+        unknown[:2, :2] = covariance[:2, :2]
+    return unknown
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,10 @@ class DriftHistory:
             )
         updates: list[DriftUpdate] = []
         for drift_filter, similarity, stretch in self._stretches:
+            if drift_filter.measured == 0:
+                # Nothing to smooth, and the prior is not knowledge.
+                updates.extend(stretch)
+                continue
             process_noise = drift_filter.process_noise
             if process_noise.psd > 0.0:
                 process_noise = estimate_process_noise(
@@ -74,13 +78,27 @@ class DriftHistory:
                 )
             states = smooth(drift_filter.start, drift_filter.events, process_noise)
             turns, first_s = similarity.smooth(), drift_filter.start.time_s
-            for update, state, turn in zip(stretch, states, turns, strict=True):
+            resolved = _find_resolved(stretch)
+            for k, (update, state, turn) in enumerate(zip(stretch, states, turns, strict=True)):
                 camera = self._cameras[len(updates)]
                 smoothed = _smoothed(update, state, turn, camera)
+                if not resolved[k]:
+                    smoothed.covariance[:2, :2] += update.doubt
                 if update.time_s > first_s:
                     smoothed.covariance[:2, :2] += process_noise.flicker_covariance
                 updates.append(smoothed)
         return DriftPath(tuple(updates))
+
+
+def _find_resolved(stretch: list[DriftUpdate]) -> list[bool]:
+    """Whether each frame, or one after it, was matched with the keyframes from before it: the specimen
+    came back to where the path expects it.
+    """
+    resolved, after = [], False
+    for update in reversed(stretch):
+        after = not update.restarted and (after or update.accepted)
+        resolved.append(after)
+    return resolved[::-1]
 
 
 def _smoothed(

@@ -42,6 +42,7 @@ from semcal_ros.core.drift.estimates import (
     DriftSettings,
     DriftStatus,
     DriftUpdate,
+    forget_prior,
 )
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.flicker import FlickerEstimator
@@ -55,7 +56,7 @@ from semcal_ros.core.drift.gating import (
     judge_shift,
 )
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.keyframe import make_keyframe
+from semcal_ros.core.drift.keyframe import Keyframe, make_keyframe
 from semcal_ros.core.drift.keyframe_store import Candidate, KeyframeStore
 from semcal_ros.core.drift.measurement import (
     add_zoom_uncertainty,
@@ -76,7 +77,7 @@ from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import similarity_matrix
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
-from semcal_ros.core.registration.reference import Region
+from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
 
 __all__ = ["DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
@@ -110,6 +111,8 @@ _MAX_SHEAR = 0.1
 _MAX_TURN_PX = 0.1
 # Divisions by intervals stay finite.
 _MIN_INTERVAL_S = 1e-9
+# What an image looks like that shows another place: the prediction need not hold.
+_ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
 
 
 @dataclass
@@ -117,7 +120,8 @@ class _Track:
     """Everything that is known since the drift was zero.
 
     ``camera`` and ``time_s`` are those of the latest frame, ``sample`` is some of its pixels, and
-    ``rejected`` is the number of frames in a row that did not match.
+    ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
+    frames that contradict the prediction add to the covariance of the drift, until one matches.
     """
 
     filter: DriftFilter
@@ -127,6 +131,7 @@ class _Track:
     sample: bytes
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
+    doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
     similarity: SimilarityTracker = field(
         default_factory=lambda: SimilarityTracker(keeps_history=False)
@@ -222,7 +227,14 @@ class DriftTracker:
             )
         state = track.filter.state.without_keyframes()
         similarity = track.similarity.predictor()
-        return DriftPredictor(state, track.filter.process_noise, track.camera, similarity)
+        return DriftPredictor(
+            state,
+            track.filter.process_noise,
+            track.camera,
+            similarity,
+            doubt=track.doubt,
+            measured=track.filter.measured > 0,
+        )
 
     def update(
         self,
@@ -307,9 +319,7 @@ class DriftTracker:
     ) -> Rejection[MatchFailure] | None:
         """Make this frame a keyframe that was not measured; why it cannot be one, or None."""
         turn, time_s = track.similarity.position, track.filter.state.time_s
-        image, region = self._corrector.corrected_image(frame, removed, turn, track.similarity.rate)
-        keyframe = make_keyframe(frame, removed, image, region, time_s, turn)
-        reference = keyframe.prepare_reference(self.settings.registration)
+        keyframe, reference = self._prepare_keyframe(track, frame, removed)
         if reference.defect:
             return Rejection(MatchFailure.UNUSABLE_IMAGE, reference.defect)
         key, forgotten = track.store.add(keyframe, reference)
@@ -318,6 +328,15 @@ class DriftTracker:
         for old in forgotten:
             track.forget(old)
         return None
+
+    def _prepare_keyframe(
+        self, track: _Track, frame: ScanFrame, removed: Array
+    ) -> tuple[Keyframe, Reference]:
+        """A frame as a keyframe, and the reference that it would be."""
+        turn, time_s = track.similarity.position, track.filter.state.time_s
+        image, region = self._corrector.corrected_image(frame, removed, turn, track.similarity.rate)
+        keyframe = make_keyframe(frame, removed, image, region, time_s, turn)
+        return keyframe, keyframe.prepare_reference(self.settings.registration)
 
     # -- every other frame ------------------------------------------------------------------------
 
@@ -584,6 +603,7 @@ class DriftTracker:
         """Choose the keyframe for the frames that follow, and improve its mean."""
         store, state = track.store, track.filter.state
         track.rejected = 0
+        track.doubt = np.zeros((2, 2))
         track.outliers.reset(state)
         registration, candidate = match.registration, match.candidate
         if candidate.ratio > _SMALL_ZOOM:
@@ -619,7 +639,9 @@ class DriftTracker:
         """
         # The first one is that of the best keyframe.
         rejection, registration = rejected[0].rejection, rejected[0].registration
-        disputed = next((r.disputed for r in rejected[::-1] if r.disputed is not None), None)
+        doubt = self._doubt(track, frame, rejected)
+        if doubt is not None:
+            track.doubt = doubt
         # A blanked beam says nothing about the keyframe.
         is_of_keyframe = rejection.status not in IMAGE_FAILURES
         track.rejected += is_of_keyframe
@@ -627,7 +649,7 @@ class DriftTracker:
         since_s = max(state.time_s - track.time_s, _MIN_INTERVAL_S)
         is_lost = track.rejected >= self.settings.lost_after
         if is_lost:
-            reach_px = self.settings.max_jump * max(frame.size)
+            reach_px = self._reach_px(frame)
             speed_px_s = self.settings.first_step_px / since_s
             track.filter.apply(inflate_when_lost(frame.px_from_unit, reach_px, speed_px_s))
         else:
@@ -636,22 +658,41 @@ class DriftTracker:
             if inflation is not None:
                 track.filter.apply(inflation)
         if is_lost or (rescaled and is_of_keyframe):
-            return self._restart(track, frame, rejection, disputed)
+            return self._restart(track, frame, rejection)
         return _make_update(
-            track,
-            frame,
-            DriftStatus.COASTING,
-            rejection,
-            registration=registration,
-            disputed=disputed,
+            track, frame, DriftStatus.COASTING, rejection, registration=registration
         )
+
+    def _reach_px(self, frame: ScanFrame) -> float:
+        """How far away the place may be that an image shows which matches nothing."""
+        return self.settings.max_jump * max(frame.size)
+
+    def _doubt(
+        self, track: _Track, frame: ScanFrame, rejected: list[_RejectedMatch]
+    ) -> Array | None:
+        """By how much, as a (2, 2) covariance, the drift may be off where an image does not match; None
+        where the image says nothing about that.
+        """
+        disputed = next((r.disputed for r in rejected[::-1] if r.disputed is not None), None)
+        if disputed is not None:
+            return disputed
+        best = rejected[0]
+        if best.rejection.status not in _ELSEWHERE:
+            return None
+        if best.rejection.status is MatchFailure.NO_PEAK:
+            motion = track.filter.state.motion
+            removed = motion if _is_removable(motion, frame) else np.zeros(4)
+            if self._prepare_keyframe(track, frame, removed)[1].defect:
+                # Noise matches nothing, wherever the specimen is.
+                return None
+        unit = np.linalg.inv(frame.px_from_unit) * self._reach_px(frame)
+        return np.asarray(unit @ unit.T)
 
     def _restart(
         self,
         track: _Track,
         frame: ScanFrame,
         rejection: Rejection[MatchFailure],
-        disputed: Array | None = None,
     ) -> DriftUpdate:
         """Go on from the predicted drift with this frame as keyframe."""
         unmatched = track.filter.pending
@@ -668,7 +709,6 @@ class DriftTracker:
             frame,
             DriftStatus.COASTING,
             defect or rejection,
-            disputed=disputed,
             restarted=defect is None,
         )
 
@@ -719,7 +759,6 @@ def _make_update(
     *,
     registration: Registration | None = None,
     overlap: float = float("nan"),
-    disputed: Array | None = None,
     restarted: bool = False,
 ) -> DriftUpdate:
     """The drift at a frame; ``overlap`` is for a frame without a registration."""
@@ -737,8 +776,9 @@ def _make_update(
     covariance = covariance + scale_covariance(frame.camera, motion[0], motion[1])
     if not is_first:
         covariance[:2, :2] += track.filter.process_noise.flicker_covariance
-    if disputed is not None:
-        covariance[:2, :2] += disputed
+    covariance[:2, :2] += track.doubt
+    if track.filter.measured == 0:
+        covariance = forget_prior(covariance, is_first=is_first)
     alignment = None if registration is None else registration.alignment
     return DriftUpdate(
         time_s=state.time_s,
@@ -761,4 +801,5 @@ def _make_update(
         merged=False,
         similarity=similarity.mean,
         similarity_covariance=similarity.covariance,
+        doubt=track.doubt,
     )

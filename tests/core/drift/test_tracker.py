@@ -28,6 +28,7 @@ from scipy import ndimage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.failures import MatchFailure
@@ -408,3 +409,76 @@ def test_after_a_restart_the_place_is_uncertain() -> None:
     # Where the other place lies is unknown within a jump that would be refused.
     assert np.all(np.sqrt(np.diag(updates[-1].covariance)[:2]) > 30.0)
     assert updates[restart + 2].accepted
+
+
+def _track(views: list[np.ndarray]) -> tuple[list[DriftUpdate], DriftTracker, DriftHistory]:
+    history = DriftHistory()
+    tracker = DriftTracker(history=history)
+    updates = [tracker.update(view, float(k)) for k, view in enumerate(views)]
+    return updates, tracker, history
+
+
+@pytest.mark.parametrize("kind", ["another place each time", "noise", "blank"])
+def test_what_was_never_measured_has_no_sigma(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    views = {
+        "another place each time": [
+            noisy(Texture(k).view((0.0, 0.0), 160), 4.0, k) for k in range(4)
+        ],
+        "noise": [rng.normal(128.0, 20.0, (160, 160)) for _ in range(4)],
+        "blank": [np.full((160, 160), 7.0)] * 4,
+    }[kind]
+    updates, tracker, history = _track(views)
+    has_zero = kind == "another place each time"
+    for path in (updates, history.smooth().updates):
+        # The drift of the first frame is zero by definition, if it can be compared with anything.
+        assert np.all(np.diag(path[0].covariance)[:2] == (0.0 if has_zero else np.inf))
+        assert np.all(np.diag(path[0].covariance)[2:] == np.inf)
+        assert all(np.all(np.diag(u.covariance) == np.inf) for u in path[1:])
+    assert np.all(np.diag(tracker.predictor().at(9.0).covariance) == np.inf)
+
+
+def test_a_blank_frame_before_the_first_keyframe_is_not_at_zero() -> None:
+    texture = Texture(4)
+    blank = np.full((160, 160), 7.0)
+    seen = [noisy(texture.view((0.5 * k, 0.0), 160), 4.0, k) for k in range(4)]
+    _, _, history = _track([blank, blank, *seen])
+    sigma = history.smooth().sigma_m
+    assert np.all(np.isinf(sigma[:2])) and np.all(sigma[2:] < 0.1)
+
+
+@pytest.mark.parametrize("frames_at_end", [1, 3, 7])
+def test_another_place_at_the_end_is_covered_at_once(frames_at_end: int) -> None:
+    """110 px away nothing is left to compare with; the drift before was steady to 0.01 px."""
+    texture, truth = Texture(4), [(0.5 * k, -0.2 * k) for k in range(8)]
+    truth += [(0.5 * k + 110.0, -0.2 * k + 110.0) for k in range(8, 8 + frames_at_end)]
+    views = [noisy(texture.view(d, 128), 4.0, k) for k, d in enumerate(truth)]
+    updates, tracker, history = _track(views)
+    assert not any(u.accepted for u in updates[8:])
+    for path in (updates, history.smooth().updates):
+        sigma = np.array([np.sqrt(np.diag(u.covariance)[:2]) for u in path])
+        error = np.abs(np.array([u.drift_px for u in path]) - truth)
+        # 1-sigma is max_jump, a quarter of the field: 32 px.
+        assert np.all(error[8:] < 4.0 * sigma[8:])
+        assert np.all(sigma[:8] < 0.5)
+    # The forecast knows it, too.
+    assert np.sqrt(tracker.predictor().at(len(truth) - 0.5).covariance[0, 0]) > 30.0
+
+
+def test_noise_instead_of_a_frame_says_nothing_about_the_place() -> None:
+    """A burst of noise is no reason to doubt the drift: it coasts, as through a blanked beam."""
+    texture, rng = Texture(4), np.random.default_rng(1)
+    views = [noisy(texture.view((0.5 * k, 0.0), 160), 4.0, k) for k in range(8)]
+    updates, _, _ = _track([*views, *(rng.normal(128.0, 40.0, (160, 160)) for _ in range(3))])
+    assert not any(u.accepted for u in updates[8:])
+    assert all(np.sqrt(u.covariance[0, 0]) < 1.0 for u in updates[8:])
+
+
+def test_a_place_that_was_doubted_and_found_again_is_certain_with_hindsight() -> None:
+    texture, other = Texture(4), Texture(5)
+    views = [noisy(texture.view((0.5 * k, 0.0), 160), 4.0, k) for k in range(12)]
+    views[8] = noisy(other.view((0.0, 0.0), 160), 4.0, 8)
+    updates, _, history = _track(views)
+    assert np.sqrt(updates[8].covariance[0, 0]) > 30.0
+    assert np.sqrt(updates[9].covariance[0, 0]) < 0.1
+    assert history.smooth().sigma_m[8, 0] < 0.5
