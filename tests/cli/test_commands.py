@@ -281,7 +281,7 @@ def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
     snippets = re.findall(
         r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
     )
-    assert len(snippets) == 7
+    assert len(snippets) == 8
     for name in ("grid", "gold"):
         (tmp_path / name).symlink_to(folder / name)
     done = subprocess.run(
