@@ -142,6 +142,13 @@ class Page:
         path.write_bytes(base64.b64decode(done["data"]))
 
 
+async def _close(connection: WebSocketClientConnection) -> None:
+    """Close, and wait until the other side has agreed; tornado warns of a connection that is merely left."""
+    connection.close()
+    while await asyncio.wait_for(connection.read_message(), ANSWER_S) is not None:
+        pass
+
+
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
     """A page in a browser without any network but this computer."""
@@ -170,7 +177,7 @@ def chromium(profile: Path) -> Iterator[Page]:
             browser = await websocket_connect(f"ws://127.0.0.1:{port}{path}")
             first = Page(loop, browser)
             made = await first._call("Target.createTarget", {"url": "about:blank"})
-            browser.close()
+            await _close(browser)
             address = f"ws://127.0.0.1:{port}/devtools/page/{made['targetId']}"
             # A picture of a page is a message of megabytes.
             return Page(loop, await websocket_connect(address, max_message_size=1 << 28))
@@ -179,6 +186,7 @@ def chromium(profile: Path) -> Iterator[Page]:
         for domain in ("Page", "Runtime", "Log"):
             page.call(f"{domain}.enable")
         yield page
+        loop.run_until_complete(_close(page._connection))
     finally:
         process.terminate()
         try:
@@ -186,5 +194,4 @@ def chromium(profile: Path) -> Iterator[Page]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-        loop.run_until_complete(asyncio.sleep(0.05))
         loop.close()
