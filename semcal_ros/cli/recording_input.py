@@ -31,7 +31,14 @@ from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import resolve_config
 
-__all__ = ["check_outputs", "check_spared", "recording_input", "recordings_input", "refuse_mask"]
+__all__ = [
+    "check_outputs",
+    "check_spared",
+    "optional_recording_input",
+    "recording_input",
+    "recordings_input",
+    "refuse_mask",
+]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
@@ -126,7 +133,12 @@ def recordings_input(command: Command) -> Command:
     return _reading(command, several=True)
 
 
-def _reading(command: Command, *, several: bool) -> Command:
+def optional_recording_input(command: Command) -> Command:
+    """As :func:`recording_input`, where ``recording`` is None if none is given."""
+    return _reading(command, several=False, required=False)
+
+
+def _reading(command: Command, *, several: bool, required: bool = True) -> Command:
     @wraps(command)
     def read(
         paths: tuple[Path, ...],
@@ -142,6 +154,12 @@ def _reading(command: Command, *, several: bool) -> Command:
         **others: Any,
     ) -> Any:
         microscope = resolve_config(config, frame_time_s=frame_time)
+        stated: tuple[object, ...] = (pixel_size, magnification, display_width, frame_interval)
+        stated += (frame_time, databar_rows, roi, mask)
+        if not paths and any(value is not None for value in stated):
+            raise InvalidValueError(
+                "options that say how to read a recording", expected="a RECORDING with them"
+            )
         given = [
             RecordedFiles(
                 part[0] if len(part) == 1 else part,
@@ -153,18 +171,18 @@ def _reading(command: Command, *, several: bool) -> Command:
                 display_width,
                 mask,
             )
-            for part in (_split(paths) if several else [paths])
+            for part in (_split(paths) if several else [paths] * bool(paths))
         ]
         if display_width is not None:
             microscope = replace(microscope, display_width_m=display_width)
-        own = {"recordings": given} if several else {"recording": given[0]}
+        own = {"recordings": given} if several else {"recording": given[0] if given else None}
         return command(config=microscope, **own, **others)
 
-    name = "RECORDINGS..." if several else "RECORDING"
+    name = "RECORDINGS..." if several else "RECORDING" if required else "[RECORDING]"
     decorated: Any = read
     for option in reversed(_READING_OPTIONS):
         decorated = option(decorated)
-    return click.argument("paths", nargs=-1, required=True, type=PATH, metavar=name)(decorated)
+    return click.argument("paths", nargs=-1, required=required, type=PATH, metavar=name)(decorated)
 
 
 def _split(paths: tuple[Path, ...]) -> list[tuple[Path, ...]]:

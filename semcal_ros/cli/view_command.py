@@ -17,13 +17,21 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import click
 
-from semcal_ros.cli.options import PATH, config_option
+from semcal_ros.cli.options import calibration_option, no_drift_option
+from semcal_ros.cli.recording_input import optional_recording_input
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.files.recordings import RecordedFiles
+from semcal_ros.workflows.inputs import open_source, resolve_calibration, resolve_config
 
 __all__ = ["command", "require_view"]
 
@@ -41,8 +49,9 @@ def require_view() -> None:
 
 
 @click.command("view")
-@config_option
-@click.option("--calibration", type=PATH, help="Calibration file; by default that on the topic.")
+@optional_recording_input
+@calibration_option("Calibration file; of a live stream, that on the topic by default.")
+@no_drift_option("Do not follow the drift of RECORDING.")
 @click.option("--namespace", default="/sem", show_default=True, help="Of the nodes and topics.")
 @click.option("--host", default="localhost", show_default=True, help="Address to listen on.")
 @click.option(
@@ -52,10 +61,18 @@ def require_view() -> None:
     show_default=True,
     help="Port to listen on; 0 takes a free one.",
 )
+@click.pass_context
 def command(
-    config: str | None, calibration: os.PathLike[str] | None, namespace: str, host: str, port: int
+    context: click.Context,
+    recording: RecordedFiles | None,
+    config: MicroscopeConfig,
+    calibration: Path | None,
+    no_drift: bool,
+    namespace: str,
+    host: str,
+    port: int,
 ) -> None:
-    """Show the live stream in the browser, raw and corrected, with lengths and their uncertainty.
+    """Show the live stream, or RECORDING, in the browser: raw and corrected, with lengths and their uncertainty.
 
     The page is for users of this computer. With another --host, whoever opens it must bring the token that is printed,
     or that the environment variable SEMCAL_VIEW_TOKEN holds.
@@ -64,27 +81,71 @@ def command(
     Example:
       semcal view
       semcal view --namespace /lab/sem --config jsm820
+      semcal view recordings/gold --calibration cal.yaml
     """
     require_view()
+    token = os.environ.get(_TOKEN, "")
+    if recording is not None:
+        _show_recording(recording, config, calibration, not no_drift, host, port, token)
+        return
     try:
         from semcal_ros.nodes.viewer import run_viewer
     except ImportError as error:
         raise SemcalError(
             f"ROS 2 cannot be imported ({error})",
-            expected="rclpy",
+            expected="rclpy for a live stream, or a RECORDING",
             do="source a ROS 2 workspace or run `make setup`",
         ) from error
+    if no_drift:
+        raise InvalidValueError("--no-drift for a live stream", expected="a RECORDING with it")
     if not namespace.startswith("/"):
         raise InvalidValueError(f"--namespace {namespace}", expected="a name that begins with /")
     parameters = {
-        "config": config or "generic",
-        "calibration": "" if calibration is None else os.path.abspath(calibration),
+        # The node reads it by its name.
+        "config": context.params["config"],
+        "calibration": "" if calibration is None else str(calibration.absolute()),
         "host": host,
         "port": str(port),
-        "token": os.environ.get(_TOKEN, ""),
+        "token": token,
     }
     arguments = ["--ros-args", "-r", f"__ns:={namespace}"]
     for name, value in parameters.items():
         if value:
             arguments += ["-p", f"{name}:={value}"]
     sys.exit(run_viewer(arguments))
+
+
+def _show_recording(
+    recording: RecordedFiles,
+    config: MicroscopeConfig,
+    calibration: Path | None,
+    drift: bool,
+    host: str,
+    port: int,
+    token: str,
+) -> None:
+    from semcal_ros.viewer.recording import RecordingSource
+    from semcal_ros.viewer.server import PageServer
+
+    model = resolve_calibration(calibration)
+    microscope = resolve_config(config, model)
+    ended = threading.Event()
+
+    def end(_number: int, _frame: Any) -> None:
+        ended.set()
+
+    source = RecordingSource(
+        lambda: open_source(recording, microscope), model, microscope, drift=drift
+    )
+    try:
+        server = PageServer(source, host, port, token)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, end)
+        server.start()
+        click.echo(f"{source.name}: open {server.address}")
+        # A wait without end does not let Python handle signals on every platform.
+        while not ended.wait(0.5):
+            pass
+        server.stop()
+    finally:
+        source.close()

@@ -341,18 +341,35 @@ class Recording(ABC):
         self._pass_notes.clear()
         count = 0
         for frame in self._frames():
-            if self._mask is not None:
-                height, width = frame.image.shape[:2]
-                frame = replace(frame, mask=fit_mask(self._mask, (height, width)))
-            if self._roi is not None:
-                try:
-                    frame = _crop(frame, self._roi)
-                except BagError as error:
-                    self._rejected.append(RejectedFrame(frame.log_time_ns, str(error)))
-                    continue
-            count += 1
-            yield frame
+            cut = self._cut(frame)
+            if cut is not None:
+                count += 1
+                yield cut
         self._end_pass(count)
+
+    def frames_from(self, start: int) -> Iterator[tuple[int, RecordedFrame]]:
+        """Yield usable frames with their numbers among all images, from the one with number ``start`` on.
+
+        What comes before is skipped without being decoded, as far as the files allow. Nothing is noted, and a
+        recording may end before.
+        """
+        for number, frame in self._frames_from(start):
+            cut = self._cut(frame)
+            if cut is not None:
+                yield number, cut
+
+    def _cut(self, frame: RecordedFrame) -> RecordedFrame | None:
+        """The frame with its mask, and the part of it that is used; None if it is too small for that."""
+        if self._mask is not None:
+            height, width = frame.image.shape[:2]
+            frame = replace(frame, mask=fit_mask(self._mask, (height, width)))
+        if self._roi is not None:
+            try:
+                return _crop(frame, self._roi)
+            except BagError as error:
+                self._rejected.append(RejectedFrame(frame.log_time_ns, str(error)))
+                return None
+        return frame
 
     def _end_pass(self, count: int) -> None:
         """Note what was left out; refuse a recording without a usable frame."""
@@ -374,6 +391,11 @@ class Recording(ABC):
 
     @abstractmethod
     def _frames(self) -> Iterator[RecordedFrame]: ...
+
+    def _frames_from(self, start: int) -> Iterator[tuple[int, RecordedFrame]]:
+        for number, frame in enumerate(self._frames()):
+            if number >= start:
+                yield number, frame
 
     @property
     def scale_source(self) -> str:
@@ -552,6 +574,15 @@ class _BagRecording(Recording):
     def _frames(self) -> Iterator[RecordedFrame]:
         return self._read(lambda raw, _index: self._frame(raw))
 
+    def _frames_from(self, start: int) -> Iterator[tuple[int, RecordedFrame]]:
+        def make(raw: RawMessage, index: int) -> tuple[tuple[int, RecordedFrame] | None, bool]:
+            if index < start:
+                return None, True
+            frame, stamped = self._frame(raw)
+            return (None if frame is None else (index, frame)), stamped
+
+        return self._read(make)
+
     def _outlines(self, wanted: Container[int]) -> Iterator[FrameOutline]:
         return self._read(lambda raw, index: self._outline(raw, index in wanted))
 
@@ -703,6 +734,16 @@ class _ImageRecording(Recording):
                 self._rejected.append(RejectedFrame(image.stamp_ns, str(pixels)))
                 continue
             yield self._frame(image, pixels)
+
+    def _frames_from(self, start: int) -> Iterator[tuple[int, RecordedFrame]]:
+        images = self._series.images
+        first = min(start, len(images))
+        # A file of several is read from its beginning.
+        while 0 < first < len(images) and images[first - 1].file is images[first].file:
+            first -= 1
+        for number, (image, pixels) in enumerate(self._series.read(images[first:]), first):
+            if number >= start and not isinstance(pixels, SemcalError):
+                yield number, self._frame(image, pixels)
 
     def _frame(self, image: SeriesImage, pixels: NDArray[Any]) -> RecordedFrame:
         return RecordedFrame(

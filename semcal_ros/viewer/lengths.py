@@ -33,10 +33,12 @@ def digits_of(sigma: float) -> int:
 def format_with_sigma(length_m: float, sigma_m: float | None) -> str:
     """Format a length and its 1-sigma in one unit, µm or nm, with two digits of the 1-sigma.
 
-    Without one, the text says that the scale is nominal.
+    Without one, the text says that the scale is nominal; with one that is not finite, that it is not known.
     """
     size, unit = next((u for u in _UNITS if abs(length_m) >= 0.9995 * u[0]), _UNITS[-1])
     if sigma_m is None:
         return f"{length_m / size:.4g} {unit} (nominal)"
+    if not math.isfinite(sigma_m):
+        return f"{length_m / size:.4g} {unit} (uncertainty not known)"
     digits = digits_of(sigma_m / size)
     return f"{length_m / size:.{digits}f} ± {sigma_m / size:.{digits}f} {unit}"

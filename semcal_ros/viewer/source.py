@@ -110,11 +110,11 @@ class Note:
 
 @dataclass(frozen=True)
 class DriftPanel:
-    """The drift: a sentence, and the way so far as (x, y) in nm, oldest first."""
+    """The drift: a sentence, its way as (x, y) in nm, oldest first, and where on it the frame that is shown stands."""
 
     text: str
     trace_nm: tuple[tuple[float, float], ...] = ()
-    sigma_nm: float | None = None
+    at_nm: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -111,4 +111,4 @@ class DriftTrace:
         if drawn[-1] != points[-1]:
             drawn.append(points[-1])
         rounded = tuple((round(x, 3), round(y, 3)) for x, y in drawn)
-        return DriftPanel(text, rounded, round(1e9 * sigma_m, 3))
+        return DriftPanel(text, rounded, points[-1])

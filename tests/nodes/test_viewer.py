@@ -29,6 +29,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from tests.helpers.chromium import BROWSER, Page, chromium
+from tests.helpers.node_scenes import write_recording
 from tests.helpers.project import ROOT
 from tests.helpers.ros_process import Peer, running
 
@@ -211,3 +212,21 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     assert done.returncode == 2
     assert "--port 0" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_recording_in_the_browser(page: Page, tmp_path: Path, calibration_file: Path) -> None:
+    write_recording(tmp_path / "bag", [2000.0] * 30, 0.05)
+    with viewing(str(tmp_path / "bag"), "--calibration", str(calibration_file)) as address:
+        for width in (1280, 390):
+            page.size(width, 844)
+            page.open(address)
+            page.wait_for("document.querySelector('#clock').textContent.startsWith('1 of 30')")
+            fits(page)
+            x, y, w, h = page.box("#time")
+            page.drag([(x + 0.5 * w, y + h / 2)])
+            page.wait_for("/^1[456] of 30/.test(document.querySelector('#clock').textContent)")
+            press(page, "play")
+            page.wait_for("document.querySelector('#clock').textContent.startsWith('30 of 30')")
+            assert page.evaluate("document.querySelector('#microscope').hidden")
+            page.drag([(x + 1, page.box("#time")[1] + h / 2)])
+    assert page.console == []

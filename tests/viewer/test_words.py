@@ -108,7 +108,7 @@ def test_the_drift_is_told_with_its_sigma_and_drawn_with_few_points() -> None:
     panel = trace.panel()
     assert panel.text == "11.18 ± 0.40 nm since the start, 120 nm per minute"
     assert len(panel.trace_nm) <= 302
-    assert panel.trace_nm[-1] == (4.999, -9.998)
+    assert panel.trace_nm[-1] == panel.at_nm == pytest.approx((4.999, -9.998))
     # A reset sets the drift to zero, a replay that begins again goes back in time.
     trace.add(5_000_001, 0.0, 0.0, 1e-9)
     assert trace.panel().trace_nm == ((0.0, 0.0),)

@@ -124,10 +124,12 @@ function showStatus(s) {
   });
   $("drift-text").textContent = s.drift.text;
   state.trace = s.drift.trace_nm;
+  state.traceAt = s.drift.at_nm;
   drawTrace();
   for (const button of all("[data-action]")) button.disabled = !s.actions.includes(button.dataset.action);
   showCalibration(s.calibration);
   showTimeline(s.timeline);
+  $("microscope").hidden = s.kind !== "live";
 }
 
 function showCalibration(panel) {
@@ -258,7 +260,7 @@ function drawTrace() {
   pen.strokeStyle = "#ffb86b"; pen.lineWidth = 1.5 * ratio; pen.lineJoin = "round"; pen.beginPath();
   state.trace.forEach((p, k) => { const [x, y] = place(p); if (k) pen.lineTo(x, y); else pen.moveTo(x, y); });
   pen.stroke();
-  const [x, y] = place(state.trace.at(-1));
+  const [x, y] = place(state.traceAt ?? state.trace.at(-1));
   pen.fillStyle = "#fff"; pen.beginPath(); pen.arc(x, y, 3.5 * ratio, 0, 7); pen.fill();
   const wide = canvas.width / scale / 4, round = 10 ** Math.floor(Math.log10(wide));
   const nm = [5, 2, 1].map((k) => k * round).find((v) => v <= wide);
