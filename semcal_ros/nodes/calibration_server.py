@@ -35,6 +35,7 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.check import Verdict
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.view_coverage import measure_view_coverage
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.corners import find_lattice
@@ -169,6 +170,11 @@ class CalibrationServer(StreamNode):
         values.append(("corners", str(sum(len(view.detection.xy) for view in views))))
         counts = Counter(view.magnification for view in views)
         values += [(f"views at {g:g}x", str(counts[g])) for g in sorted(counts)]
+        coverage = measure_view_coverage(views)
+        values.append(("field_share", f"{coverage.field_share:.3f}"))
+        if coverage.tilts_deg:
+            values.append(("least_tilt_deg", f"{min(coverage.tilts_deg):.1f}"))
+            values.append(("largest_tilt_deg", f"{max(coverage.tilts_deg):.1f}"))
         if stage is not None:
             values += [("stage", stage.name), ("fraction", f"{stage.fraction:.3f}")]
         status = DiagnosticStatus()

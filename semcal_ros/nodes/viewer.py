@@ -49,6 +49,7 @@ from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, ViewedImages
+from semcal_ros.viewer.coverage import describe_coverage, describe_run
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
@@ -378,9 +379,15 @@ class Viewer(SemNode):
     def _describe_calibration(self) -> CalibrationPanel | None:
         if self._progress is None or "add_view" not in self._offered:
             return None
-        answer, level, _values = self._progress
+        answer, level, values = self._progress
         overlay = self._overlay
-        return CalibrationPanel(answer, level, overlay=0 if overlay is None else overlay[0])
+        return CalibrationPanel(
+            answer,
+            level,
+            describe_coverage(values),
+            describe_run(values),
+            0 if overlay is None else overlay[0],
+        )
 
 
 def run_viewer(args: Sequence[str] | None = None) -> int:

@@ -54,7 +54,7 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         r"uncalibrated",
         _WARN,
         "has no calibration: lengths are nominal, and the distortion stays",
-        "calibrate below, or load a calibration file",
+        "calibrate, or load a calibration file",
     ),
     (
         r"scale of the calibration: (.*)",
@@ -207,12 +207,16 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 
 
 def describe_rates(reports: Sequence[NodeReport]) -> tuple[Rate, ...]:
-    """Return the frames per second of all nodes that publish some."""
+    """Return the frames per second of all nodes that publish some.
+
+    A calibration server has views, which come as they are asked for.
+    """
     rates = []
     for report in reports:
         rate = _number(report.values, "rate_hz")
         published = _number(report.values, "published")
-        if rate is None or not published or report.age_s > _SILENT_S:
+        gone = report.age_s > _SILENT_S
+        if rate is None or not published or gone or report.name == "calibration_server":
             continue
         latency = _number(report.values, "latency_mean_ms")
         longest = _number(report.values, "latency_max_ms")

@@ -32,6 +32,7 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.source import DriftPanel, Note, Rate, Status, Timeline, View
@@ -201,7 +202,9 @@ class RecordingSource:
             )
             notes.append(Note("ok", "recording", text))
         elif self._follows:
-            text = f"the drift is known of {self._followed} of {self._count} frames so far"
+            text = (
+                f"the drift is known of {self._followed} of {counted(self._count, 'frame')} so far"
+            )
             notes.append(Note("ok", "recording", text, "later frames are shown with their drift"))
         return tuple(notes)
 

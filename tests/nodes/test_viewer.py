@@ -230,3 +230,39 @@ def test_a_recording_in_the_browser(page: Page, tmp_path: Path, calibration_file
             assert page.evaluate("document.querySelector('#microscope').hidden")
             page.drag([(x + 1, page.box("#time")[1] + h / 2)])
     assert page.console == []
+
+
+def test_the_calibration_panel(page: Page, tmp_path: Path) -> None:
+    grid = {"specimen": "grid", "magnification": 1000.0, "rate": 5.0, "width": 320, "height": 320}
+    with (
+        running("virtual_sem", grid),
+        running("calibration_server", {"config": "virtual_sem", "directory": tmp_path}),
+        viewing() as address,
+    ):
+        page.size(1280, 844)
+        page.open(address)
+        page.wait_for("!document.querySelector('#calibration').hidden")
+        press(page, "save")
+        page.wait_for("document.querySelector('#answer').textContent.includes('no calibration')")
+        for count in (1, 2, 3):
+            press(page, "add_view")
+            page.wait_for(
+                f"document.querySelector('#calibration-answer').textContent.includes('view {count} at')"
+            )
+        page.wait_for("document.querySelector('#overlay img').naturalWidth === 320")
+        shares = page.evaluate("[...document.querySelectorAll('#bars progress')].map(p => p.value)")
+        # Three views of one magnification, which the grid fills: of nine magnifications, and five views.
+        assert shares[0] > 0.9
+        assert shares[2:] == pytest.approx([1 / 9, 3 / 5])
+        fits(page)
+        page.size(390, 844)
+        fits(page)
+        press(page, "calibrate")
+        page.wait_for("document.querySelector('#answer').textContent.includes('calibrating')")
+        # Three views without tilt or rotation make no good calibration, but they make one or are refused in words.
+        page.wait_for(
+            "!/calibrating/.test(document.querySelector('#calibration-answer').textContent)", 60.0
+        )
+        press(page, "clear")
+        page.wait_for("document.querySelector('#answer').textContent.includes('3 views removed')")
+    assert page.console == []

@@ -120,7 +120,9 @@ function showStatus(s) {
   });
   fill($("notes"), s.notes, "li", (item, note) => {
     item.className = note.level;
-    fill(item, [["", note.text], ["who", ` ${note.who}`], ["do", note.do]], "span", (span, [kind, text]) => { span.className = kind; setText(span, text); span.hidden = !text.trim(); });
+    // What is fine is said of several at once, what is not of one.
+    const words = note.level === "ok" ? [["", note.text], ["who", ` ${note.who}`]] : [["", `${note.who} ${note.text}`], ["who", ""]];
+    fill(item, [...words, ["do", note.do]], "span", (span, [kind, text]) => { span.className = kind; setText(span, text); span.hidden = !text.trim(); });
   });
   $("drift-text").textContent = s.drift.text;
   state.trace = s.drift.trace_nm;
@@ -215,6 +217,9 @@ function drawBar(pen, picture, ratio, width, height) {
   if (!picture.scale) return;
   const length = picture.scale.bar_px * width / picture.region[2];
   const right = width - 12 * ratio, y = height - 12 * ratio;
+  const plate = Math.max(length, pen.measureText(picture.scale.bar_label).width) + 12 * ratio;
+  pen.fillStyle = "rgb(0 0 0 / .55)";
+  pen.fillRect(right + 6 * ratio - plate, y - 26 * ratio, plate, 33 * ratio);
   line(pen, ratio, "#fff", [[right - length, y], [right, y]]);
   label(pen, ratio, picture.scale.bar_label, right, y - 6 * ratio, "right");
 }
