@@ -111,8 +111,9 @@ def talk(
             if not messages or (isinstance(told, str) and json.loads(told)["type"] != "status"):
                 found.append(told if isinstance(told, bytes) else json.loads(told))
         page.close()
-        # Until the other side has noticed.
-        await asyncio.sleep(0.1)
+        # Until the other side has agreed: a socket that is merely left is a warning.
+        while await asyncio.wait_for(page.read_message(), 20) is not None:
+            pass
         return found
 
     return asyncio.run(run())
