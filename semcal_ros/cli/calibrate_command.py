@@ -25,7 +25,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.grid_options import grid_options
 from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_option
-from semcal_ros.cli.output import echo_notes, echo_table, echo_verdict, show_progress
+from semcal_ros.cli.output import echo_notes, echo_rejected, echo_table, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.calibrate import (
@@ -35,9 +35,8 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
 )
 from semcal_ros.core.calibration.pda import focal_length_and_skew, prime
-from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.corners import PATTERN_NAMES
-from semcal_ros.core.wording import counted, group_by_kind, omit_numbers
+from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
 
@@ -62,10 +61,6 @@ def _parse_step(
         return float(text)
     except ValueError:
         raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
-
-
-# Rejected views that are named for each kind of reason; the report shows all.
-_MOST_NAMED = 5
 
 
 @click.command("calibrate")
@@ -215,22 +210,10 @@ def _echo_result(done: RecordingCalibration) -> None:
         click.echo(
             f"the stage is known for {told} of {counted(statistics['views'], 'view')}{unused}"
         )
-    _echo_rejected(rejected)
+    echo_rejected(rejected)
     echo_notes(done.notes)
     for warning in group_by_kind(done.result.warnings):
         click.echo(f"warning: {warning}", err=True)
-
-
-def _echo_rejected(rejected: Sequence[RejectedView]) -> None:
-    """Print each kind of reason once, with the views that have it."""
-    kinds: dict[str, list[RejectedView]] = {}
-    for view in rejected:
-        kinds.setdefault(omit_numbers(view.reason), []).append(view)
-    for views in kinds.values():
-        names = [f"{view.name} at {view.magnification:g}" for view in views[:_MOST_NAMED]]
-        if len(views) > _MOST_NAMED:
-            names.append(f"{len(views) - _MOST_NAMED} more")
-        click.echo(f"rejected: {', '.join(names)}: {views[0].reason}", err=True)
 
 
 def _echo_steps(fit: dict[str, Any]) -> None:

@@ -25,7 +25,14 @@ import click
 
 from semcal_ros.cli.grid_options import grid_options
 from semcal_ros.cli.options import PATH, json_option
-from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progress
+from semcal_ros.cli.output import (
+    echo_json,
+    echo_notes,
+    echo_rejected,
+    echo_table,
+    list_rejections,
+    show_progress,
+)
 from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.check import CalibrationCheck, Change, Verdict
@@ -85,12 +92,19 @@ def command(
             on_progress=on_progress,
         )
     if as_json:
-        echo_json({**asdict(done.result), "verdict": done.result.verdict.value})
+        echo_json(
+            {
+                **asdict(done.result),
+                "verdict": done.result.verdict.value,
+                "rejections": list_rejections(done.rejections),
+            }
+        )
     else:
         click.echo(f"{calibration}: {done.result.verdict.value}")
         echo_check(done.result)
         click.echo(_ADVICE[done.result.verdict])
         echo_notes(done.notes)
+        echo_rejected(done.rejections)
     if done.result.verdict is not Verdict.VALID:
         sys.exit(1)
 

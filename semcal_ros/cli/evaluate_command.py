@@ -16,13 +16,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
 
 from semcal_ros.cli.options import PATH, dask_option, json_option
-from semcal_ros.cli.output import echo_json, echo_table, show_progress
+from semcal_ros.cli.output import (
+    echo_json,
+    echo_rejected,
+    echo_table,
+    list_rejections,
+    show_progress,
+)
 from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.corners import PATTERNS
@@ -72,7 +78,8 @@ def command(
             on_progress=on_progress,
         )
     if as_json:
-        summary = asdict(result)
+        summary = asdict(replace(result, rejections=()))
+        summary["rejections"] = list_rejections(result.rejections)
         for row in summary["by_magnification"]:
             del row["views"]
         echo_json(summary)
@@ -93,3 +100,4 @@ def command(
     click.echo(
         f"{result.views} of {counted(result.views + result.rejected, 'view')}, RMS {result.rms_px:.4f} px"
     )
+    echo_rejected(result.rejections)

@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from semcal_ros.core.wording import counted, group_by_kind
+from semcal_ros.core.wording import counted, group_by_kind, omit_numbers
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+    from semcal_ros.core.calibration.views import RejectedView
     from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = [
@@ -39,11 +40,16 @@ __all__ = [
     "echo_nominal_unit",
     "echo_notes",
     "echo_paths",
+    "echo_rejected",
     "echo_states",
     "echo_table",
     "echo_verdict",
+    "list_rejections",
     "show_progress",
 ]
+
+# Rejected views that are named for each kind of reason; the report shows all.
+_MOST_NAMED = 5
 
 
 # Work of less than this, s, needs no bar.
@@ -181,3 +187,23 @@ def echo_json(value: Any) -> None:
         return item
 
     click.echo(json.dumps(plain(value), indent=2))
+
+
+def echo_rejected(rejected: Sequence[RejectedView]) -> None:
+    """Print each kind of reason once, with the views that have it."""
+    kinds: dict[str, list[RejectedView]] = {}
+    for view in rejected:
+        kinds.setdefault(omit_numbers(view.reason), []).append(view)
+    for views in kinds.values():
+        names = [f"{view.name} at {view.magnification:g}" for view in views[:_MOST_NAMED]]
+        if len(views) > _MOST_NAMED:
+            names.append(f"{len(views) - _MOST_NAMED} more")
+        click.echo(f"rejected: {', '.join(names)}: {views[0].reason}", err=True)
+
+
+def list_rejections(rejected: Sequence[RejectedView]) -> list[dict[str, Any]]:
+    """Plain data of rejected views, for JSON."""
+    return [
+        {"name": view.name, "magnification": view.magnification, "reason": view.reason}
+        for view in rejected
+    ]

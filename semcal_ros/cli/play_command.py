@@ -21,7 +21,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.errors import BagError, SemcalError
 
 __all__ = ["command"]
 
@@ -50,6 +50,7 @@ def command(
     Example:
       semcal play recordings/zoom --rate 2
     """
+    _require_bag(recording)
     try:
         from semcal_ros.nodes.bag_player import main as play
     except ImportError as error:
@@ -70,3 +71,27 @@ def command(
     for name, value in parameters.items():
         arguments += ["-p", f"{name}:={value}"]
     sys.exit(play(arguments) or 0)
+
+
+def _require_bag(recording: Path) -> None:
+    """Refuse what cannot be played, before ROS is loaded.
+
+    Raises
+    ------
+    BagError
+        It is no bag, or a damaged one.
+    """
+    # Imported here, as ROS below: the help need not wait for the library of bags.
+    from semcal_ros.files.bags.reader import is_bag, open_bag
+    from semcal_ros.files.images.image_file import is_image_file
+
+    if recording.exists() and not is_bag(recording):
+        files = recording.iterdir() if recording.is_dir() else [recording]
+        if any(is_image_file(file) for file in files):
+            raise BagError(
+                f"{recording} has images, and no bag",
+                expected="a rosbag2 folder, or an .mcap or .db3 file",
+                do=f"make one with `semcal import {recording} BAG`, and play that",
+            )
+    with open_bag(recording):
+        pass

@@ -39,7 +39,7 @@ from semcal_ros.synthetic import (
     TYPICAL_GRID,
     make_stage,
 )
-from semcal_ros.workflows.simulate import PLAN_KINDS, simulate
+from semcal_ros.workflows.simulate import MOST_FRAMES, MOST_VIEWS, PLAN_KINDS, simulate
 
 __all__ = ["command"]
 
@@ -77,10 +77,16 @@ def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], C
     help="grid, steps: repeat for each; drift: one; zoom: first and last.",
 )
 @click.option(
-    "--views", type=click.IntRange(1), default=5, show_default=True, help="grid: poses each."
+    "--views",
+    type=click.IntRange(1, MOST_VIEWS),
+    default=5,
+    show_default=True,
+    help="grid: poses each.",
 )
 @click.option(
-    "--frames", type=click.IntRange(1), help="drift, zoom: number of frames; steps: of each step."
+    "--frames",
+    type=click.IntRange(1, MOST_FRAMES),
+    help="drift, zoom: number of frames; steps: of each step.",
 )
 @click.option(
     "--size",

@@ -23,7 +23,7 @@ import click
 from semcal_ros.cli.check_command import echo_check
 from semcal_ros.cli.grid_options import grid_options
 from semcal_ros.cli.options import PATH, output_option, parse_ratio
-from semcal_ros.cli.output import echo_notes, echo_verdict, show_progress
+from semcal_ros.cli.output import echo_notes, echo_rejected, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.update import DEFAULT_AGEING
@@ -80,4 +80,5 @@ def command(
     echo_verdict(done.calibration)
     echo_check(done.result.check)
     echo_notes(done.notes)
+    echo_rejected(done.rejections)
     click.echo(f"calibration: {output}")

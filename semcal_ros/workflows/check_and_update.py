@@ -64,11 +64,14 @@ class RecordingCheck:
         Number of images that could not be used.
     notes
         Notes for the user about the recording.
+    rejections
+        These images, each with the reason.
     """
 
     result: CalibrationCheck
     rejected: int
     notes: tuple[str, ...] = ()
+    rejections: tuple[RejectedView, ...] = ()
 
 
 def check(
@@ -117,7 +120,7 @@ def check(
     model = require_calibration(calibration)
     seen = _see(model, source, config, squares_m, untilted, pattern, on_progress)
     on_progress("comparing", 0, None)
-    return RecordingCheck(_check(model, seen), seen.rejected, seen.notes)
+    return RecordingCheck(_check(model, seen), len(seen.rejected), seen.notes, seen.rejected)
 
 
 def check_found(
@@ -147,12 +150,15 @@ class RecordingUpdate:
         Number of images that could not be used.
     notes
         Notes for the user about the recording.
+    rejections
+        These images, each with the reason.
     """
 
     calibration: Calibration
     result: CalibrationUpdate
     rejected: int
     notes: tuple[str, ...] = ()
+    rejections: tuple[RejectedView, ...] = ()
 
 
 def update(
@@ -192,7 +198,8 @@ def update(
     on_progress("adjusting", 0, None)
     used = {view.name: seen.frames[view.name] for view in seen.views}
     result = _update(model, seen, ageing, describe_provenance(source, seen.config, used))
-    return RecordingUpdate(Calibration.from_model(result.model), result, seen.rejected, seen.notes)
+    renewed = Calibration.from_model(result.model)
+    return RecordingUpdate(renewed, result, len(seen.rejected), seen.notes, seen.rejected)
 
 
 def update_found(
@@ -228,7 +235,7 @@ class _Seen(NamedTuple):
     image_size: tuple[int, int]
     untilted: str | tuple[str, ...]
     axis: StageAxis
-    rejected: int
+    rejected: tuple[RejectedView, ...]
     notes: tuple[str, ...]
     config: MicroscopeConfig
     # Without their pixels, by the names of the views; none for views that were found elsewhere.
@@ -282,7 +289,7 @@ def _arrange(
         collected.image_size,
         name_untilted(untilted, found),
         options_for(microscope).axis,
-        len(collected.rejected),
+        collected.rejected,
         notes,
         microscope,
         frames,

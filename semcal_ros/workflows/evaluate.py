@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from semcal_ros.core.calibration.evaluate import compare_scales, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -79,12 +80,15 @@ class Evaluation:
         Numbers of images that were used, and that were rejected.
     by_magnification
         The same for each magnification, ascending.
+    rejections
+        The images that were rejected, each with the reason.
     """
 
     rms_px: float
     views: int
     rejected: int
     by_magnification: tuple[MagnificationError, ...]
+    rejections: tuple[RejectedView, ...] = ()
 
 
 def evaluate(
@@ -170,7 +174,8 @@ def evaluate(
         )
         for g, rms in rms_by_magnification(fit).items()
     )
-    return Evaluation(fit.rms_px(), len(collected.views), len(collected.rejected), tuple(errors))
+    views, rejections = len(collected.views), collected.rejected
+    return Evaluation(fit.rms_px(), views, len(rejections), tuple(errors), rejections)
 
 
 def _visit_height_sigma_m(statistics: Mapping[str, Any]) -> float:

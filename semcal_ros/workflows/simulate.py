@@ -49,10 +49,13 @@ from semcal_ros.workflows.inputs import (
     ignore_progress,
 )
 
-__all__ = ["PLAN_KINDS", "plan_recording", "simulate"]
+__all__ = ["MOST_FRAMES", "MOST_VIEWS", "PLAN_KINDS", "plan_recording", "simulate"]
 
 #: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it.
 PLAN_KINDS = ("grid", "drift", "steps", "zoom")
+#: Poses of a grid at each magnification, and frames: ten times those of the longest recordings in use. More are a
+#: slip of the hand, and would fill the disk.
+MOST_VIEWS, MOST_FRAMES = 1000, 200_000
 # Numbers of magnifications of the plans that do not take any number of them.
 _MAGNIFICATIONS = {"drift": 1, "zoom": 2}
 _STAGE = STAGES["one-axis"]
@@ -99,7 +102,7 @@ def plan_recording(
     Raises
     ------
     InvalidValueError
-        For an unknown kind or name, or the wrong number of magnifications.
+        For an unknown kind or name, the wrong number of magnifications, or more views or frames than anyone needs.
     """
     if kind not in PLAN_KINDS:
         raise InvalidValueError(
@@ -107,6 +110,9 @@ def plan_recording(
             expected="one of " + ", ".join(PLAN_KINDS),
             do=did_you_mean(kind, PLAN_KINDS),
         )
+    for name, count, most in (("views", views, MOST_VIEWS), ("frames", frames, MOST_FRAMES)):
+        if count is not None and not 1 <= count <= most:
+            raise InvalidValueError(f"{name} = {count}", expected=f"1 to {most}")
     chosen = check_positives(magnifications, "magnifications")
     wanted = _MAGNIFICATIONS.get(kind, len(chosen))
     if chosen and len(chosen) != wanted:

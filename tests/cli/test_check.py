@@ -17,11 +17,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 
 from semcal_ros import Calibration
+from semcal_ros.files.recordings import open_recording
 from tests.helpers.semcal_runs import refused, run
 
 
@@ -63,6 +65,28 @@ def test_bad_input_is_refused_in_one_line(folder: Path, capsys: pytest.CaptureFi
     assert "untilted '99'" in line
     line = refused(capsys, "check", folder / "cal.yaml", folder / "missing")
     assert "missing" in line
+
+
+@pytest.mark.slow
+def test_rejected_views_are_named_with_the_reason(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = tmp_path / "views"
+    views.mkdir()
+    with open_recording(folder / "today") as opened:
+        for k, frame in enumerate(f for f in opened.frames() if f.magnification == 1500.0):
+            cv2.imwrite(str(views / f"grid{k}.png"), frame.image)
+    noise = np.random.default_rng(0).integers(0, 255, (256, 256)).astype(np.uint8)
+    for k in range(2):
+        cv2.imwrite(str(views / f"noise{k}.png"), noise)
+    given = (folder / "cal.yaml", views, "--magnification", "1500")
+    for command in (("check", *given), ("evaluate", *given)):
+        assert run(*command) == 0
+        (line,) = (x for x in capsys.readouterr().err.splitlines() if "rejected: " in x)
+        assert "at 1500" in line and line.count("at 1500") == 2
+        assert run(*command, "--json") == 0
+        rejections = json.loads(capsys.readouterr().out)["rejections"]
+        assert len(rejections) == 2 and all(r["reason"] for r in rejections)
 
 
 @pytest.mark.slow

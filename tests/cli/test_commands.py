@@ -282,7 +282,7 @@ def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
         r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
     )
     assert len(snippets) == 8
-    for name in ("grid", "gold"):
+    for name in ("grid", "gold", "cal.yaml"):
         (tmp_path / name).symlink_to(folder / name)
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", "\n".join(snippets)],

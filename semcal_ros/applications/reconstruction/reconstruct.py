@@ -218,7 +218,9 @@ def collect_tracks(
     """Collect the tracks seen in at least ``least`` keyframes, in the plane of the specimen."""
     if len(keyframes) < 3:
         raise StructureError(
-            counted(len(keyframes), "keyframe"), expected="at least 3: the specimen hardly turns"
+            counted(len(keyframes), "keyframe"),
+            expected="at least 3 of a ball that turns: the specimen hardly turns",
+            do="record it while it turns by 10 degrees and more; for two or three images at known tilts, give --tilts",
         )
     ids = np.concatenate([frame.ids for frame in keyframes])
     names, counts = np.unique(ids, return_counts=True)

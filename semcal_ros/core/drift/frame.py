@@ -159,8 +159,8 @@ class MotionCorrector:
         )
         if drift is not None:
             x, y = (int(np.ceil(d)) for d in displaced)
-            left, right = min(left + x, width // 3), max(right - x, 2 * width // 3)
-            top, bottom = min(top + y, height // 3), max(bottom - y, 2 * height // 3)
+            left, right = min(left + x, width // 3), max(right - x, 2 * width // 3, 1)
+            top, bottom = min(top + y, height // 3), max(bottom - y, 2 * height // 3, 1)
         region = left, top, right, bottom
         if turn is not None:
             # A rotation moves most pixels by a fraction of one: cubic interpolation would falsify it by a
@@ -218,8 +218,8 @@ def _find_scanned_region(size: tuple[int, int], camera: ScanCamera | None) -> Re
         steps = [int(np.ceil(max(v, 0.0))) for v in lacking]
         left, top = min(left + steps[0], width // 3), min(top + steps[1], height // 3)
         right, bottom = (
-            max(right - steps[2], 2 * width // 3),
-            max(bottom - steps[3], 2 * height // 3),
+            max(right - steps[2], 2 * width // 3, 1),
+            max(bottom - steps[3], 2 * height // 3, 1),
         )
         if not any(steps):
             break

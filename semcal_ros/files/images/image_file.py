@@ -123,7 +123,7 @@ def _describe_tiff(path: Path) -> ImageFile:
     try:
         return _describe_sem(path)
     except TiffError as error:
-        reason = str(error)
+        reason = error.seen
     stack = list_tiff_stack(path)
     pages = tuple(
         ImagePage(

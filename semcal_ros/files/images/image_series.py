@@ -33,6 +33,7 @@ from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted, omit_numbers
+from semcal_ros.files.bags.reader import is_bag
 from semcal_ros.files.images.image_file import (
     ImageFile,
     ImagePage,
@@ -203,8 +204,14 @@ def find_image_files(path: Path) -> list[Path]:
     Raises
     ------
     BagError
-        There are none.
+        There are none, or the path is that of a bag.
     """
+    if is_bag(path):
+        raise BagError(
+            f"{path} is a bag",
+            expected="image files: an image (TIFF, PNG, JPEG, BMP), a video, or a folder or pattern of them",
+            do="give a bag alone: every command reads it as it is",
+        )
     if path.is_dir():
         listed = [p for p in path.iterdir() if p.is_file() and is_image_file(p)]
         what = f"{path} has no image file"
