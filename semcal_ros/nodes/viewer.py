@@ -73,6 +73,8 @@ _GRAPH_S = 2.0
 _STATUS_S = 0.25
 # A service answers at once, but for those that compute.
 _ANSWER_S = 20.0
+# Until a client and a service have found each other both ways.
+_MEETING_S = 1.5
 _COMPUTE_S = 600.0
 _CALIBRATION_ACTIONS = {
     "add_view": "add_view",
@@ -105,7 +107,8 @@ class Viewer(SemNode):
         self._progress: tuple[str, str, dict[str, str]] | None = None
         self._overlay: tuple[int, NDArray[Any]] | None = None
         self._offered: dict[str, tuple[str, Any]] = {}
-        self._callers: dict[str, Any] = {}
+        # Clients, and when they were made.
+        self._callers: dict[str, tuple[Any, float]] = {}
         self._wanted: list[tuple[str, Any, Any, Future[Any]]] = []
         self._graph_s = self._status_s = 0.0
         self._magnification: float | None = None
@@ -223,16 +226,20 @@ class Viewer(SemNode):
             self._call(service, kind, request, answer)
 
     def _call(self, service: str, kind: Any, request: Any, answer: Future[Any]) -> None:
-        client = self._callers.get(service)
-        if client is None:
-            client = self._callers[service] = self.create_client(kind, service)
-        # A client that was made just now finds its service within moments.
+        client, made_s = self._caller(service, kind)
         threading.Thread(
-            target=self._call_when_found, args=(client, request, answer), daemon=True
+            target=self._call_when_found, args=(client, made_s, request, answer), daemon=True
         ).start()
 
+    def _caller(self, service: str, kind: Any) -> tuple[Any, float]:
+        if service not in self._callers:
+            self._callers[service] = self.create_client(kind, service), time.monotonic()
+        return self._callers[service]
+
     @staticmethod
-    def _call_when_found(client: Any, request: Any, answer: Future[Any]) -> None:
+    def _call_when_found(client: Any, made_s: float, request: Any, answer: Future[Any]) -> None:
+        # A service that has not found this client yet answers to nobody, and there is no asking whether it has.
+        time.sleep(max(0.0, made_s + _MEETING_S - time.monotonic()))
         if client.wait_for_service(timeout_sec=5.0):
             client.call_async(request).add_done_callback(
                 lambda done: answer.set_result(done.result())
@@ -341,6 +348,7 @@ class Viewer(SemNode):
             for name in names:
                 if offered.get(name) in kinds and action not in found:
                     found[action] = name, kinds[offered[name]]
+                    self._caller(*found[action])
 
         sources = self._images.publishers("raw")
         offer("start", [f"{node}/{verb}" for node in sources for verb in ("start", "resume")])

@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from semcal_ros.cli import main
-from semcal_ros.cli.calibrate_command import _echo_rejected
+from semcal_ros.cli.output import echo_rejected
 from semcal_ros.core.calibration.views import RejectedView, ViewStatus
 from semcal_ros.core.errors import Rejection
 
@@ -66,7 +66,7 @@ def test_rejected_views_are_told_by_kind(capsys: pytest.CaptureFixture[str]) -> 
         RejectedView(f"frame {k}", 100.0, Rejection(ViewStatus.OTHER_IMAGE_SIZE, f"{k} px wide"))
         for k in range(7)
     ]
-    _echo_rejected([*views, replace(views[0], rejection=Rejection(ViewStatus.OUTLIER, "outlier"))])
+    echo_rejected([*views, replace(views[0], rejection=Rejection(ViewStatus.OUTLIER, "outlier"))])
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("rejected: frame 0 at 100, frame 1 at 100, ")
     assert first.endswith("frame 4 at 100, 2 more: 0 px wide")

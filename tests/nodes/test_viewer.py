@@ -83,15 +83,16 @@ def page(tmp_path: Path) -> Iterator[Page]:
         yield made
 
 
-def bright(page: Page, picture: str) -> float:
-    """Standard deviation of the grey levels on the canvas of a picture."""
-    return float(
-        page.evaluate(
-            f"(() => {{ const c = document.querySelector('figure[data-picture={picture}] canvas');"
-            " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let s = 0, q = 0, n = 0;"
-            " for (let i = 0; i < d.length; i += 4) { s += d[i]; q += d[i] * d[i]; n += 1; }"
-            " return Math.sqrt(q / n - (s / n) ** 2); })()"
-        )
+def wait_bright(page: Page, picture: str) -> None:
+    """Wait until the canvas of a picture shows one: its grey levels have a standard deviation of more than 30.
+
+    A picture of gold uses the whole range; an empty canvas is 0.
+    """
+    page.wait_for(
+        f"(() => {{ const c = document.querySelector('figure[data-picture={picture}] canvas');"
+        " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let s = 0, q = 0, n = 0;"
+        " for (let i = 0; i < d.length; i += 4) { s += d[i]; q += d[i] * d[i]; n += 1; }"
+        " return Math.sqrt(q / n - (s / n) ** 2) > 30; })()"
     )
 
 
@@ -139,8 +140,7 @@ def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
             # The first pictures may come before their magnification.
             page.wait_for("document.querySelector('#pixel').textContent.includes('±')")
             for picture in ("raw", "corrected"):
-                # A picture of gold uses the whole range; an empty canvas is 0.
-                assert bright(page, picture) > 30.0
+                wait_bright(page, picture)
             peer.wait_for(lambda: watched() == 1, "the subscription")
             page.wait_for("document.querySelector('#drift-text').textContent.includes('±')")
             page.wait_for(
