@@ -219,10 +219,15 @@ def test_a_stream_that_was_never_tracked_claims_no_drift(bench: Bench) -> None:
         known = 0.0 <= covariance[0] ** 0.5 < pixel_m
         assert known if stamp == 1 else (covariance[0], covariance[7]) == (1e6, 1e6)
     assert all((c[0], c[7]) == (1e6, 1e6) for c in velocities.values())
-    # The first frame but for its noise: now it is known.
-    bench.exchange(noisy(texture(10), 1))
-    bench.peer.wait_for(lambda: bench.drifts[-1].header.stamp.sec == bench.sent, "its drift")
-    assert bench.drifts[-1].pose.covariance[0] < 1e6
+
+    def known() -> bool:
+        bench.exchange(noisy(texture(10), bench.sent))
+        bench.peer.wait_for(lambda: bench.drifts[-1].header.stamp.sec == bench.sent, "its drift")
+        return bool(bench.drifts[-1].pose.covariance[0] < 1e6)
+
+    # The first frame but for its noise: now it is known. On a busy machine the node measures beside the stream, and
+    # what comes with a frame is what was known before it.
+    bench.peer.wait_for(known, "a known drift")
 
 
 def test_an_absurd_magnification_is_refused_and_the_old_one_not_used_on(bench: Bench) -> None:
