@@ -362,17 +362,23 @@ def test_the_nodes_together_converge_across_magnifications(peer: Peer, tmp_path:
         for g in (1000.0, 2000.0, 4000.0):
             peer.wait_for(lambda: knob.get_subscription_count() == 1, "the knob")
             knob.publish(Float64(data=g))
-            peer.wait_for(
-                lambda value=g: (
-                    peer.state(SERVO).get("servo_state") == "converged"
-                    and float(peer.state("/sem/stream_corrector").get("magnification", "nan"))
-                    == value
-                    and float(peer.state(SERVO).get("servo_error_px", "nan")) < 1.0
-                ),
-                f"convergence at {g:g}x",
-                # Four processes; the stage stands still while they are late.
-                timeout_s=120.0,
-            )
+            try:
+                peer.wait_for(
+                    lambda value=g: (
+                        peer.state(SERVO).get("servo_state") == "converged"
+                        and float(peer.state("/sem/stream_corrector").get("magnification", "nan"))
+                        == value
+                        and float(peer.state(SERVO).get("servo_error_px", "nan")) < 1.0
+                    ),
+                    f"convergence at {g:g}x",
+                    # Four processes; the stage stands still while they are late.
+                    timeout_s=55.0,
+                )
+            except AssertionError as error:
+                nodes = ("virtual_sem", "stream_corrector", "visual_servo")
+                raise AssertionError(
+                    [str(error), *(peer.state(f"/sem/{n}") for n in nodes)]
+                ) from None
     place = errors[-1].pose.pose.position
     # Two px at 4000x.
     assert np.hypot(place.x, place.y) < 2.0 * 0.12 / 4000.0 / SIZE
