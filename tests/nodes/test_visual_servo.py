@@ -342,7 +342,7 @@ def test_the_nodes_together_converge_across_magnifications(peer: Peer, tmp_path:
         "magnification": 1000.0,
         "rotation_deg": 4.0,
         # Slow enough for a busy machine to finish each frame before it is too old to move the stage.
-        "rate": 3.0,
+        "rate": 2.0,
     }
     goal = {
         "config": "virtual_sem",
