@@ -37,11 +37,11 @@ pytestmark = pytest.mark.slow
 
 PARTS = (
     *("pyproject.toml", "setup.py", "setup.cfg", "package.xml", "README.md", "LICENSE"),
-    *("resource", "launch", "config", "msg_configs", "dds", "security", "semcal_ros"),
+    *("resource", "launch", "config", "msg_configs", "dds", "security", "viewers", "semcal_ros"),
 )
 SHARED = {
     str(path.relative_to(ROOT))
-    for folder in ("launch", "config", "msg_configs", "dds", "security")
+    for folder in ("launch", "config", "msg_configs", "dds", "security", "viewers")
     for path in (ROOT / folder).glob("*")
     if path.is_file()
 } | {"package.xml"}
