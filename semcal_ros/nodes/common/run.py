@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -75,6 +76,9 @@ class DeferredSignals:
 
 # A thread that computes beside the stream must not hold the interpreter for long when a frame arrives.
 _SWITCH_S = 5e-4
+
+# A callback that is running when a node ends: as long as a frame may take.
+_CALLBACKS_S = 2.0
 
 _START_ERRORS = (
     SemcalError,
@@ -202,6 +206,12 @@ class _Threads(MultiThreadedExecutor):
 
     _sigint_gc: Any = None
 
+    def wait_for_callbacks(self, limit_s: float) -> None:
+        """Wait for those that are running: what they use is about to be destroyed."""
+        end_s = time.monotonic() + limit_s
+        while time.monotonic() < end_s and not all(f.done() for f in list(self._futures)):
+            time.sleep(0.01)
+
 
 def _spin(node: Node, threads: int) -> int:
     executor: Executor | None = None
@@ -216,6 +226,11 @@ def _spin(node: Node, threads: int) -> int:
         if rclpy.utilities.ok():
             raise
     finally:
+        if isinstance(node, SemNode):
+            # Ends what a callback may be waiting for.
+            node.closing.close()
+        if isinstance(executor, _Threads):
+            executor.wait_for_callbacks(_CALLBACKS_S)
         if executor is not None:
             executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
