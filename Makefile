@@ -14,7 +14,7 @@ endif
 SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-fast lint format demo bench fuzz soak clean
+.PHONY: help setup test test-fast lint format demo demo-live bench fuzz soak clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
@@ -55,6 +55,9 @@ test-fast: setup ## the quick tests: no running nodes, no whole experiments, no 
 
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
 	@$(VENV_PYTHON) -m examples.demo
+
+demo-live: setup ## the virtual SEM live in the browser, raw and corrected
+	@$(VENV_PYTHON) -m semcal_ros demo
 
 # Where what they compare with cannot be installed, the tables say so.
 bench: setup ## the benchmarks, as a table (installs what they compare with into .venv)

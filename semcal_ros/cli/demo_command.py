@@ -1,0 +1,88 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal demo``."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.options import DURATION
+from semcal_ros.cli.output import show_progress
+from semcal_ros.cli.view_command import require_view
+from semcal_ros.core.errors import SemcalError
+
+__all__ = ["command"]
+
+# Views of the grid for the calibration: some seconds of work, good to a few tenths of a per cent.
+_MAGNIFICATIONS = (1500.0, 2500.0, 4000.0, 6000.0, 9000.0)
+_VIEWS, _VIEW_SIZE = 4, 320
+
+
+@click.command("demo")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8060,
+    show_default=True,
+    help="Port of the page; 0 takes a free one.",
+)
+@click.option(
+    "--size",
+    type=click.IntRange(64, 4096),
+    default=512,
+    show_default=True,
+    help="Width and height of the images, px.",
+)
+@click.option("--duration", type=DURATION, help="End by itself after this time, such as 60s.")
+def command(port: int, size: int, duration: float | None) -> None:
+    """Show a virtual microscope in the browser, raw and corrected: no instrument, no files.
+
+    It calibrates the virtual microscope from simulated pictures of the grid, starts virtual_sem, parameter_server and
+    stream_corrector, and turns the magnification up and down.
+
+    \b
+    Example:
+      semcal demo
+    """
+    require_view()
+    try:
+        from semcal_ros.nodes.demo import run_demo
+    except ImportError as error:
+        raise SemcalError(
+            f"ROS 2 cannot be imported ({error})",
+            expected="rclpy",
+            do="source a ROS 2 workspace or run `make setup`",
+        ) from error
+    from semcal_ros.workflows.calibrate import calibrate_recording
+    from semcal_ros.workflows.simulate import simulate
+
+    with tempfile.TemporaryDirectory(prefix="semcal-demo-") as folder:
+        bag, file = Path(folder) / "grid", Path(folder) / "calibration.yaml"
+        with show_progress() as on_progress:
+            simulate(
+                bag,
+                magnifications=_MAGNIFICATIONS,
+                views=_VIEWS,
+                size=_VIEW_SIZE,
+                on_progress=on_progress,
+            )
+            done = calibrate_recording(bag, config="virtual_sem", on_progress=on_progress)
+        done.calibration.save(file)
+        status = run_demo(file, port=port, size=size, duration_s=duration or 0.0, say=click.echo)
+    sys.exit(status)

@@ -1,0 +1,117 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal demo`` as a user starts it: a corrected picture comes, and Ctrl-C ends all of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tornado.websocket import websocket_connect
+
+from tests.helpers.project import ROOT
+
+pytestmark = [pytest.mark.slow, pytest.mark.flaky(reruns=1)]
+
+PICTURE_S = 60.0
+
+
+async def _calibrated_picture(address: str) -> dict[str, Any]:
+    """What the page is told of the first corrected picture with a calibrated scale."""
+    page = await websocket_connect(f"{address.replace('http', 'ws', 1)}live")
+    try:
+        while True:
+            told = await page.read_message()
+            assert told is not None
+            if isinstance(told, str):
+                continue
+            (length,) = struct.unpack_from("<I", told)
+            header: dict[str, Any] = json.loads(told[4 : 4 + length])
+            for picture in header["pictures"]:
+                scale = picture["scale"]
+                if picture["name"] == "corrected" and scale and "±" in scale["bar_label"]:
+                    return header
+    finally:
+        page.close()
+        while await page.read_message() is not None:
+            pass
+
+
+def _nodes() -> set[str]:
+    """Processes that have the calibration of a demo, all but the microscope."""
+    found = set()
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes().decode().split("\0")
+        except (OSError, UnicodeDecodeError):
+            continue
+        if any(
+            part.startswith("config:=virtual_sem") or "semcal-demo-" in part for part in command
+        ):
+            found.add(entry.name)
+    return found
+
+
+def test_one_command_shows_the_corrected_stream_and_ends_with_ctrl_c() -> None:
+    before = _nodes()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "semcal_ros", "demo", "--port", "0", "--size", "128"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+    ) as demo:
+        assert demo.stdout is not None
+        found = None
+        while found is None:
+            line = demo.stdout.readline()
+            assert line
+            found = re.search(r"open (http://\S+/)", line)
+        try:
+            header = asyncio.run(asyncio.wait_for(_calibrated_picture(found[1]), PICTURE_S))
+            assert {picture["name"] for picture in header["pictures"]} == {"raw", "corrected"}
+            assert len(_nodes() - before) == 2
+        finally:
+            demo.send_signal(signal.SIGINT)
+            demo.wait(60)
+    assert demo.returncode == 0
+    assert _nodes() <= before
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
+    with socket.create_server(("localhost", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = subprocess.run(
+            [sys.executable, "-m", "semcal_ros", "demo", "--port", str(port), "--size", "64"],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert str(port) in done.stderr.splitlines()[-1]
