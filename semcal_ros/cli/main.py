@@ -31,10 +31,12 @@ __all__ = ["main"]
 
 # Modules are imported when their command is used, so that `semcal --help` does not wait for plotting or bags.
 _COMMANDS = {
+    "acquire": "calibrate a live microscope unattended, or step by step",
     "at": "camera at a magnification: K, P, distortion, nm per pixel",
     "calibrate": "calibrate from a recording of the chess grid",
     "check": "whether a calibration still holds, by a few views of the grid",
     "compare": "by how much two calibrations differ",
+    "demo": "a virtual microscope in the browser, raw and corrected",
     "doctor": "what keeps a live stream from working",
     "drift": "specimen drift of a recording, as a table",
     "evaluate": "reprojection error of a calibration on a recording",

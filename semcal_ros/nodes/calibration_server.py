@@ -16,10 +16,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -32,6 +36,7 @@ from semcal_ros.bridge.calibration_warnings import ScaleWarnings
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
+from semcal_ros.core.calibration.acquisition import ViewRequest, find_picture_fault
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.check import Verdict
 from semcal_ros.core.calibration.stage import StageReading
@@ -39,9 +44,22 @@ from semcal_ros.core.calibration.view_coverage import measure_view_coverage
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
+from semcal_ros.core.errors import (
+    CalibrationError,
+    InvalidValueError,
+    MicroscopeError,
+    Rejection,
+)
 from semcal_ros.core.wording import counted
+from semcal_ros.files.bags.view_recorder import ViewRecorder
 from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
+from semcal_ros.nodes.acquisition.run import (
+    ACQUISITION,
+    AcquisitionRun,
+    Progress,
+    goal_of,
+)
 from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
 from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -76,10 +94,16 @@ _PARAMETERS = (
         description="Calibration that ~/check and ~/update start from, until one is made here.",
     ),
     OUTPUT,
-    ParameterDeclaration("allow_writing", True, "Whether ~/save may write files.", fixed=True),
+    ParameterDeclaration(
+        "allow_writing", True, "Whether ~/save and ~/acquire may write files.", fixed=True
+    ),
+    *ACQUISITION,
 )
-# Frames, the report, parameters, views, a calibration, a call that cancels it, and a check.
-_THREADS = 7
+# Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
+_PICTURE_S = 600.0
+_POLL_S = 0.1
+# Relative difference of a magnification from the one that was asked for: what a display rounds.
+_MAGNIFICATION_OFF = 0.02
 
 
 @dataclass(frozen=True)
@@ -92,13 +116,25 @@ class _Candidate:
     conditions: Conditions
 
 
+def _free_folder(wanted: Path) -> Path:
+    """The folder, or with a number if there is one already."""
+    number, free = 2, wanted
+    while free.exists():
+        free = wanted.with_name(f"{wanted.name}_{number}")
+        number += 1
+    return free
+
+
 class CalibrationServer(StreamNode):
-    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/cancel, ~/check, ~/update, ~/save, ~/clear; topics
-    ``calibration``, ~/progress, ~/overlay.
+    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/acquire, ~/cancel, ~/check, ~/update, ~/save, ~/clear;
+    topics ``calibration``, ~/progress, ~/overlay.
 
     ~/calibrate answers when the calibration is done, ~/calibrate_start when it has begun; views can be added meanwhile
-    for the next one.
+    for the next one. ~/acquire begins, or goes on with, an acquisition: see :mod:`semcal_ros.nodes.acquisition`.
     """
+
+    # Frames, the report, parameters, views, a calibration, a call that cancels it, a check, and a microscope's answers.
+    threads = 8
 
     def __init__(self) -> None:
         super().__init__("calibration_server", _PARAMETERS)
@@ -112,6 +148,14 @@ class CalibrationServer(StreamNode):
         self._running: CalibrationProcess | None = None
         self._stage: Stage | None = None
         self._beside: threading.Thread | None = None
+        # An acquisition, its thread while it runs, and what a person took for its request.
+        self._acquisition: AcquisitionRun | None = None
+        self._acquiring: threading.Thread | None = None
+        self._acquisition_wanted = False
+        self._request: ViewRequest | None = None
+        self._taken_by_hand = ""
+        self._recorder: ViewRecorder | None = None
+        self._pictures = 0
         self._warnings = ScaleWarnings()
         self._output = OutputFile(self.parameters, self.reporter.info)
         self._text = self.endpoints.latched_publisher(String, "calibration")
@@ -122,14 +166,21 @@ class CalibrationServer(StreamNode):
         self._position = StageInput(self.config.stage, self.endpoints, self.reporter, stream)
         self._known = ConditionsInput(self.endpoints, self.reporter, group=stream)
         self.receive_frames(self._on_frame, group=stream)
+        name = self.parameters["microscope"]
+        self._commands = (
+            MicroscopeCommands(self, self.endpoints, name, self.config.stage, self._still_acquiring)
+            if name
+            else None
+        )
         quick, compared = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         handlers = (
-            ("add_view", self._add_view, quick),
-            ("save", self._save, quick),
+            ("add_view", self.add_view, quick),
+            ("save", self.save, quick),
             ("clear", self._clear, quick),
             # A call during a calibration is refused at once instead of waiting for its end.
             ("calibrate", self._calibrate, ReentrantCallbackGroup()),
             ("calibrate_start", self._start_calibration, quick),
+            ("acquire", self.acquire, quick),
             ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
             ("check", self._check, compared),
             ("update", self._update, compared),
@@ -155,17 +206,19 @@ class CalibrationServer(StreamNode):
     def _end_calibration(self) -> None:
         with self._lock:
             running = self._running
+            self._acquisition_wanted = False
         if running is not None:
             running.cancel()
-        if self._beside is not None:
-            self._beside.join()
+        for thread in (self._beside, self._acquiring):
+            if thread is not None:
+                thread.join()
 
     def _report_answer(self, success: bool, text: str) -> None:
         self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
 
     def _report_progress(self, text: str, level: DiagnosticLevel = DiagnosticLevel.OK) -> None:
         with self._lock:
-            views, stage = list(self._views), self._stage
+            views, stage, acquisition = list(self._views), self._stage, self._acquisition
         values = [("views", str(len(views)))]
         values.append(("corners", str(sum(len(view.detection.xy) for view in views))))
         counts = Counter(view.magnification for view in views)
@@ -177,6 +230,13 @@ class CalibrationServer(StreamNode):
             values.append(("largest_tilt_deg", f"{max(coverage.tilts_deg):.1f}"))
         if stage is not None:
             values += [("stage", stage.name), ("fraction", f"{stage.fraction:.3f}")]
+        if acquisition is not None:
+            progress = acquisition.progress
+            values += [("acquisition", progress.state), ("request", progress.text)]
+            values += [("taken", str(progress.views)), ("planned", str(progress.planned))]
+            values += [("left_out", str(progress.left_out))]
+            values += [("target", f"{acquisition.goal.target:g}")]
+            values += [("largest_sigma", f"{progress.largest:.3g}")]
         status = DiagnosticStatus()
         name = f"{self.get_fully_qualified_name()}: calibration"
         summary = DiagnosticSummary(level, text, tuple(values))
@@ -200,6 +260,7 @@ class CalibrationServer(StreamNode):
             visit = 0 if before is None else before.visit
             visit += before is not None and before.frame.magnification != magnification
             self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns), conditions)
+            self._pictures += 1
 
     # -- services ----------------------------------------------------------------------------------
 
@@ -207,7 +268,18 @@ class CalibrationServer(StreamNode):
         if self.frames is not None:
             self.frames.refuse_rivals()
 
-    def _add_view(self) -> str:
+    def add_view(self) -> str:
+        """Make a view of the newest frame, and say which."""
+        with self._lock:
+            request = self._request
+        text = self._take_view(request)
+        if request is not None:
+            with self._lock:
+                self._taken_by_hand = text
+        return text
+
+    def _take_view(self, request: ViewRequest | None) -> str:
+        """Make a view of the newest frame, which must show what was asked for."""
         self._refuse_rivals()
         with self._lock:
             newest, name = self._newest, f"view {len(self._views)}"
@@ -218,6 +290,14 @@ class CalibrationServer(StreamNode):
             )
         if frame is self._added:
             raise InvalidValueError("the same frame as before", do="wait for the next one")
+        if request is not None:
+            self._record(newest, frame.magnification)
+            off = frame.magnification / request.magnification - 1.0
+            if abs(off) > _MAGNIFICATION_OFF:
+                raise CalibrationError(
+                    f"a picture at {frame.magnification:g}x",
+                    expected=f"{request.magnification:.0f}x",
+                )
         grey = to_gray(frame.image, frame.encoding)
         detection = find_lattice(grey)
         message = Image()
@@ -232,6 +312,10 @@ class CalibrationServer(StreamNode):
                 f"no grid found at {frame.magnification:g}x: {detection.reason}",
                 expected="an image filled by the chess grid",
             )
+        if request is not None and (
+            fault := find_picture_fault(grey, detection, request, newest.stage)
+        ):
+            raise CalibrationError(f"not usable at {frame.magnification:g}x: {fault}")
         found = FoundView(name, frame.magnification, grey, detection, newest.stage, newest.visit)
         view = without_images([found])[0]
         with self._lock:
@@ -358,9 +442,181 @@ class CalibrationServer(StreamNode):
             self._stage = stage
         self._report_progress(f"calibrating from {counted(len(running.job.views), 'view')}")
 
+    # -- a calibration that records itself -----------------------------------------------------------
+
+    def acquire(self) -> str:
+        """Begin an acquisition, or go on with one; return what was begun, in words."""
+        self._refuse_rivals()
+        with self._lock:
+            if self.acquiring:
+                raise CalibrationError("an acquisition is running", do="call ~/cancel to end it")
+            if self._running is not None:
+                raise CalibrationError(
+                    "a calibration is running", do="wait for its end, or call ~/cancel"
+                )
+            goal = goal_of(self.parameters, self.config.squares_m, self.config.display_width_m)
+            run, verb = self._acquisition, "going on"
+            if run is None or run.goal != goal or run.progress.state == "done":
+                verb = "begun"
+                run = AcquisitionRun(
+                    goal,
+                    self,
+                    self._commands,
+                    self.parameters["turn_by"],
+                    self._still_acquiring,
+                )
+            record = self.parameters["record"]
+            if record and not self.parameters["allow_writing"]:
+                raise InvalidValueError(
+                    "writing files is switched off",
+                    do="start the node with allow_writing true, or record nothing",
+                )
+            path = _free_folder(self.parameters.allowed_path(record)) if record else None
+            recorder = None if path is None else ViewRecorder(path, self.config)
+            self._acquisition, self._acquisition_wanted = run, True
+            self._acquiring = threading.Thread(
+                target=self._acquire_beside, args=(run, recorder), daemon=True
+            )
+        self._acquiring.start()
+        where = "" if path is None else f", recorded to {path}"
+        return f"acquisition {verb}{where}; ~/progress shows it, ~/cancel ends it"
+
+    def _acquire_beside(self, run: AcquisitionRun, recorder: ViewRecorder | None) -> None:
+        """Run an acquisition, and say how it has ended."""
+        level, state = DiagnosticLevel.OK, "done"
+        try:
+            with recorder or nullcontext():
+                self._recorder = recorder
+                try:
+                    ended = run.run()
+                except NODE_ERRORS as error:
+                    # What was recorded is kept: the error is told, not raised.
+                    text = " ".join(str(error).split())
+                    level = DiagnosticLevel.WARN
+                    state = "failed" if self._still_acquiring() else "stopped"
+                else:
+                    text = (
+                        f"{ended.reason}: nm per px known to {100.0 * ended.largest:.3f} % at {ended.at:.0f}x, the "
+                        "worst, repeatability aside; ~/save writes the calibration"
+                    )
+        except NODE_ERRORS as error:
+            text, level, state = " ".join(str(error).split()), DiagnosticLevel.WARN, "failed"
+        finally:
+            with self._lock:
+                self._recorder, self._request = None, None
+                self._acquisition_wanted = False
+        run.progress = replace(run.progress, state=state, text=text)
+        if self.context.ok():
+            self._report_progress(f"acquisition {state}: {text}", level)
+            (self.reporter.info if state == "done" else self.reporter.warn)(f"~/acquire: {text}")
+
+    @property
+    def has_picture(self) -> bool:
+        """Whether there is a frame with a known magnification."""
+        return self._newest is not None
+
+    @property
+    def has_calibration(self) -> bool:
+        """Whether there is something to save."""
+        return self._calibration is not None
+
+    @property
+    def acquiring(self) -> bool:
+        """Whether an acquisition is under way."""
+        return self._acquiring is not None and self._acquiring.is_alive()
+
+    @property
+    def acquisition_progress(self) -> Progress:
+        """How far the acquisition is, or how it has ended."""
+        return (
+            Progress("stopped", "not begun")
+            if self._acquisition is None
+            else self._acquisition.progress
+        )
+
+    def _still_acquiring(self) -> bool:
+        return self._acquisition_wanted and self.context.ok()
+
+    def _record(self, newest: _Candidate, magnification: float) -> None:
+        recorder = self._recorder
+        if recorder is not None:
+            frame = newest.frame
+            recorder.write(
+                frame.image,
+                frame.encoding,
+                frame.stamp_ns,
+                magnification,
+                newest.stage,
+                newest.conditions,
+            )
+
+    def wait_for_pictures(self, count: int) -> None:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        with self._lock:
+            wanted = self._pictures + count
+        self._wait_until(
+            lambda: self._pictures >= wanted,
+            MicroscopeError("no picture comes any more"),
+            _PICTURE_S,
+        )
+
+    def take(self, request: ViewRequest) -> str:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        try:
+            return self._take_view(request)
+        except InvalidValueError as error:
+            raise CalibrationError(str(error)) from error
+
+    def wait_for_view(self, request: ViewRequest) -> str:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        with self._lock:
+            self._request, self._taken_by_hand = request, ""
+        self._wait_until(lambda: bool(self._taken_by_hand), CalibrationError("no view"), math.inf)
+        return self._taken_by_hand
+
+    def stage(self) -> StageReading | None:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        with self._lock:
+            return None if self._newest is None else self._newest.stage
+
+    def calibrate(self) -> Calibration:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        with self._lock:
+            self._request = None
+        self._complete(self._begin())
+        with self._lock:
+            calibration = self._calibration
+        if calibration is None:
+            raise CalibrationError("no calibration came of the views")
+        return calibration
+
+    def show(self, progress: Progress) -> None:
+        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        self._report_progress(progress.text)
+
+    def _wait_until(
+        self,
+        condition: Callable[[], bool],
+        late: MicroscopeError | CalibrationError,
+        limit_s: float,
+    ) -> None:
+        end_s = time.monotonic() + limit_s
+        while not condition():
+            if not self._still_acquiring():
+                raise CalibrationError("stopped", do="call ~/acquire to go on")
+            if time.monotonic() > end_s:
+                raise late
+            time.sleep(_POLL_S)
+
     def _cancel(self) -> str:
         with self._lock:
+            acquiring = self._acquisition_wanted
+            self._acquisition_wanted = False
             running, self._running, self._stage = self._running, None, None
+        if acquiring:
+            if running is not None:
+                running.cancel()
+            return "the acquisition ends as soon as nothing moves; ~/acquire goes on with it"
         if running is None:
             raise CalibrationError("no calibration is running")
         running.cancel()
@@ -405,7 +661,8 @@ class CalibrationServer(StreamNode):
         self._adopt(Calibration.from_model(done.model))
         return f"updated; before, it was {done.check.summary}"
 
-    def _save(self) -> str:
+    def save(self) -> str:
+        """Write the calibration, and say where."""
         if not self.parameters["allow_writing"]:
             raise InvalidValueError(
                 "writing files is switched off", do="start the node with allow_writing true"
@@ -419,7 +676,7 @@ class CalibrationServer(StreamNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable."""
-    return run_node(CalibrationServer, args, threads=_THREADS)
+    return run_node(CalibrationServer, args, threads=CalibrationServer.threads)
 
 
 if __name__ == "__main__":

@@ -114,6 +114,8 @@ def parameters_of(node: str, folder: Path) -> dict[str, Any]:
         return {"bag": folder / "bag", "start_paused": True}
     if node == "microscope":
         return {"source": "folder", "folder": folder, "journal": folder / "journal"}
+    if node == "calibration_server":
+        return {"microscope": "microscope"}
     if node == "parameter_server":
         return {"monitor_period": 60.0}
     return {"input": "stabilized"} if node == "rectifier" else {}

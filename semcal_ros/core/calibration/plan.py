@@ -109,6 +109,7 @@ def plan_views(
     *,
     squares_m: Sequence[float],
     most_visits: int = 10,
+    single_setting: bool = True,
 ) -> ViewPlan:
     """Choose visits until the relative 1-sigma of nm per pixel is below a target in the whole calibrated range.
 
@@ -122,6 +123,9 @@ def plan_views(
         Sides of the squares that the grid has.
     most_visits
         End after so many, with the target met or not.
+    single_setting
+        Whether the sigmas are those of a user who sets the magnification once, with the part that no view lowers
+        (:attr:`ViewPlan.floor`); otherwise those of the calibration itself, which views can make as small as wanted.
 
     Raises
     ------
@@ -138,7 +142,8 @@ def plan_views(
     candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
     root = _root(model)
     rows = np.stack([_pixel_rows(model, float(g)) @ root for g in judged])  # (G, 2, K)
-    fixed = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
+    floor = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
+    fixed = floor if single_setting else np.zeros_like(floor)
     designs = [_design(model, float(g)) @ root for g in candidates]
     seen = [_square_for(model.at(float(g)), squares_m) for g in candidates]
     information = [
@@ -156,7 +161,7 @@ def plan_views(
         return float(total[worst]), worst
 
     largest, worst = judge(precision)
-    start = worst_pixel_size(model)
+    start = worst_pixel_size(model) if single_setting else (largest, float(judged[worst]))
     visits: list[PlannedVisit] = []
     while largest > target and len(visits) < most_visits:
         scores = [_mean_variance(precision + gain, rows, fixed) for gain in gains]
@@ -166,7 +171,7 @@ def plan_views(
         visits.append(
             PlannedVisit(float(candidates[best]), seen[best], largest, float(judged[worst]))
         )
-    return ViewPlan(tuple(visits), *start, float(fixed.max()), largest <= target)
+    return ViewPlan(tuple(visits), *start, float(floor.max()), largest <= target)
 
 
 def _mean_variance(precision: Array, rows: Array, fixed: Array) -> float:

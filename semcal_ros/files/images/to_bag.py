@@ -25,22 +25,26 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.bridge.magnification import published_number
 from semcal_ros.config.config import (
     IMAGE_TYPE,
-    STAGE_TYPE,
     MicroscopeConfig,
     StageConfig,
     load_config,
 )
-from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
 from semcal_ros.files.bags.messages import blank_message
+from semcal_ros.files.bags.microscope_messages import (
+    check_recordable,
+    conditions_message,
+    magnification_message,
+    microscope_topic,
+    stage_message,
+)
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
 from semcal_ros.files.images.image_series import (
     MIN_SPACING_NS,
@@ -60,7 +64,6 @@ METADATA_TOPIC = "metadata"
 SIDECAR = "import.json"
 """File in the recording's folder with the same settings, the notes and the skipped files."""
 
-_NUMBER_TYPES = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 # A tenth of the least spacing: after the image before, whatever their order in the folder.
 _BEFORE_IMAGE_NS = MIN_SPACING_NS // 10
 
@@ -101,27 +104,6 @@ class ImportSummary:
         ]
 
 
-def _topic(name: str) -> str:
-    return name if name.startswith("/") else f"/sem/{name}"
-
-
-def _check_config(config: MicroscopeConfig) -> None:
-    if config.image.type != IMAGE_TYPE:
-        raise BagError(
-            f"configuration {config.name!r} has its images in {config.image.type}",
-            expected=f"{IMAGE_TYPE} for an import",
-            do="import with --config generic",
-        )
-    source = config.magnification
-    if source.type not in _NUMBER_TYPES or source.field != "data":
-        raise BagError(
-            f"configuration {config.name!r} has its {source.quantity} in {source.type}, "
-            f"field {source.field}",
-            expected="std_msgs/msg/Float64, field data, for an import",
-            do="import with --config generic",
-        )
-
-
 def _describe(image: SeriesImage, pixels: NDArray[Any]) -> dict[str, Any]:
     """What is known of an image, as plain values for JSON (SI units)."""
     settings, rows = image.page.settings, image.databar_rows
@@ -144,27 +126,6 @@ def _text_message(text: str) -> Any:
     return message
 
 
-def _stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: int) -> Any:
-    """Joints of the stage; none where the file does not tell them, which ends the reading before."""
-    own = reading or StageReading()
-    angles = {
-        source.tilt: own.tilt_rad,
-        source.rotation: own.rotation_rad,
-        source.scan_rotation: own.scan_rotation_rad,
-    }
-    known = {joint: angle for joint, angle in angles.items() if angle is not None}
-    message = blank_message(STAGE_TYPE)
-    fill_header(message.header, stamp_ns, "")
-    message.name, message.position = list(known), list(known.values())
-    return message
-
-
-def _conditions_message(conditions: Conditions, name: str) -> Any:
-    message = blank_message(CONDITIONS_TYPE)
-    fill_conditions(message, conditions.topic_values(), name)
-    return message
-
-
 def _write_image(
     writer: BagWriter,
     config: MicroscopeConfig,
@@ -172,23 +133,21 @@ def _write_image(
     pixels: NDArray[Any],
     stage: StageConfig | None,
 ) -> dict[str, Any]:
-    number = blank_message(config.magnification.type)
-    width_m = config.display_width_m / entry.magnification
-    number.data = published_number(config, width_m, pixels.shape[1])
+    number = magnification_message(config, entry.magnification, pixels.shape[1])
     # A player that keeps the recording's order then announces the magnification before its image.
     before_ns = max(0, entry.stamp_ns - _BEFORE_IMAGE_NS)
-    writer.write(_topic(config.magnification.topic), before_ns, number)
+    writer.write(microscope_topic(config.magnification.topic), before_ns, number)
     if stage is not None:
-        joints = _stage_message(stage, entry.stage, before_ns)
-        writer.write(_topic(stage.topic), before_ns, joints)
+        joints = stage_message(stage, entry.stage, before_ns)
+        writer.write(microscope_topic(stage.topic), before_ns, joints)
     message = blank_message(IMAGE_TYPE)
     header = blank_message("std_msgs/msg/Header")
     fill_header(header, entry.stamp_ns, config.frame_id)
     fill_image(message, pixels, ENCODINGS[pixels.dtype.name], header)
-    writer.write(_topic(config.image.topic), entry.stamp_ns, message)
+    writer.write(microscope_topic(config.image.topic), entry.stamp_ns, message)
     settings = {"stamp_ns": entry.stamp_ns, "published": number.data, **_describe(entry, pixels)}
     text = json.dumps(settings, sort_keys=True, allow_nan=False)
-    writer.write(_topic(METADATA_TOPIC), entry.stamp_ns, _text_message(text))
+    writer.write(microscope_topic(METADATA_TOPIC), entry.stamp_ns, _text_message(text))
     return settings
 
 
@@ -211,9 +170,9 @@ def _write_all(
         if conditions.topic_values() != told:
             told = conditions.topic_values()
             before_ns = max(0, image.stamp_ns - _BEFORE_IMAGE_NS)
-            topic = _topic(CONDITIONS_TOPIC)
+            topic = microscope_topic(CONDITIONS_TOPIC)
             writer.add_topic(topic, CONDITIONS_TYPE, latched=True, depth=1)
-            writer.write(topic, before_ns, _conditions_message(conditions, config.name))
+            writer.write(topic, before_ns, conditions_message(conditions, config.name))
         written.append(_write_image(writer, config, image, pixels, stage))
     if not written:
         raise BagError(
@@ -254,7 +213,7 @@ def import_images(
         No file is usable, or their scale is not known; the recording cannot be written, or exists.
     """
     used = load_config("generic") if config is None else config
-    _check_config(used)
+    check_recordable(used)
     check_replaceable(Path(os.path.abspath(out_bag)), overwrite)
     given = source if isinstance(source, RecordedFiles) else RecordedFiles(source)
     if given.roi is not None:

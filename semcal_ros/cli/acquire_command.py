@@ -1,0 +1,154 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``semcal acquire``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from semcal_ros.cli.options import (
+    PATH,
+    config_option,
+    output_option,
+    parse_ratio,
+    require_folder,
+)
+from semcal_ros.config.config import load_config
+from semcal_ros.core.errors import InvalidValueError, SemcalError
+
+__all__ = ["command"]
+
+
+def _parse_range(
+    _context: click.Context, _parameter: click.Parameter, text: str
+) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not a range such as 500,10000") from None
+    return low, high
+
+
+def _wait_for_enter(text: str) -> None:
+    click.echo(text, nl=False)
+    if not sys.stdin.readline():
+        raise SemcalError("the input has ended", expected="Enter after each view")
+
+
+@click.command("acquire")
+@output_option("Calibration file.")
+@click.option(
+    "--range",
+    "magnifications",
+    required=True,
+    callback=_parse_range,
+    metavar="LOW,HIGH",
+    help="Magnifications to calibrate.",
+)
+@click.option(
+    "--target",
+    default="0.1%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="1-sigma of nm per pixel to reach, repeatability of the magnification aside.",
+)
+@click.option(
+    "--microscope",
+    default="microscope",
+    show_default=True,
+    help="Node that moves the microscope, such as virtual_sem.",
+)
+@click.option(
+    "--by-hand", is_flag=True, help="Say what to set, and wait for Enter; nothing is moved."
+)
+@click.option(
+    "--tilts", default="0,20,40", show_default=True, help="Tilts of each visit, in degrees."
+)
+@click.option(
+    "--turn-by",
+    type=click.Choice(["scan_rotation", "rotation", "nothing"]),
+    default="scan_rotation",
+    show_default=True,
+    help="What turns the grid in the image between views.",
+)
+@click.option(
+    "--most-views",
+    type=click.IntRange(6, 1000),
+    default=150,
+    show_default=True,
+    help="End after so many views, with the target met or not.",
+)
+@click.option("--record", type=PATH, help="Also record all pictures to this bag, a new folder.")
+@click.option("--namespace", default="/sem", show_default=True, help="Of the nodes and topics.")
+@config_option
+def command(
+    output: Path,
+    magnifications: tuple[float, float],
+    target: float,
+    microscope: str,
+    by_hand: bool,
+    tilts: str,
+    turn_by: str,
+    most_views: int,
+    record: Path | None,
+    namespace: str,
+    config: str,
+) -> None:
+    """Calibrate a live microscope unattended: move it, take views of the grid, until nm per pixel is certain enough.
+
+    The nodes of the microscope must run, with the grid in view and in focus, and moving allowed. Exit status 1 if the
+    target was not met; what was calibrated is written all the same.
+
+    \b
+    Example:
+      semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem --record views
+      semcal acquire -o cal.yaml --range 500,10000 --by-hand
+    """
+    require_folder(output)
+    load_config(config)
+    if record is not None and record.exists():
+        raise InvalidValueError(f"--record {record} exists", expected="a new folder")
+    if not namespace.startswith("/"):
+        raise InvalidValueError(f"--namespace {namespace}", expected="a name that begins with /")
+    try:
+        from semcal_ros.nodes.acquire import run_acquisition
+    except ImportError as error:
+        raise SemcalError(
+            f"ROS 2 cannot be imported ({error})",
+            expected="rclpy for a live microscope",
+            do="source a ROS 2 workspace or run `make setup`",
+        ) from error
+    parameters: dict[str, object] = {
+        "config": config,
+        "output": str(output.absolute()),
+        "lowest_magnification": magnifications[0],
+        "highest_magnification": magnifications[1],
+        "target": target,
+        "tilts_deg": f"'{tilts}'",
+        "turn_by": turn_by,
+        "most_views": most_views,
+    }
+    if not by_hand:
+        parameters["microscope"] = microscope
+    if record is not None:
+        parameters["record"] = str(record.absolute())
+    arguments = ["--ros-args", "-r", f"__ns:={namespace}", "--log-level", "error"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={value}"]
+    sys.exit(run_acquisition(arguments, click.echo, _wait_for_enter))

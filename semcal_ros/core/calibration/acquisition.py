@@ -1,0 +1,295 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which views a calibration that records itself takes: first a survey of the range, then what helps most.
+
+The survey visits magnifications at equal ratios. What follows is chosen by :func:`~semcal_ros.core.calibration.plan.
+plan_views` from the calibration that the views so far give, until nm per pixel is as certain as asked. Each visit has
+one view for each tilt, differently turned in the plane, so that the faults of the grid and those of the camera are told
+apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, check_positive
+from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.corners import LatticeDetection
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import counted
+
+__all__ = [
+    "AcquisitionGoal",
+    "Proposal",
+    "ViewRequest",
+    "find_picture_fault",
+    "plan_survey",
+    "propose_visits",
+]
+
+# Ratio of neighbouring magnifications of the survey: the functions of a calibration are smooth over a factor of two.
+_SURVEY_RATIO = 1.7
+_FEWEST_VISITS = 4
+# Visits between two calibrations: what they bring was predicted, so that there is little to learn from each alone.
+_AT_ONCE = 4
+# A round that is predicted to lower the largest sigma by less than this part is not worth the time.
+_WORTH = 0.02
+# Turns of the views of one visit, and from visit to visit: the golden angle never repeats a direction (Vogel 1979).
+_TURN_RAD = 1.1
+_GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
+# Squares across the image that a view should show, at least.
+_SQUARES_ACROSS = 8.0
+_STEEPEST_RAD = math.radians(60.0)
+# Share of pixels at one end of the detector's range from which edges are cut off.
+_SATURATED = 0.05
+# Blur of the edges, as a part of the spacing, from which corners of neighbouring squares run into each other.
+_BLURRED = 0.25
+# Tilt that is no longer the one that was asked for.
+_TILT_OFF_RAD = math.radians(2.0)
+# Part of the image, along x and y, that the grid must span.
+_SPANNED = 0.6
+
+
+@dataclass(frozen=True)
+class AcquisitionGoal:
+    """What is to be calibrated, and how well.
+
+    Attributes
+    ----------
+    magnification_range
+        Least and greatest magnification.
+    squares_m
+        Sides of the squares that the grid has, m.
+    display_width_m
+        Display width to which magnifications refer, m.
+    target
+        Relative 1-sigma of nm per pixel to reach in the whole range, repeatability of the magnification aside.
+    tilts_rad
+        Tilts of the views of each visit, rad.
+    most_views
+        End after so many views, with the target met or not.
+    """
+
+    magnification_range: tuple[float, float]
+    squares_m: tuple[float, ...]
+    display_width_m: float
+    target: float = 1e-3
+    tilts_rad: tuple[float, ...] = PLANNED_TILTS_RAD
+    most_views: int = 150
+
+    def __post_init__(self) -> None:
+        low, high = self.magnification_range
+        check_positive(low, "the least magnification")
+        check_positive(self.target, "target =")
+        check_positive(self.display_width_m, "display_width_m =")
+        if not low <= high < math.inf:
+            raise InvalidValueError(
+                f"magnifications from {low:g} to {high:g}", expected="the lower one first"
+            )
+        if not self.squares_m or min(self.squares_m) <= 0.0:
+            raise InvalidValueError(
+                f"squares of {list(self.squares_m)} m", expected="the sizes of the grid's squares"
+            )
+        if len(self.tilts_rad) < 2 or max(self.tilts_rad) - min(self.tilts_rad) < 0.1:
+            raise InvalidValueError(
+                f"tilts of {[round(math.degrees(t), 1) for t in self.tilts_rad]} degrees",
+                expected="at least two that are 6 degrees apart",
+            )
+        if max(map(abs, self.tilts_rad)) > _STEEPEST_RAD:
+            raise InvalidValueError(
+                f"a tilt of {math.degrees(max(map(abs, self.tilts_rad))):.0f} degrees",
+                expected=f"{math.degrees(_STEEPEST_RAD):.0f} degrees at most",
+            )
+        needed = len(self.tilts_rad) * len(_survey_magnifications(self.magnification_range))
+        if self.most_views < needed:
+            raise InvalidValueError(
+                counted(self.most_views, "view"),
+                expected=f"at least {needed} for this range",
+                do="allow more, or narrow the range",
+            )
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """One view to take.
+
+    Attributes
+    ----------
+    visit
+        Number of the visit: the magnification is set anew for each.
+    magnification
+        Magnification to set.
+    tilt_rad
+        Tilt of the specimen, rad.
+    turn_rad
+        Turn in the plane, of the scan or of the specimen, -pi to pi.
+    square_m
+        Side of the squares that should be in view, m.
+    """
+
+    visit: int
+    magnification: float
+    tilt_rad: float
+    turn_rad: float
+    square_m: float
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to do after a calibration.
+
+    Attributes
+    ----------
+    requests
+        Views to take; empty at the end.
+    largest, at
+        Largest relative 1-sigma of nm per pixel now, repeatability aside, and the magnification where that is.
+    reached
+        Whether the target is met.
+    reason
+        Why it ends here, in words; empty if it does not.
+    """
+
+    requests: tuple[ViewRequest, ...]
+    largest: float
+    at: float
+    reached: bool
+    reason: str
+
+
+def _survey_magnifications(magnification_range: tuple[float, float]) -> tuple[float, ...]:
+    low, high = magnification_range
+    if low == high:
+        return (low,) * _FEWEST_VISITS
+    steps = math.ceil(math.log(high / low) / math.log(_SURVEY_RATIO) - 1e-9)
+    visits = np.geomspace(low, high, max(steps + 1, _FEWEST_VISITS))
+    visits[0], visits[-1] = low, high
+    return tuple(float(g) for g in visits)
+
+
+def _requests_of(
+    goal: AcquisitionGoal, visit: int, magnification: float
+) -> tuple[ViewRequest, ...]:
+    """The views of one visit."""
+    field_m = goal.display_width_m / magnification
+    fitting = [size for size in goal.squares_m if field_m / size >= _SQUARES_ACROSS]
+    square_m = max(fitting) if fitting else min(goal.squares_m)
+    return tuple(
+        ViewRequest(
+            visit,
+            magnification,
+            tilt,
+            math.remainder(0.2 + _GOLDEN_RAD * visit + _TURN_RAD * number, 2.0 * math.pi),
+            square_m,
+        )
+        for number, tilt in enumerate(goal.tilts_rad)
+    )
+
+
+def plan_survey(goal: AcquisitionGoal) -> tuple[ViewRequest, ...]:
+    """Return the views of the survey: what can be known without any calibration, and gives the first one."""
+    visits = _survey_magnifications(goal.magnification_range)
+    return tuple(r for visit, g in enumerate(visits) for r in _requests_of(goal, visit, g))
+
+
+def propose_visits(
+    goal: AcquisitionGoal, model: CalibrationModel, taken: Sequence[ViewRequest]
+) -> Proposal:
+    """Choose the next visits from the calibration of the views so far.
+
+    Parameters
+    ----------
+    goal
+        What is asked for.
+    model
+        The calibration.
+    taken
+        The requests so far, whether or not a view came of them.
+
+    Raises
+    ------
+    InvalidValueError
+        The calibration does not state what a plan needs.
+    """
+    left = (goal.most_views - len(taken)) // len(goal.tilts_rad)
+    plan = plan_views(
+        model,
+        goal.target,
+        squares_m=goal.squares_m,
+        most_visits=max(1, min(_AT_ONCE, left)),
+        single_setting=False,
+    )
+    reason = ""
+    if plan.largest <= goal.target:
+        reason = "the target is met"
+    elif left < 1:
+        reason = f"{counted(goal.most_views, 'view')} are all that were allowed"
+    elif not plan.visits or plan.visits[-1].largest > (1.0 - _WORTH) * plan.largest:
+        reason = "more views would hardly help"
+    first = 1 + max((request.visit for request in taken), default=-1)
+    requests: tuple[ViewRequest, ...] = ()
+    if not reason:
+        requests = tuple(
+            request
+            for number, visit in enumerate(plan.visits)
+            for request in _requests_of(goal, first + number, visit.magnification)
+        )
+    return Proposal(requests, plan.largest, plan.at, plan.largest <= goal.target, reason)
+
+
+def find_picture_fault(
+    image: AnyImage,
+    detection: LatticeDetection,
+    request: ViewRequest,
+    stage: StageReading | None,
+) -> str:
+    """Say what is wrong with a picture in which the grid was found; empty if nothing is.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey values.
+    detection
+        The corners.
+    request
+        What was asked for.
+    stage
+        Where the stage says that it is, or None.
+    """
+    if stage is not None and stage.tilt_rad is not None:
+        off = stage.tilt_rad - request.tilt_rad
+        if abs(off) > _TILT_OFF_RAD:
+            return (
+                f"the stage is tilted by {math.degrees(stage.tilt_rad):.1f} degrees"
+                f" instead of {math.degrees(request.tilt_rad):.1f}"
+            )
+    grey = np.asarray(image, dtype=np.float64)
+    largest = 2.0 ** (8 * image.dtype.itemsize) - 1.0 if image.dtype.kind == "u" else math.inf
+    dark, bright = float(np.mean(grey <= 0.0)), float(np.mean(grey >= largest))
+    if max(dark, bright) > _SATURATED:
+        share, end = max((dark, "black"), (bright, "white"))
+        return f"{100.0 * share:.0f} % of the pixels are {end}: change brightness or contrast"
+    if detection.blur_px > _BLURRED * detection.spacing_px:
+        return f"out of focus: edges are blurred by {detection.blur_px:.1f} px"
+    spanned = np.ptp(detection.xy, axis=0) / np.array(detection.image_size)
+    if min(spanned) < _SPANNED:
+        return f"the grid fills {100.0 * float(min(spanned)):.0f} % of the image: move it to the middle"
+    return ""

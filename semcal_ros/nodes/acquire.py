@@ -1,0 +1,125 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node behind ``semcal acquire``: a calibration server that begins at once, tells its progress, saves, and ends."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import ExternalShutdownException
+
+from semcal_ros.core.errors import MicroscopeError
+from semcal_ros.nodes.acquisition.run import Progress
+from semcal_ros.nodes.calibration_server import CalibrationServer
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
+from semcal_ros.nodes.common.run import run_node
+
+__all__ = ["run_acquisition"]
+
+# As long as a slow scan may take, and the middleware to find a microscope.
+_FIRST_PICTURE_S = 60.0
+_POLL_S = 0.1
+# What the target is missed by, or what failed.
+_MISSED = 1
+
+
+class _Acquirer(CalibrationServer):
+    def __init__(self, say: Callable[[str], None], ask: Callable[[str], None]) -> None:
+        super().__init__()
+        self._say = say
+        self._ask = ask
+        self._ended = False
+        self.exit_status = _MISSED
+        self._timer = self.create_timer(
+            _POLL_S, self._end_if_done, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+        self._driver = threading.Thread(target=self._drive, daemon=True)
+        self._driver.start()
+
+    def _end_if_done(self) -> None:
+        if self._ended:
+            raise ExternalShutdownException
+
+    def show(self, progress: Progress) -> None:
+        """Extend the base class: also on the terminal."""
+        super().show(progress)
+        if progress.state != "waiting":
+            self._say(f"{progress.views}/{progress.planned}: {progress.text}")
+
+    def _drive(self) -> None:
+        try:
+            self._begin_acquisition()
+            self._follow()
+        except NODE_ERRORS as error:
+            print(" ".join(str(error).split()), file=sys.stderr)
+        finally:
+            self._ended = True
+
+    def _begin_acquisition(self) -> None:
+        end_s = time.monotonic() + _FIRST_PICTURE_S
+        while not self.has_picture:
+            if time.monotonic() > end_s:
+                raise MicroscopeError(
+                    f"no picture with a known magnification for {_FIRST_PICTURE_S:g} s",
+                    do="check that the microscope publishes, by `semcal doctor`",
+                )
+            time.sleep(_POLL_S)
+        self._say(self.acquire())
+
+    def _follow(self) -> None:
+        asked = ""
+        while self.acquiring:
+            progress = self.acquisition_progress
+            if progress.state == "waiting" and progress.text != asked:
+                asked = progress.text
+                self._ask(f"{progress.views}/{progress.planned}: {progress.text}, then press Enter")
+                try:
+                    self.add_view()
+                except NODE_ERRORS as error:
+                    self._say(f"not taken: {error}")
+                    asked = ""
+            time.sleep(_POLL_S)
+        progress = self.acquisition_progress
+        self._say(progress.text)
+        if self.has_calibration:
+            self._say(self.save())
+        if progress.state == "done" and progress.largest <= self.parameters["target"]:
+            self.exit_status = 0
+
+
+def run_acquisition(
+    args: Sequence[str], say: Callable[[str], None], ask: Callable[[str], None]
+) -> int:
+    """Run the node.
+
+    Parameters
+    ----------
+    args
+        ROS arguments of the node ``calibration_server``.
+    say
+        Called with each line of progress.
+    ask
+        Called with what a person has to do; returns when that is done.
+
+    Returns
+    -------
+    Exit status: 0 if the target is met, 1 if not, 2 if the node cannot start.
+    """
+    return run_node(lambda: _Acquirer(say, ask), args, threads=_Acquirer.threads)

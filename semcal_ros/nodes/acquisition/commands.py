@@ -1,0 +1,173 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Asks a microscope to move, over the topics of ``microscope`` or ``virtual_sem``, and waits for its answers."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+
+from semcal_ros.config.config import StageConfig
+from semcal_ros.core.errors import MicroscopeError
+from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.qos import latched
+
+__all__ = ["MicroscopeCommands"]
+
+# Stages turn by some degrees per second; nothing that is asked for here is farther than a full turn.
+_ANSWER_S = 120.0
+# The middleware finds a node that runs within a second or two.
+_FIND_S = 10.0
+_POLL_S = 0.05
+# A little less than the longest way that `microscope` does in one command by default.
+_STEPS_RAD = {"tilt": 0.3, "rotation": 0.75}
+
+
+class MicroscopeCommands:
+    """One command at a time; each returns once the microscope has done it.
+
+    Parameters
+    ----------
+    node, endpoints
+        The node that asks.
+    name
+        Name of the node that is asked.
+    stage
+        How the joints are called in messages; None for the usual names.
+    still_wanted
+        Asked while waiting; if it returns False, the wait ends with an error.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        endpoints: Endpoints,
+        name: str,
+        stage: StageConfig | None,
+        still_wanted: Callable[[], bool],
+    ) -> None:
+        self._name = name
+        self._stage = stage or StageConfig()
+        self._still_wanted = still_wanted
+        self._changed = threading.Condition()
+        self._answer: dict[str, str] = {}
+        self._text = ""
+        self._magnification = endpoints.stream_publisher(Float64, f"{name}/set_magnification")
+        self._move = endpoints.stream_publisher(JointState, f"{name}/move_stage")
+        self._motion = endpoints.subscribe(
+            DiagnosticStatus,
+            f"{name}/motion",
+            self._on_motion,
+            latched(),
+            MutuallyExclusiveCallbackGroup(),
+        )
+
+    def set_magnification(self, magnification: float) -> None:
+        """Set the magnification; raises :class:`MicroscopeError` if that is refused or fails."""
+        self._ask(
+            self._magnification,
+            Float64(data=magnification),
+            "set_magnification",
+            f"magnification {magnification:g}",
+        )
+
+    def move(self, target: Mapping[str, float], current: Mapping[str, float | None]) -> None:
+        """Move joints, far ways in steps.
+
+        Parameters
+        ----------
+        target
+            Position of each joint, rad.
+        current
+            Where they are, as far as that is known.
+
+        Raises
+        ------
+        MicroscopeError
+            It is refused or fails, or the microscope does not answer.
+        """
+        ways = {}
+        for joint, position in target.items():
+            before = current.get(joint)
+            ways[joint] = (position if before is None else before, position)
+        steps = max(
+            (
+                math.ceil(abs(to - start) / _STEPS_RAD[joint])
+                for joint, (start, to) in ways.items()
+                if joint in _STEPS_RAD
+            ),
+            default=1,
+        )
+        for step in range(1, max(steps, 1) + 1):
+            part = step / max(steps, 1)
+            place = {joint: start + part * (to - start) for joint, (start, to) in ways.items()}
+            names = [getattr(self._stage, joint) for joint in place]
+            told = ", ".join(f"{joint} {math.degrees(at):.1f} deg" for joint, at in place.items())
+            message = JointState(name=names, position=list(place.values()))
+            self._ask(self._move, message, "move_stage", told)
+
+    def _on_motion(self, message: Any, _info: Any) -> None:
+        with self._changed:
+            self._answer = {value.key: value.value for value in message.values}
+            self._text = str(message.message)
+            self._changed.notify_all()
+
+    def _ask(self, publisher: Any, message: Any, command: str, told: str) -> None:
+        self._wait(
+            lambda: bool(self._answer) and publisher.get_subscription_count() > 0,
+            _FIND_S,
+            MicroscopeError(
+                f"no node {self._name} that takes ~/{command}",
+                expected="the node `microscope` or `virtual_sem` in this namespace",
+                do="start it, or set the parameter microscope",
+            ),
+        )
+        before = int(self._answer.get("number", 0))
+        publisher.publish(message)
+
+        def answered() -> bool:
+            number = int(self._answer.get("number", 0))
+            return number > before and self._answer.get("state") != "moving"
+
+        self._wait(
+            answered,
+            _ANSWER_S,
+            MicroscopeError(
+                f"no answer of {self._name} to {command}: {told}", do="look at the microscope"
+            ),
+        )
+        if self._answer.get("state") != "done":
+            raise MicroscopeError(
+                f"{self._name} has not done {told} ({self._answer.get('state')}): {self._text}"
+            )
+
+    def _wait(self, condition: Callable[[], bool], limit_s: float, late: MicroscopeError) -> None:
+        end_s = time.monotonic() + limit_s
+        with self._changed:
+            while not condition():
+                if not self._still_wanted():
+                    raise MicroscopeError("stopped")
+                if time.monotonic() > end_s:
+                    raise late
+                self._changed.wait(_POLL_S)

@@ -1,0 +1,309 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A calibration that records itself: goes to each view, takes it, calibrates, and chooses the next ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.core.calibration.acquisition import (
+    AcquisitionGoal,
+    Proposal,
+    ViewRequest,
+    plan_survey,
+    propose_visits,
+)
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
+from semcal_ros.core.wording import counted
+from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
+from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+
+__all__ = ["ACQUISITION", "AcquisitionRun", "Progress", "ViewTaker", "describe_request", "goal_of"]
+
+ACQUISITION = (
+    ParameterDeclaration(
+        "microscope",
+        "",
+        "Node that ~/acquire moves: microscope or virtual_sem. Empty: a person moves it, told by ~/progress, and calls"
+        " ~/add_view.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "lowest_magnification", 0.0, "Where ~/acquire begins; 0: not known.", "", 0.0, 1e8
+    ),
+    ParameterDeclaration(
+        "highest_magnification", 0.0, "Where ~/acquire ends; 0: not known.", "", 0.0, 1e8
+    ),
+    ParameterDeclaration(
+        "target",
+        1e-3,
+        "Relative 1-sigma of nm per pixel that ~/acquire goes on to, repeatability aside.",
+        "",
+        1e-5,
+        0.1,
+    ),
+    ParameterDeclaration("tilts_deg", "0, 20, 40", "Tilts of the views of each visit, degrees."),
+    ParameterDeclaration(
+        "turn_by",
+        "scan_rotation",
+        "What turns the grid in the image between views.",
+        choices=("scan_rotation", "rotation", "nothing"),
+    ),
+    ParameterDeclaration("most_views", 150, "Views that ~/acquire takes at most.", "", 6, 1000),
+    ParameterDeclaration(
+        "record",
+        "",
+        "Recording of all pictures that ~/acquire judges, a new folder; empty: none.",
+        confined=True,
+    ),
+)
+"""Parameters of an acquisition."""
+
+# Pictures of one view before it is left out: noise or a vibration passes, a grid that is not there does not.
+_ATTEMPTS = 3
+# Views left out in a row before somebody must look.
+_MOST_LEFT_OUT = 3
+# The picture that is being scanned on arrival, and the first that is scanned after it.
+_PICTURES = 2
+# Ratio to a magnification that is only set to come back from, as a visit must.
+_AWAY = 1.25
+
+
+def goal_of(
+    parameters: Parameters, squares_m: tuple[float, ...], display_width_m: float
+) -> AcquisitionGoal:
+    """Read the goal from the parameters :data:`ACQUISITION`; raises :class:`InvalidValueError`."""
+    low, high = parameters["lowest_magnification"], parameters["highest_magnification"]
+    if not (low > 0.0 and high > 0.0):
+        raise InvalidValueError(
+            "no range of magnifications",
+            expected="the parameters lowest_magnification and highest_magnification",
+            do="set them",
+        )
+    text = parameters["tilts_deg"]
+    try:
+        tilts = tuple(math.radians(float(part)) for part in text.split(","))
+    except ValueError as error:
+        raise InvalidValueError(
+            f"parameter tilts_deg = {text!r}", expected="degrees with commas, such as 0, 20, 40"
+        ) from error
+    return AcquisitionGoal(
+        (low, high),
+        squares_m,
+        display_width_m,
+        parameters["target"],
+        tilts,
+        parameters["most_views"],
+    )
+
+
+def describe_request(request: ViewRequest, turn_by: str) -> str:
+    """Return what a person has to do for a view."""
+    turn = ""
+    if turn_by != "nothing":
+        what = "the scan" if turn_by == "scan_rotation" else "the specimen"
+        turn = f", turn {what} to {math.degrees(request.turn_rad):.0f} degrees"
+    return (
+        f"set {request.magnification:.0f}x anew, tilt to {math.degrees(request.tilt_rad):.0f} degrees{turn}; "
+        f"the {1e6 * request.square_m:g} um squares fill the image, in focus"
+    )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an acquisition is.
+
+    Attributes
+    ----------
+    state
+        ``running``, ``waiting`` for a person, ``stopped``, ``failed`` or ``done``.
+    text
+        What happens, or is to be done, in words.
+    views, planned
+        Views taken, and all that are planned so far.
+    left_out
+        Views of which no usable picture came.
+    largest
+        Largest relative 1-sigma of nm per pixel after the last calibration; NaN before the first.
+    """
+
+    state: str
+    text: str
+    views: int = 0
+    planned: int = 0
+    left_out: int = 0
+    largest: float = math.nan
+
+
+class ViewTaker(Protocol):
+    """What looks at the pictures and calibrates; all calls may last, and end by ``still_wanted`` of the run."""
+
+    def wait_for_pictures(self, count: int) -> None:
+        """Return after so many more pictures; raises :class:`MicroscopeError` if they stay away."""
+
+    def take(self, request: ViewRequest) -> str:
+        """Make a view of the newest picture, and say which; raises :class:`CalibrationError` with what is wrong."""
+
+    def wait_for_view(self, request: ViewRequest) -> str:
+        """Return what a person has taken for a request."""
+
+    def stage(self) -> StageReading | None:
+        """Return where the stage is now."""
+
+    def calibrate(self) -> Calibration:
+        """Calibrate from all views; raises :class:`CalibrationError`."""
+
+    def show(self, progress: Progress) -> None:
+        """Tell how far the run is."""
+
+
+class AcquisitionRun:
+    """One acquisition, which can be stopped and gone on with.
+
+    Parameters
+    ----------
+    goal
+        What is asked for.
+    taker
+        Looks and calibrates.
+    commands
+        Moves; None where a person does.
+    turn_by
+        Which joint turns the grid in the image.
+    still_wanted
+        If it returns False, the run ends as soon as nothing moves.
+    """
+
+    def __init__(
+        self,
+        goal: AcquisitionGoal,
+        taker: ViewTaker,
+        commands: MicroscopeCommands | None,
+        turn_by: str,
+        still_wanted: Callable[[], bool],
+    ) -> None:
+        self.goal = goal
+        self._taker = taker
+        self._commands = commands
+        self._turn_by = turn_by
+        self._still_wanted = still_wanted
+        self._waiting = list(plan_survey(goal))
+        self._requested: list[ViewRequest] = []
+        self._left_out = 0
+        self._in_a_row = 0
+        self._visit = -1
+        self._magnification = math.nan
+        self.progress = Progress("stopped", "not begun", planned=len(self._waiting))
+
+    def run(self) -> Proposal:
+        """Go on until the target is met or cannot be; return the last proposal, which says why it ended.
+
+        Raises
+        ------
+        SemcalError
+            The microscope refuses or is silent, the grid is lost, a calibration fails, or it is not wanted any more.
+            Another call goes on where this one ended.
+        """
+        # Somebody may have moved it meanwhile.
+        self._visit = -1
+        self._in_a_row = 0
+        while True:
+            while self._waiting:
+                self._take(self._waiting[0])
+                self._requested.append(self._waiting.pop(0))
+            self._show("running", "calibrating")
+            model = self._taker.calibrate()
+            proposal = propose_visits(self.goal, model, self._requested)
+            self.progress = replace(self.progress, largest=proposal.largest)
+            if proposal.reason:
+                return proposal
+            self._waiting.extend(proposal.requests)
+
+    def _show(self, state: str, text: str) -> None:
+        taken = len(self._requested) - self._left_out
+        planned = len(self._requested) + len(self._waiting)
+        self.progress = replace(
+            self.progress,
+            state=state,
+            text=text,
+            views=taken,
+            planned=planned,
+            left_out=self._left_out,
+        )
+        self._taker.show(self.progress)
+
+    def _refuse_unwanted(self) -> None:
+        if not self._still_wanted():
+            raise CalibrationError("stopped", do="call ~/acquire to go on")
+
+    def _take(self, request: ViewRequest) -> None:
+        described = describe_request(request, self._turn_by)
+        if self._commands is None:
+            self._show("waiting", described)
+            self._show("running", self._taker.wait_for_view(request))
+            return
+        fault = ""
+        for attempt in range(_ATTEMPTS):
+            self._refuse_unwanted()
+            again = f" (again: {fault})" if fault else ""
+            self._show("running", f"{described}{again}")
+            self._go(request, self._commands)
+            self._taker.wait_for_pictures(_PICTURES + attempt)
+            try:
+                self._show("running", self._taker.take(request))
+            except CalibrationError as error:
+                fault = str(error)
+            else:
+                self._in_a_row = 0
+                return
+        self._left_out += 1
+        self._in_a_row += 1
+        if self._in_a_row >= _MOST_LEFT_OUT:
+            raise CalibrationError(
+                f"{counted(self._in_a_row, 'view')} in a row without a usable picture, the last: {fault}",
+                do="look at the microscope, then call ~/acquire to go on",
+            )
+        self._show("running", f"left out: {fault}")
+
+    def _go(self, request: ViewRequest, commands: MicroscopeCommands) -> None:
+        g = request.magnification
+        if request.visit != self._visit:
+            if g == self._magnification:
+                up = g * _AWAY
+                inside = up <= self.goal.magnification_range[1]
+                commands.set_magnification(up if inside else g / _AWAY)
+                self._taker.wait_for_pictures(1)
+            commands.set_magnification(g)
+            self._visit, self._magnification = request.visit, g
+        now = self._taker.stage() or StageReading()
+        target = {"tilt": request.tilt_rad}
+        current: dict[str, float | None] = {"tilt": now.tilt_rad}
+        if self._turn_by == "scan_rotation":
+            target["scan_rotation"] = request.turn_rad
+            current["scan_rotation"] = now.scan_rotation_rad
+        elif self._turn_by == "rotation":
+            target["rotation"] = request.turn_rad
+            current["rotation"] = now.rotation_rad
+        try:
+            commands.move(target, current)
+        except MicroscopeError:
+            # Where it stands is not known.
+            self._visit = -1
+            raise

@@ -1,0 +1,190 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A calibration that records itself: unattended by ``semcal acquire``, step by step, and when something goes wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64
+
+from semcal_ros.calibration import Calibration
+from semcal_ros.synthetic import preset
+from semcal_ros.workflows.calibrate import calibrate_recording
+from tests.helpers.project import ROOT
+from tests.helpers.ros_process import LATCHED, RELIABLE, Peer, running
+
+pytestmark = pytest.mark.slow
+
+SERVER = "/sem/calibration_server"
+SIZE = 320
+SEM: dict[str, Any] = {
+    "specimen": "grid",
+    "width": SIZE,
+    "height": SIZE,
+    "magnification": 2000.0,
+    "rate": 10.0,
+}
+GOAL: dict[str, Any] = {
+    "config": "virtual_sem",
+    "lowest_magnification": 1500.0,
+    "highest_magnification": 3000.0,
+    "target": 0.05,
+    "allow_writing": False,
+}
+
+
+class Progress:
+    """What ``~/progress`` says."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.messages = peer.collect(DiagnosticStatus, f"{SERVER}/progress", LATCHED)
+
+    def __getitem__(self, key: str) -> str:
+        values = self.messages[-1].values if self.messages else []
+        return {value.key: value.value for value in values}.get(key, "")
+
+    @property
+    def text(self) -> str:
+        return str(self.messages[-1].message)
+
+
+def test_semcal_acquire_calibrates_the_virtual_microscope(tmp_path: Path) -> None:
+    """From nothing to a calibration that is right within what it states, and a recording of it."""
+    output, views = tmp_path / "cal.yaml", tmp_path / "views"
+    arguments = ["--range", "1500,3000", "--target", "5%", "--microscope", "virtual_sem"]
+    with running("virtual_sem", SEM):
+        done = subprocess.run(
+            [
+                *(sys.executable, "-m", "semcal_ros", "acquire"),
+                *("-o", str(output), "--record", str(views), "--config", "virtual_sem"),
+                *arguments,
+            ],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=150.0,
+            check=False,
+        )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert sum(line.startswith("acquisition begun") for line in lines) == 1
+    assert "the target is met" in lines[-2]
+    assert lines[-1].startswith(f"saved to {output}")
+    calibration = Calibration.load(output)
+    assert calibration.magnification_range == (1500.0, 3000.0)
+    truth = preset("jsm820").with_image_size(SIZE, SIZE)
+    for g in (1500.0, 2200.0, 3000.0):
+        camera = calibration.at(g)
+        error = np.divide(camera.pixel_size_m, truth.camera_at(g).pixel_size_m) - 1.0
+        stated = np.divide(camera.pixel_size_sigma_m, camera.pixel_size_m)
+        assert np.all(np.abs(error) < 3.5 * stated)
+        assert np.all(stated < 0.05)
+    # Four visits with three tilts; the recording has each of them, and gives as many views.
+    assert calibration.provenance is not None and len(calibration.provenance.views) == 12
+    again = calibrate_recording(views, config="virtual_sem")
+    assert len(again.collected.views) >= 12
+    readings = [view.stage for view in again.collected.views]
+    tilts = {round(np.degrees(r.tilt_rad) / 20.0) for r in readings if r is not None and r.tilt_rad}
+    assert tilts == {0, 1, 2}
+
+
+def test_a_person_is_told_what_to_set_and_goes_on_after_a_stop(peer: Peer) -> None:
+    progress = Progress(peer)
+    images = peer.collect(Image, "image_raw")
+    knob = peer.node.create_publisher(Float64, "virtual_sem/set_magnification", RELIABLE)
+    with running("virtual_sem", SEM), running("calibration_server", GOAL):
+        peer.wait_for(lambda: len(images) > 2 and progress.messages, "frames")
+        begun = peer.trigger(f"{SERVER}/acquire")
+        assert begun.success and begun.message.startswith("acquisition begun")
+        peer.wait_for(lambda: progress["acquisition"] == "waiting", "the first request")
+        assert progress["request"].startswith("set 1500x anew, tilt to 0 degrees, turn the scan to")
+        assert "um squares fill the image" in progress["request"]
+        again = peer.trigger(f"{SERVER}/acquire")
+        assert not again.success and "an acquisition is running" in again.message
+        # Nobody has turned the knob.
+        peer.wait_for(
+            lambda: peer.state(SERVER).get("magnification") == "2000", "the magnification"
+        )
+
+        def refused() -> bool:
+            answer = peer.trigger(f"{SERVER}/add_view")
+            assert not answer.success
+            return "a picture at 2000x; expected 1500x" in answer.message
+
+        peer.wait_for(refused, "the refusal of a picture at another magnification")
+        peer.wait_for(lambda: knob.get_subscription_count() == 1, "the knob")
+        knob.publish(Float64(data=1500.0))
+
+        def taken() -> bool:
+            return bool(peer.trigger(f"{SERVER}/add_view").success)
+
+        peer.wait_for(taken, "the first view")
+        peer.wait_for(lambda: progress["taken"] == "1", "the next request")
+        assert "tilt to 20 degrees" in progress["request"]
+        ended = peer.trigger(f"{SERVER}/cancel")
+        assert ended.success and "~/acquire goes on with it" in ended.message
+        peer.wait_for(lambda: progress["acquisition"] == "stopped", "the end")
+        on = peer.trigger(f"{SERVER}/acquire")
+        assert on.success and on.message.startswith("acquisition going on")
+        peer.wait_for(lambda: progress["acquisition"] == "waiting", "the same request")
+        assert progress["taken"] == "1" and "tilt to 20 degrees" in progress["request"]
+
+
+@pytest.mark.parametrize(
+    ("scene", "said"),
+    [
+        ({"allow_motion": False}, "which is not allowed"),
+        ({"max_magnification": 1000.0}, "1000"),
+        (
+            {"specimen": "gold"},
+            "3 views in a row without a usable picture, the last: no grid found",
+        ),
+    ],
+    ids=["not allowed", "limits", "no grid"],
+)
+def test_what_goes_wrong_ends_it_with_the_reason_and_nothing_moves_any_more(
+    peer: Peer, scene: dict[str, Any], said: str
+) -> None:
+    progress = Progress(peer)
+    stage = peer.collect(JointState, "stage", LATCHED)
+    images = peer.collect(Image, "image_raw")
+    goal = {**GOAL, "microscope": "virtual_sem"}
+    with running("virtual_sem", {**SEM, **scene}), running("calibration_server", goal):
+        peer.wait_for(lambda: len(images) > 2 and progress.messages, "frames")
+        peer.wait_for(lambda: peer.trigger(f"{SERVER}/acquire").success, "the begin")
+        peer.wait_for(lambda: progress["acquisition"] == "failed", "the end")
+        assert said in progress["request"]
+        assert said in progress.text
+        moved = len(stage)
+        peer.spin(0.5)
+        assert len(stage) == moved
+        assert "acquisition" not in peer.state(SERVER).get("message", "")
+
+
+def test_a_range_is_needed(peer: Peer) -> None:
+    with running("virtual_sem", SEM), running("calibration_server", {"config": "virtual_sem"}):
+        answer = peer.trigger(f"{SERVER}/acquire")
+        assert not answer.success
+        assert "no range of magnifications" in answer.message
