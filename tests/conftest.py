@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 import atexit
-import fcntl
 import os
 import shutil
 import tempfile
@@ -27,32 +26,13 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.helpers.ros_domain import claim_domain
+
 # Machines that run tests are shared, so a slow example is no failure. An ordinary run tries the same
 # examples every time; `make fuzz` tries others, from the seed that it prints.
 hypothesis.settings.register_profile("semcal", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("explore", deadline=None, print_blob=True, max_examples=500)
 hypothesis.settings.load_profile("explore" if "SEMCAL_FUZZ_CASES" in os.environ else "semcal")
-
-# Ids above 101 would use ports from the range that Linux hands out to other programs.
-_DOMAIN_IDS = range(1, 102)
-
-
-def _claim_domain() -> tuple[int, int]:
-    """A ROS domain id that no other test process on this machine holds, and the open lock file.
-
-    The lock lives as long as the process, however that ends.
-    """
-    start = os.getpid() % len(_DOMAIN_IDS)
-    for domain_id in [*_DOMAIN_IDS[start:], *_DOMAIN_IDS[:start]]:
-        path = Path(tempfile.gettempdir()) / f"semcal-ros-domain-{os.getuid()}-{domain_id}.lock"
-        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(lock)
-            continue
-        return domain_id, lock
-    raise RuntimeError("all ROS domain ids are in use by other test runs; wait for them to end")
 
 
 def _share() -> None:
@@ -65,7 +45,7 @@ def _share() -> None:
 
 def _isolate() -> int:
     _share()
-    domain_id, lock = _claim_domain()
+    domain_id, lock = claim_domain()
     logs = tempfile.mkdtemp(prefix="semcal-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ.update(
