@@ -14,7 +14,7 @@ endif
 SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-fast lint format demo demo-live bench fuzz soak clean
+.PHONY: help setup test test-fast lint format demo demo-live docs bench fuzz soak clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
@@ -59,6 +59,9 @@ demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing wor
 demo-live: setup ## the virtual SEM live in the browser, raw and corrected
 	@$(VENV_PYTHON) -m semcal_ros demo
 
+docs: setup ## the documentation site, into site/
+	@$(VENV_PYTHON) scripts/build_docs.py
+
 # Where what they compare with cannot be installed, the tables say so.
 bench: setup ## the benchmarks, as a table (installs what they compare with into .venv)
 	@$(VENV_PYTHON) -m pip install --quiet --no-input --disable-pip-version-check --no-deps \
@@ -82,7 +85,7 @@ soak: setup ## the suite broken every second (SEMCAL_SOAK_S=600, SEMCAL_SOAK_SEE
 	@$(VENV_PYTHON) -m pytest -q -s -W error tests/soak/soak_nodes.py
 
 clean: ## remove what make and the tools made, .venv too
-	rm -rf .venv .venv-jazzy .venv-kilted .venv.lock build install log demo_output bench_output
+	rm -rf site .venv .venv-docs .venv-jazzy .venv-kilted .venv.lock build install log demo_output bench_output
 	rm -rf cantilever_output nano_ball_output visual_servo_output
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis semcal_ros.egg-info
 	find semcal_ros tests examples benchmarks launch scripts -name __pycache__ -type d \

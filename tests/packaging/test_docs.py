@@ -42,7 +42,7 @@ from tests.helpers.node_scenes import make_calibration
 from tests.helpers.project import NODES, ROOT
 
 DOC = ROOT / "doc"
-PAGES = [ROOT / "README.md", *sorted(DOC.glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted(DOC.rglob("*.md"))]
 ROOTS = (ROOT, ROOT / "semcal_ros")
 FOLDERS = {path.name for root in ROOTS for path in root.iterdir() if path.is_dir()}
 COMMANDS = {

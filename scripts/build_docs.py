@@ -1,0 +1,257 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Builds the documentation site: the pages of doc/ and the reference that is generated from the code.
+
+``make docs`` runs it. The site needs no network, neither to be read nor, once MkDocs is installed, to be built. A
+warning, such as a link or an anchor that leads nowhere, is an error. MkDocs lives in an environment of its own
+(.venv-docs), so that its dependencies are nobody else's.
+
+Exit status: 0; 1 if the build fails; 3 if MkDocs cannot be installed.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import os
+import re
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import click
+
+import semcal_ros
+from semcal_ros.cli.main import _COMMANDS  # no public name lists them with their summaries
+from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
+from semcal_ros.nodes.common.help import EXECUTABLES
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "semcal_ros"
+REQUIREMENTS = ROOT / "requirements" / "docs.txt"
+ENVIRONMENT = ROOT / ".venv-docs"
+PAGES = ROOT / "build" / "docs"
+SITE = ROOT / "site"
+CANNOT_INSTALL = 3
+# Files beside doc/ that its pages link to.
+BESIDE = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
+
+
+def commands_page() -> str:
+    """Every command with its help, as `--help` prints it."""
+    parts = ["# Commands", "", "Generated from the code: what `semcal COMMAND --help` prints.", ""]
+    for name in sorted(_COMMANDS):
+        module = import_module(f"semcal_ros.cli.{name.replace('-', '_')}_command")
+        parts += _help(module.command, f"semcal {name}", 2)
+    return "\n".join(parts)
+
+
+def _help(command: click.Command, name: str, level: int) -> list[str]:
+    context = click.Context(command, info_name=name, max_content_width=100, terminal_width=100)
+    parts = [f"{'#' * level} {name}", "", "```text", command.get_help(context), "```", ""]
+    if isinstance(command, click.Group):
+        for own in command.list_commands(context):
+            found = command.get_command(context, own)
+            assert found is not None
+            parts += _help(found, f"{name} {own}", level + 1)
+    return parts
+
+
+def parameters_page() -> str:
+    """The parameters of every node, as they are declared."""
+    parts = [
+        "# Parameters",
+        "",
+        "Generated from the code. What they mean together: [Nodes](../nodes.md).",
+        "",
+    ]
+    for name in sorted(EXECUTABLES):
+        parts += [f"## {name}", "", EXECUTABLES[name].purpose, ""]
+        parts += ["| parameter | default | accepted | read | |", "|---|---|---|---|---|"]
+        for declared in sorted(_declarations(name), key=lambda d: d.name):
+            default = (
+                str(declared.default).lower()
+                if isinstance(declared.default, bool)
+                else declared.default
+            )
+            read = "at start" if declared.fixed else "any time"
+            shown = f"`{default}`" if default != "" else "empty"
+            parts.append(
+                f"| `{declared.name}` | {shown} | {declared.expected} | {read} | {declared.description} |"
+            )
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _declarations(name: str) -> tuple:  # type: ignore[type-arg]  # of declarations
+    module = import_module(f"semcal_ros.nodes.{name}")
+    (kind,) = (public for public in module.__all__ if public != "main")
+    try:
+        with starting_with(["--help"]):
+            getattr(module, kind)()
+    except HelpWanted as wanted:
+        return tuple(wanted.declarations)
+    raise AssertionError(f"{name} does not ask for help")
+
+
+def api_page() -> str:
+    """The public names of the package with their docstrings."""
+    parts = [
+        "# Python functions",
+        "",
+        "Generated from the docstrings. With examples: [From Python](../python.md).",
+        "",
+    ]
+    for name in sorted(semcal_ros.__all__):
+        value = getattr(semcal_ros, name)
+        if not callable(value):
+            continue
+        parts += [f"## {name}", "", "```text", f"{name}{_signature(value)}", ""]
+        parts += [inspect.getdoc(value) or "", "```", ""]
+        if inspect.isclass(value):
+            for own, member in sorted(vars(value).items()):
+                target = getattr(member, "__func__", member)
+                if own.startswith("_") or not inspect.isfunction(target):
+                    continue
+                parts += [f"### {name}.{own}", "", "```text", f"{own}{_signature(target)}", ""]
+                parts += [inspect.getdoc(target) or "", "```", ""]
+    return "\n".join(parts)
+
+
+def _signature(value: object) -> str:
+    try:
+        return str(inspect.signature(value))  # type: ignore[arg-type]  # of what is callable
+    except (TypeError, ValueError):
+        return "(...)"
+
+
+def messages_page() -> str:
+    """Every message of an error that the source can raise, so that a search finds it."""
+    found: dict[str, tuple[str, str, str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and _name_of(node.func).endswith("Error") and node.args:
+                text = _text_of(node.args[0])
+                if not re.search(r"[a-z]{3}", text):
+                    continue
+                words = {k.arg: _text_of(k.value) for k in node.keywords}
+                place = str(path.relative_to(ROOT))
+                found.setdefault(text, (words.get("expected", ""), words.get("do", ""), place))
+    parts = ["# Messages", ""]
+    parts += [
+        "Generated from the source: what went wrong, what was expected, and what to do. An ellipsis is a value.",
+        "By symptom: [Troubleshooting](../howto/troubleshooting.md).",
+        "",
+        "| message | expected | what to do | raised in |",
+        "|---|---|---|---|",
+    ]
+    for text, (expected, do, place) in sorted(
+        found.items(), key=lambda item: item[0].lstrip("… ").lower()
+    ):
+        cells = (part.replace("|", "\\|").replace("<", "&lt;") for part in (text, expected, do))
+        parts.append(f"| {' | '.join(cells)} | `{place}` |")
+    return "\n".join([*parts, ""])
+
+
+def _name_of(node: ast.expr) -> str:
+    return node.id if isinstance(node, ast.Name) else getattr(node, "attr", "")
+
+
+def _text_of(node: ast.expr) -> str:
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return " ".join(node.value.split())
+    if isinstance(node, ast.JoinedStr):
+        parts = [p.value if isinstance(p, ast.Constant) else "…" for p in node.values]
+        return " ".join("".join(str(part) for part in parts).split())
+    return "…"
+
+
+GENERATED = {
+    "reference/commands.md": commands_page,
+    "reference/parameters.md": parameters_page,
+    "reference/api.md": api_page,
+    "reference/messages.md": messages_page,
+}
+
+
+def collect(target: Path) -> None:
+    """Lay out everything that the site is made of."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(ROOT / "doc", target)
+    for name in BESIDE:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        # Links of the root lead into doc/; what is not on the site is named only.
+        text = re.sub(r"\]\(doc/", "](../", text)
+        text = re.sub(r"!?\[([^\]]*)\]\((?!\.\./|https?:|#)[^)]*\)", r"\1", text)
+        (target / "project").mkdir(exist_ok=True)
+        (target / "project" / name.lower()).write_text(text, encoding="utf-8")
+    for path in target.rglob("*.md"):
+        if path.parent.name == "project":
+            continue
+        text = path.read_text(encoding="utf-8")
+        up = "../" * len(path.relative_to(target).parents[:-1])
+        for name in BESIDE:
+            text = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}project/{name.lower()}", text)
+        path.write_text(text, encoding="utf-8")
+    for name, make in GENERATED.items():
+        (target / name).parent.mkdir(exist_ok=True)
+        (target / name).write_text(make(), encoding="utf-8")
+
+
+def install() -> bool:
+    """Make the environment of MkDocs, unless it is there; return whether it is."""
+    digest = hashlib.sha256(REQUIREMENTS.read_bytes()).hexdigest()
+    mark = ENVIRONMENT / "requirements.sha256"
+    if mark.is_file() and mark.read_text() == digest:
+        return True
+    shutil.rmtree(ENVIRONMENT, ignore_errors=True)
+    commands = (
+        [sys.executable, "-m", "venv", str(ENVIRONMENT)],
+        [
+            *(str(ENVIRONMENT / "bin" / "pip"), "install", "--quiet", "--no-input"),
+            *("--disable-pip-version-check", "-r", str(REQUIREMENTS)),
+        ],
+    )
+    for command in commands:
+        if subprocess.run(command, check=False).returncode:
+            return False
+    mark.write_text(digest)
+    return True
+
+
+def main() -> int:
+    """Build the site into site/."""
+    if not install():
+        print("docs: MkDocs could not be installed", file=sys.stderr)
+        return CANNOT_INSTALL
+    collect(PAGES)
+    done = subprocess.run(
+        [str(ENVIRONMENT / "bin" / "mkdocs"), "build", "--strict", "--quiet", "--clean"],
+        cwd=ROOT,
+        # A notice about the next version of MkDocs is no warning about these pages.
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        check=False,
+    )
+    if done.returncode:
+        return 1
+    print(f"{SITE / 'index.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

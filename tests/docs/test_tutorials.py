@@ -1,0 +1,87 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tutorials: their commands print what they show; their sentences are short; the site builds without a warning."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.listings import differences, listings, run_page
+from tests.helpers.project import ROOT
+
+DOC = ROOT / "doc"
+TUTORIALS = sorted((DOC / "tutorials").glob("*.md"))
+# Another processor rounds differently, and a fit amplifies that; what a reader sees is the same.
+TOLERANCE = 0.05
+
+
+@pytest.mark.slow
+def test_the_first_calibration_prints_what_the_page_shows(tmp_path: Path) -> None:
+    assert run_page(DOC / "tutorials" / "first_calibration.md", tmp_path, TOLERANCE) == 7
+
+
+def test_a_listing_is_read_and_compared_line_by_line(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "Text.\n\n    $ one --a \\\n        --b\n    size 10.0 nm\n    ...\n    end\n    $ two\n\nText.\n"
+    )
+    first, second = listings(page)
+    assert (first.command, first.output) == ("one --a --b", ("size 10.0 nm", "...", "end"))
+    assert (second.command, second.output) == ("two", ())
+    assert differences(first.output, ["size 10.2 nm", "x", "end"], 0.05) == []
+    assert differences(first.output, ["size 11.2 nm", "x", "end"], 0.05) == ["size 10.0 nm"]
+    assert differences(first.output, ["size 10.0 um", "end"], 0.05) == ["size 10.0 nm"]
+    assert differences(first.output, ["size 10.0 nm", "x"], 0.05) == ["end"]
+    # Without an ellipsis nothing may come between.
+    assert differences(("a", "b"), ["a", "x", "b"], 0.05) == ["b"]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *TUTORIALS], ids=lambda path: path.stem)
+def test_no_sentence_is_longer_than_thirty_words(page: Path) -> None:
+    prose = re.sub(
+        r"^(    .*|\|.*|#.*|!\[.*)$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
+    prose = re.sub(r"\]\([^)]*\)", "]", prose)
+    sentences = re.split(r"(?<=[.!?:;])\s+|\n\n|\n- ", prose)
+    assert [s for s in sentences if len(s.split()) > 30] == []
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning() -> None:
+    """Links, anchors and the navigation are checked by MkDocs, the generated pages among them."""
+    script = ROOT / "scripts" / "build_docs.py"
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=170,
+    )
+    if done.returncode == 3:
+        pytest.skip("MkDocs cannot be installed here")
+    assert done.returncode == 0, done.stdout + done.stderr
+    messages = (ROOT / "site" / "reference" / "messages.html").read_text(encoding="utf-8")
+    assert "no range of magnifications" in messages
+    commands = (ROOT / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "semcal acquire" in commands and "--by-hand" in commands
+    # Nothing is fetched from elsewhere when it is read.
+    page = (ROOT / "site" / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r'(?:src|href)="(https?:[^"]+\.(?:js|css|woff2?))"', page) == []
