@@ -24,6 +24,7 @@ Exit status: 0; 1 if the build fails; 3 if MkDocs cannot be installed.
 from __future__ import annotations
 
 import ast
+import fcntl
 import hashlib
 import inspect
 import os
@@ -215,6 +216,13 @@ def collect(target: Path) -> None:
 
 def install() -> bool:
     """Make the environment of MkDocs, unless it is there; return whether it is."""
+    with open(ROOT / ".venv.lock", "w", encoding="ascii") as lock:
+        # Tests in several processes want it at once; it is the lock of make setup.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _install()
+
+
+def _install() -> bool:
     digest = hashlib.sha256(REQUIREMENTS.read_bytes()).hexdigest()
     mark = ENVIRONMENT / "requirements.sha256"
     if mark.is_file() and mark.read_text() == digest:
@@ -234,22 +242,34 @@ def install() -> bool:
     return True
 
 
+def build(configuration: Path) -> bool:
+    """Build the site that a configuration describes; print its warnings, and return whether there were none."""
+    done = subprocess.run(
+        # Not --quiet: MkDocs then drops the warnings before --strict counts them.
+        [str(ENVIRONMENT / "bin" / "mkdocs"), "build", "--strict", "-f", str(configuration)],
+        cwd=configuration.parent,
+        # A notice about the next version of MkDocs is no warning about these pages.
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    for line in done.stderr.splitlines():
+        if line.strip() and not line.startswith("INFO"):
+            print(line, file=sys.stderr)
+    return done.returncode == 0
+
+
 def main() -> int:
     """Build the site into site/."""
     if not install():
         print("docs: MkDocs could not be installed", file=sys.stderr)
         return CANNOT_INSTALL
     collect(PAGES)
-    done = subprocess.run(
-        [str(ENVIRONMENT / "bin" / "mkdocs"), "build", "--strict", "--quiet", "--clean"],
-        cwd=ROOT,
-        # A notice about the next version of MkDocs is no warning about these pages.
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        check=False,
-    )
-    if done.returncode:
+    if not build(ROOT / "mkdocs.yml"):
         return 1
     print(f"{SITE / 'index.html'}")
+    print("The search needs a server: python3 -m http.server -d site")
     return 0
 
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -83,5 +84,36 @@ def test_the_site_builds_without_a_warning() -> None:
     commands = (ROOT / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "semcal acquire" in commands and "--by-hand" in commands
     # Nothing is fetched from elsewhere when it is read.
-    page = (ROOT / "site" / "index.html").read_text(encoding="utf-8")
-    assert re.findall(r'(?:src|href)="(https?:[^"]+\.(?:js|css|woff2?))"', page) == []
+    fetched = re.compile(
+        r"""<(?:script|img|iframe|link rel="(?:stylesheet|preconnect|icon)")[^>]*["']https?://"""
+    )
+    pages = sorted((ROOT / "site").rglob("*.html"))
+    assert len(pages) > 30
+    assert [p.name for p in pages if fetched.search(p.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("link", "good"),
+    [
+        ("index.md#a-heading", True),
+        ("index.md#no-heading", False),
+        ("no_page.md", False),
+        ("/index.md", False),
+    ],
+)
+def test_a_link_that_leads_nowhere_fails_the_build(tmp_path: Path, link: str, good: bool) -> None:
+    """By the settings of mkdocs.yml, on one page."""
+    spec = importlib.util.spec_from_file_location("build_docs", ROOT / "scripts" / "build_docs.py")
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    if not script.install():
+        pytest.skip("MkDocs cannot be installed here")
+    (tmp_path / "pages").mkdir()
+    (tmp_path / "pages" / "index.md").write_text(f"# A page\n\n## A heading\n\n[x]({link})\n")
+    configuration = tmp_path / "mkdocs.yml"
+    configuration.write_text(
+        f"INHERIT: {ROOT / 'mkdocs.yml'}\ndocs_dir: pages\nnav: [index.md]\nplugins: []\n"
+    )
+    assert script.build(configuration) == good
