@@ -53,7 +53,9 @@ class ScaleWarnings:
         if not self.count:
             return ""
         told = "a warning" if self.count == 1 else f"{self.count} warnings, the first"
-        return f"scale of the calibration: {told}: {_cut(self.texts[0], _SHORT)}"
+        # Conditions are told apart by semicolons.
+        first = _cut(self.texts[0], _SHORT).replace(";", ",")
+        return f"scale of the calibration: {told}: {first}"
 
     @property
     def details(self) -> str:

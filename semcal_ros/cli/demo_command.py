@@ -30,7 +30,7 @@ from semcal_ros.core.errors import SemcalError
 __all__ = ["command"]
 
 # Views of the grid for the calibration: some seconds of work, good to a few tenths of a per cent.
-_MAGNIFICATIONS = (1500.0, 2500.0, 4000.0, 6000.0, 9000.0)
+_MAGNIFICATIONS = (1500.0, 2200.0, 3200.0, 4700.0, 6800.0, 9000.0)
 _VIEWS, _VIEW_SIZE = 4, 320
 
 

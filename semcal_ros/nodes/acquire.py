@@ -55,6 +55,8 @@ class _Acquirer(CalibrationServer):
 
     def _end_if_done(self) -> None:
         if self._ended:
+            # Once: what a second thread raised nobody would hear.
+            self._timer.cancel()
             raise ExternalShutdownException
 
     def show(self, progress: Progress) -> None:
