@@ -26,7 +26,6 @@ from __future__ import annotations
 import ast
 import fcntl
 import hashlib
-import inspect
 import os
 import re
 import shutil
@@ -37,10 +36,11 @@ from pathlib import Path
 
 import click
 
-import semcal_ros
+from semcal_ros import _HOMES  # the public names, with the modules that define them
 from semcal_ros.cli.main import _COMMANDS  # no public name lists them with their summaries
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from semcal_ros.nodes.common.help import EXECUTABLES
+from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "semcal_ros"
@@ -49,6 +49,8 @@ ENVIRONMENT = ROOT / ".venv-docs"
 PAGES = ROOT / "build" / "docs"
 SITE = ROOT / "site"
 CANNOT_INSTALL = 3
+_WORD = re.compile(r"[a-z]{3}")
+_TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 # Files beside doc/ that its pages link to.
 BESIDE = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
 
@@ -83,76 +85,82 @@ def parameters_page() -> str:
     ]
     for name in sorted(EXECUTABLES):
         parts += [f"## {name}", "", EXECUTABLES[name].purpose, ""]
-        parts += ["| parameter | default | accepted | read | |", "|---|---|---|---|---|"]
+        parts += ["| parameter | type | default | accepted | read | |", "|---|---|---|---|---|---|"]
         for declared in sorted(_declarations(name), key=lambda d: d.name):
-            default = (
-                str(declared.default).lower()
-                if isinstance(declared.default, bool)
-                else declared.default
+            default = declared.default
+            if isinstance(default, bool):
+                shown = str(default).lower()
+            else:
+                shown = f"{default:g}" if isinstance(default, float) else str(default)
+            cells = (
+                f"`{declared.name}`",
+                _TYPES[type(default)],
+                f"`{shown}`" if shown else "empty",
+                _cell(declared.expected),
+                "at start" if declared.fixed else "any time",
+                _cell(declared.description),
             )
-            read = "at start" if declared.fixed else "any time"
-            shown = f"`{default}`" if default != "" else "empty"
-            parts.append(
-                f"| `{declared.name}` | {shown} | {declared.expected} | {read} | {declared.description} |"
-            )
+            parts.append(f"| {' | '.join(cells)} |")
         parts.append("")
     return "\n".join(parts)
 
 
-def _declarations(name: str) -> tuple:  # type: ignore[type-arg]  # of declarations
+def _declarations(name: str) -> list[ParameterDeclaration]:
+    """As `--help` of the executable shows them: the last declaration of a name counts."""
     module = import_module(f"semcal_ros.nodes.{name}")
     (kind,) = (public for public in module.__all__ if public != "main")
     try:
         with starting_with(["--help"]):
             getattr(module, kind)()
     except HelpWanted as wanted:
-        return tuple(wanted.declarations)
+        found = {declared.name: declared for declared in wanted.declarations}
+        if any(declared.confined for declared in found.values()):
+            found.setdefault(DIRECTORY.name, DIRECTORY)
+        return list(found.values())
     raise AssertionError(f"{name} does not ask for help")
 
 
+def _cell(text: str) -> str:
+    """A text for a cell of a table, where nothing but code is formatted."""
+    parts = re.split(r"(`[^`]*`)", text.replace("|", "\\|"))
+    parts[::2] = [re.sub(r"([*_\[\]<>])", r"\\\1", part) for part in parts[::2]]
+    return " ".join("".join(parts).split())
+
+
 def api_page() -> str:
-    """The public names of the package with their docstrings."""
-    parts = [
-        "# Python functions",
-        "",
-        "Generated from the docstrings. With examples: [From Python](../python.md).",
-        "",
-    ]
-    for name in sorted(semcal_ros.__all__):
-        value = getattr(semcal_ros, name)
-        if not callable(value):
-            continue
-        parts += [f"## {name}", "", "```text", f"{name}{_signature(value)}", ""]
-        parts += [inspect.getdoc(value) or "", "```", ""]
-        if inspect.isclass(value):
-            for own, member in sorted(vars(value).items()):
-                target = getattr(member, "__func__", member)
-                if own.startswith("_") or not inspect.isfunction(target):
-                    continue
-                parts += [f"### {name}.{own}", "", "```text", f"{own}{_signature(target)}", ""]
-                parts += [inspect.getdoc(target) or "", "```", ""]
+    """The public names of the package; mkdocstrings puts their docstrings there."""
+    parts = ["# Python functions", ""]
+    parts += ["Generated from the docstrings. With examples: [From Python](../python.md).", ""]
+    for name, home in _HOMES.items():
+        parts += [f"::: {home}.{name}", ""]
     return "\n".join(parts)
 
 
-def _signature(value: object) -> str:
-    try:
-        return str(inspect.signature(value))  # type: ignore[arg-type]  # of what is callable
-    except (TypeError, ValueError):
-        return "(...)"
+def without_sphinx(html: str) -> str:
+    """Take marks that docstrings have for Sphinx out of a page that is made of them."""
+    html = re.sub(r"<p>::</p>\s*", "", html).replace("::</p>", ":</p>")
+    return re.sub(r":(?:attr|class|data|func|meth|mod):(<code>)~?", r"\1", html)
 
 
 def messages_page() -> str:
     """Every message of an error that the source can raise, so that a search finds it."""
     found: dict[str, tuple[str, str, str]] = {}
+    reasons: set[tuple[str, str]] = set()
     for path in sorted(PACKAGE.rglob("*.py")):
+        place = str(path.relative_to(ROOT))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and _name_of(node.func).endswith("Error") and node.args:
+            if not isinstance(node, ast.Call):
+                continue
+            kind = _name_of(node.func)
+            words = {k.arg: _text_of(k.value) for k in node.keywords}
+            if kind.endswith("Error") and node.args:
                 text = _text_of(node.args[0])
-                if not re.search(r"[a-z]{3}", text):
-                    continue
-                words = {k.arg: _text_of(k.value) for k in node.keywords}
-                place = str(path.relative_to(ROOT))
-                found.setdefault(text, (words.get("expected", ""), words.get("do", ""), place))
+                if _WORD.search(text):
+                    found.setdefault(text, (words.get("expected", ""), words.get("do", ""), place))
+            elif kind == "Rejection" and _WORD.search(
+                reason := words.get("reason") or "".join(map(_text_of, node.args[1:2]))
+            ):
+                reasons.add((reason, place))
     parts = ["# Messages", ""]
     parts += [
         "Generated from the source: what went wrong, what was expected, and what to do. An ellipsis is a value.",
@@ -161,12 +169,18 @@ def messages_page() -> str:
         "| message | expected | what to do | raised in |",
         "|---|---|---|---|",
     ]
-    for text, (expected, do, place) in sorted(
-        found.items(), key=lambda item: item[0].lstrip("… ").lower()
-    ):
-        cells = (part.replace("|", "\\|").replace("<", "&lt;") for part in (text, expected, do))
-        parts.append(f"| {' | '.join(cells)} | `{place}` |")
+    for text in sorted(found, key=_order):
+        *words_of, place = found[text]
+        parts.append(f"| {' | '.join(map(_cell, (text, *words_of)))} | `{place}` |")
+    parts += ["", "## Why a view, a frame or a match was not used", ""]
+    parts += ["| reason | given in |", "|---|---|"]
+    for reason, place in sorted(reasons, key=lambda row: _order(row[0])):
+        parts.append(f"| {_cell(reason)} | `{place}` |")
     return "\n".join([*parts, ""])
+
+
+def _order(text: str) -> str:
+    return text.lstrip("… ").lower()
 
 
 def _name_of(node: ast.expr) -> str:
@@ -179,6 +193,10 @@ def _text_of(node: ast.expr) -> str:
     if isinstance(node, ast.JoinedStr):
         parts = [p.value if isinstance(p, ast.Constant) else "…" for p in node.values]
         return " ".join("".join(str(part) for part in parts).split())
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return f"{_text_of(node.left)}{_text_of(node.right)}"
+    if isinstance(node, ast.IfExp):
+        return f"{_text_of(node.body)} / {_text_of(node.orelse)}"
     return "…"
 
 
@@ -232,7 +250,7 @@ def _install() -> bool:
         [sys.executable, "-m", "venv", str(ENVIRONMENT)],
         [
             *(str(ENVIRONMENT / "bin" / "pip"), "install", "--quiet", "--no-input"),
-            *("--disable-pip-version-check", "-r", str(REQUIREMENTS)),
+            *("--disable-pip-version-check", "--no-deps", "-r", str(REQUIREMENTS)),
         ],
     )
     for command in commands:
@@ -268,6 +286,8 @@ def main() -> int:
     collect(PAGES)
     if not build(ROOT / "mkdocs.yml"):
         return 1
+    api = SITE / "reference" / "api.html"
+    api.write_text(without_sphinx(api.read_text(encoding="utf-8")), encoding="utf-8")
     print(f"{SITE / 'index.html'}")
     print("The search needs a server: python3 -m http.server -d site")
     return 0

@@ -25,7 +25,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.listings import differences, listings, run_page
-from tests.helpers.project import ROOT
+from tests.helpers.project import NODES, ROOT
 
 DOC = ROOT / "doc"
 TUTORIALS = sorted((DOC / "tutorials").glob("*.md"))
@@ -83,6 +83,15 @@ def test_the_site_builds_without_a_warning() -> None:
     assert "no range of magnifications" in messages
     commands = (ROOT / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "semcal acquire" in commands and "--by-hand" in commands
+    assert "Why a view, a frame or a match was not used" in messages
+    parameters = (ROOT / "site" / "reference" / "parameters.html").read_text(encoding="utf-8")
+    for node in NODES:
+        section = parameters.partition(f'id="{node}"')[2].partition("<h2")[0]
+        assert "a number from 0.05 to 60 (s)" in section, f"diagnostics_period of {node}"
+    api = (ROOT / "site" / "reference" / "api.html").read_text(encoding="utf-8")
+    for name in ("Calibration", "ScanCamera", "calibrate", "track_drift"):
+        assert f">{name}</span>" in api
+    assert ":class:" not in api and "<p>::</p>" not in api
     # Nothing is fetched from elsewhere when it is read.
     fetched = re.compile(
         r"""<(?:script|img|iframe|link rel="(?:stylesheet|preconnect|icon)")[^>]*["']https?://"""
