@@ -23,7 +23,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.grid_options import grid_options
+from semcal_ros.cli.grid_options import grid_options, refuse_grid_options
 from semcal_ros.cli.options import PATH, json_option
 from semcal_ros.cli.output import (
     echo_json,
@@ -79,6 +79,7 @@ def command(
       semcal check cal.yaml recordings/gold_steps --specimen
     """
     if specimen:
+        refuse_grid_options("--specimen compares images of any specimen")
         _check_specimen(calibration, recording, config, as_json=as_json)
         return
     with show_progress() as on_progress:

@@ -24,8 +24,9 @@ import click
 from semcal_ros.cli.options import squares_option
 from semcal_ros.core.calibration.untilted import UNTILTED_MODES
 from semcal_ros.core.corners import PATTERNS
+from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["grid_options"]
+__all__ = ["grid_options", "refuse_grid_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -63,3 +64,25 @@ def grid_options(command: Command) -> Command:
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def refuse_grid_options(why: str) -> None:
+    """Refuse the first of these options that the user gave, for work that looks at no grid.
+
+    Parameters
+    ----------
+    why
+        What the work looks at instead, with the option that asked for it.
+
+    Raises
+    ------
+    InvalidValueError
+        If one was given, even with the value of its default.
+    """
+    context = click.get_current_context()
+    for name in ("squares", "pattern", "untilted"):
+        # Its value may be None, or equal to the default, although it was given.
+        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+            raise InvalidValueError(
+                f"--{name}, which is about a grid; {why}", expected="one of the two", do=f"leave out --{name}"
+            )

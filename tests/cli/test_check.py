@@ -67,6 +67,20 @@ def test_bad_input_is_refused_in_one_line(folder: Path, capsys: pytest.CaptureFi
     assert "missing" in line
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    # The last two are the defaults: who gives them means a grid all the same.
+    [("--squares", "10um"), ("--pattern", "dots"), ("--pattern", "auto"), ("--untilted", "auto")],
+)
+def test_a_specimen_has_no_grid_options(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were ignored; now they are refused, before anything is read."""
+    line = refused(capsys, "check", "cal.yaml", "steps", "--specimen", option, value)
+    assert f"{option}, which is about a grid" in line
+    assert f"leave out {option}" in line and "--specimen" in line
+
+
 @pytest.mark.slow
 def test_rejected_views_are_named_with_the_reason(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
