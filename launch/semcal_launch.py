@@ -150,6 +150,18 @@ ARGUMENTS = {
         " separate: drift_compensator, then rectifier, for users who need the images in between as well.",
         choices=["combined", "separate"],
     ),
+    "on_mismatch": Argument(
+        "warn",
+        "While the topic conditions tells of another microscope, voltage, working distance or scan rotation than the"
+        " calibration was made with. warn: the log and the diagnostics say so. refuse: image_rect stays silent, too.",
+        choices=["warn", "refuse"],
+    ),
+    "monitor_period": Argument(
+        "0",
+        "Seconds between two frames in which parameter_server looks for the grid, to say whether the calibration still"
+        " holds. 0: none.",
+        number(0.0, 86400.0),
+    ),
     "calibration_server": Argument(
         "false", "Also start calibration_server, to calibrate live.", boolean
     ),
@@ -191,6 +203,8 @@ ARGUMENTS = {
         boolean,
     ),
 }
+# What is no text.
+TYPES = {"monitor_period": float}
 # Not of a replay, whose recording takes the place of the microscope.
 DRIVER = {
     "source": Argument(
@@ -282,13 +296,14 @@ def make_driver(context):
 
 def make_nodes(context):
     # The stream nodes get the file as well as the topic: their first frame is rectified already.
-    nodes = [suite_node(context, "parameter_server", "config", "calibration")]
+    corrector = ("config", "calibration", "on_mismatch")
+    nodes = [suite_node(context, "parameter_server", "config", "calibration", "monitor_period")]
     if LaunchConfiguration("mode").perform(context) == "combined":
-        nodes.append(suite_node(context, "stream_corrector", "config", "calibration"))
+        nodes.append(suite_node(context, "stream_corrector", *corrector))
     else:
         stabilized = {"input": "stabilized"}
         nodes.append(suite_node(context, "drift_compensator", "config"))
-        nodes.append(suite_node(context, "rectifier", "config", "calibration", fixed=stabilized))
+        nodes.append(suite_node(context, "rectifier", *corrector, fixed=stabilized))
     if LaunchConfiguration("calibration_server").perform(context) == "true":
         folder = {"directory": folder_of_calibrations(context)}
         server = ("calibration_server", "config", "calibration", "output", "directory")
@@ -306,13 +321,15 @@ def folder_of_calibrations(context):
 def suite_node(context, executable, *passed, fixed=None, fallback=None):
     """An executable of the suite, which is started again when it dies."""
     respawn = LaunchConfiguration("respawn").perform(context) == "true"
-    fixed = dict(fixed or {})
+    values = given(context, LIVE, passed)
+    parameters = {name: TYPES.get(name, str)(text) for name, text in values.items()}
+    parameters.update(fixed or {})
     if LaunchConfiguration("use_sim_time").perform(context) == "true":
-        fixed["use_sim_time"] = True
+        parameters["use_sim_time"] = True
     return make_node(
         context,
         executable,
-        {**given(context, LIVE, passed), **fixed},
+        parameters,
         fallback,
         respawn=respawn,
         respawn_delay=RESPAWN_DELAY_S,

@@ -329,6 +329,8 @@ EVERYTHING = {
     "directory": ".",
     "use_sim_time": "true",
     "log_level": "debug",
+    "on_mismatch": "refuse",
+    "monitor_period": "60",
 }
 DRIVER = {"source": "folder", "folder": "."}
 REPLAY_EVERYTHING = {
@@ -408,6 +410,21 @@ def test_arguments_reach_every_node(run: Run) -> None:
             assert node.parameters.get("calibration") == ("2024" if has_calibration else None)
 
 
+@pytest.mark.parametrize(("path", "arguments"), [(SUITE, {}), (REPLAY, BAG)])
+def test_what_guards_a_calibration_reaches_the_nodes_that_do_it(
+    run: Run, path: Path, arguments: dict[str, str]
+) -> None:
+    guards = {"on_mismatch": "refuse", "monitor_period": "60"}
+    for mode, corrector in (("combined", "stream_corrector"), ("separate", "rectifier")):
+        context = run(path, {**arguments, **guards, "mode": mode})
+        assert context.node("parameter_server").parameters == {"monitor_period": 60.0}
+        assert context.node(corrector).parameters["on_mismatch"] == "refuse"
+        # Left at the default, they leave the choice to params_file.
+        context = run(path, {**arguments, "mode": mode})
+        assert context.node("parameter_server").parameters == {}
+        assert "on_mismatch" not in context.node(corrector).parameters
+
+
 def test_a_home_folder_is_found(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     file = tmp_path / "more.yaml"
@@ -426,6 +443,9 @@ WRONG = [
     (SUITE, "config", "jsm"),
     (SUITE, "config", "missing.yaml"),
     (SUITE, "calibration", "missing.yaml"),
+    (SUITE, "monitor_period", "often"),
+    (SUITE, "monitor_period", "-1"),
+    (SUITE, "monitor_period", "nan"),
     (SUITE, "calibration_server", "ja"),
     (SUITE, "output", "missing/live.yaml"),
     (SUITE, "output", "."),
@@ -467,7 +487,7 @@ def test_every_argument_is_checked(run: Run, path: Path) -> None:
     assert free - {name for _, name, _ in WRONG} == ({"topics", "exclude"} & set(arguments))
 
 
-@pytest.mark.parametrize(("name", "value"), [("mode", "both"), ("log_level", "loud")])
+@pytest.mark.parametrize(("name", "value"), [("mode", "both"), ("log_level", "loud"), ("on_mismatch", "stop")])
 def test_a_wrong_choice_is_refused(run: Run, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=name):
         run(SUITE, {name: value})
