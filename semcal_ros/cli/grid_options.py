@@ -84,5 +84,7 @@ def refuse_grid_options(why: str) -> None:
         # Its value may be None, or equal to the default, although it was given.
         if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
             raise InvalidValueError(
-                f"--{name}, which is about a grid; {why}", expected="one of the two", do=f"leave out --{name}"
+                f"--{name}, which is about a grid; {why}",
+                expected="one of the two",
+                do=f"leave out --{name}",
             )

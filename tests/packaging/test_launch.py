@@ -487,7 +487,9 @@ def test_every_argument_is_checked(run: Run, path: Path) -> None:
     assert free - {name for _, name, _ in WRONG} == ({"topics", "exclude"} & set(arguments))
 
 
-@pytest.mark.parametrize(("name", "value"), [("mode", "both"), ("log_level", "loud"), ("on_mismatch", "stop")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("mode", "both"), ("log_level", "loud"), ("on_mismatch", "stop")]
+)
 def test_a_wrong_choice_is_refused(run: Run, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=name):
         run(SUITE, {name: value})
