@@ -110,6 +110,9 @@ def _parse_step(
     help="1-sigma of the height of what is measured later above or below the untilted grid.",
 )
 @click.option("--report", type=PATH, help="Also write an HTML report.")
+@click.option(
+    "--paper", is_flag=True, help="With an appendix in the report that compares with the paper."
+)
 @dask_option
 def command(
     recording: RecordedFiles,
@@ -128,6 +131,7 @@ def command(
     height_sigma: float,
     tau: float | None,
     report: Path | None,
+    paper: bool,
     dask: str | None,
 ) -> None:
     """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files or ordinary images, of the grid.
@@ -163,7 +167,7 @@ def command(
     click.echo(f"calibration: {output}")
     if report is not None:
         with show_progress("writing the report"):
-            _write_report(done, report, f"Calibration from {recording.name}")
+            _write_report(done, report, f"Calibration from {recording.name}", paper)
         click.echo(f"report: {report}")
 
 
@@ -281,7 +285,7 @@ def _format_values(values: Sequence[float]) -> list[str]:
     return [f"{value:.8g}" for value in values]
 
 
-def _write_report(done: RecordingCalibration, path: Path, title: str) -> None:
+def _write_report(done: RecordingCalibration, path: Path, title: str, paper: bool) -> None:
     from semcal_ros.report import write_calibration_report
 
     write_calibration_report(
@@ -290,4 +294,5 @@ def _write_report(done: RecordingCalibration, path: Path, title: str) -> None:
         detections=done.collected.found,
         rejected=done.collected.rejected,
         title=title,
+        paper=paper,
     )

@@ -31,7 +31,7 @@ from semcal_ros.core.errors import Rejection
 SIZE = 256
 DISPLAY_M = 0.12
 HOSTILE = "<script>alert('x')</script>\"><img src=//evil.example/a>"
-VOID = {"meta", "img", "image", "path", "br", "link"}
+VOID = {"meta", "img", "image", "path", "br", "link", "input"}
 
 
 def unused(name: str, magnification: float, reason: str, image: Any = None) -> RejectedView:
@@ -61,7 +61,7 @@ class Page(HTMLParser):
             assert self.open and self.open.pop() == tag, f"</{tag}> does not match"
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.words.append(data)
 
     def named(self, tag: str) -> list[dict[str, str | None]]:

@@ -71,6 +71,7 @@ def _write(result: CalibrationResult, folder: Path) -> None:
             unused("frame 9", 400.0, "blank", np.full((SIZE, SIZE), 90, dtype=np.uint16)),
         ],
         images=[("Setup", np.zeros((40, 60, 3), dtype=np.uint8))],
+        paper=True,
         title=f"Microscope {HOSTILE}",
     )
     assert written == path

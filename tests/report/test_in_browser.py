@@ -26,7 +26,11 @@ import numpy as np
 import pytest
 
 from examples.demo.correction_page import DemoRow, write_correction_report
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.html.page import render
+from semcal_ros.report.html.text import format_length
+from tests.helpers.chromium import chromium
 
 BROWSER = next(
     (
@@ -77,7 +81,11 @@ def long_words_text() -> str:
         "calibration.html.j2",
         {
             "title": long_word,
-            "summary": [("Held-out error", "0.050 px", "RMS; paper: 0.9 to 1.45 px")] * 6,
+            "summary": [("Held-out error", "0.050 px", "RMS of images left out")] * 6,
+            "cameras": [
+                {"title": long_word, "values": [(long_word, long_word)], "K": [[long_word]]}
+            ],
+            "slider": "",
             "verdict": [long_word],
             "warnings": [long_word],
             "paper": [row],
@@ -134,6 +142,29 @@ def test_page_fits_the_window_without_console_errors(
         assert found == loaded == pictures
         assert wide == 0
         assert small == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+def test_the_slider_shows_the_camera_of_its_magnification(
+    page_path: Path, result: CalibrationResult, tmp_path: Path
+) -> None:
+    rows = tabulate_cameras(result.model)
+    with chromium(tmp_path / "profile") as page:
+        page.open(page_path.as_uri())
+        page.wait_for("!document.querySelector('#magnification-slider').hidden")
+        for k in (0, len(rows) // 3, len(rows) - 1):
+            page.evaluate(
+                "(() => { const s = document.querySelector('#magnification-slider');"
+                f" s.value = {k}; s.dispatchEvent(new Event('input')); }})()"
+            )
+            assert page.text("#magnification-shown").startswith(rows[k]["title"])
+            camera = result.model.at(rows[k]["g"])
+            assert page.text("#camera-k-0-0") == f"{camera.K[0, 0]:.6g}"
+            assert page.text("#camera-value-0") == format_length(
+                camera.pixel_size_m[0], camera.pixel_size_sigma_m[0]
+            )
+        assert page.console == []
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")

@@ -82,8 +82,8 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
                 magnification=f"{g:g}×",
                 views=len(own),
                 corners=sum(len(v.image_xy) for v in own),
-                rms=format_px(value),
-                held_out=format_px(result.held_out_rms_px.get(g)),
+                rms=_format_error(value, x, y),
+                held_out=_format_error(result.held_out_rms_px.get(g), x, y),
                 extrapolated=g in model.magnification_range,
                 pixel_x=format_length(x, sigma[0]),
                 pixel_y=format_length(y, sigma[1]),
@@ -94,6 +94,14 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
             )
         )
     return rows
+
+
+def _format_error(px: float | None, *pixel_m: float) -> str:
+    """An error in px and as a length."""
+    text = format_px(px)
+    if px is None or not np.isfinite(px):
+        return text
+    return f"{text}, {format_length(px * float(np.mean(pixel_m)))}"
 
 
 def compute_held_out_px(result: CalibrationResult) -> float | None:

@@ -17,7 +17,10 @@
 from __future__ import annotations
 
 import os
+from base64 import b64encode
 from collections.abc import Sequence
+from hashlib import sha256
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,7 @@ from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
     plot_coverage,
     plot_reached_shares,
@@ -49,7 +53,6 @@ from semcal_ros.report.calibration.field_error_figures import (
 )
 from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
-    PAPER_RMS_PX,
     collect_facts,
     collect_warnings,
     compute_fitted_inner_px,
@@ -88,6 +91,7 @@ def write_calibration_report(
     rejected: Sequence[RejectedView] = (),
     images: Sequence[tuple[str, NDArray[Any]]] = (),
     title: str = "SEM calibration",
+    paper: bool = False,
 ) -> Path:
     """Write one self-contained HTML file about a calibration.
 
@@ -105,6 +109,8 @@ def write_calibration_report(
         More images as (caption, image), shown at the end.
     title
         Heading of the page.
+    paper
+        Whether an appendix compares the errors with those that the paper prints.
 
     Returns
     -------
@@ -123,13 +129,19 @@ def write_calibration_report(
     examples = _choose_example_cameras(model)
     verdict = judge_calibration(model)
     rms, straight = rms_by_magnification(result.fit), compute_rms_without_distortion(result)
+    # A single magnification has no curves.
+    curves = len(rms) > 1
+    script = _slider_script() if curves else ""
     values = {
         "title": remove_control_characters(title),
         "verdict": [text for text in (verdict.describe(), verdict.advise()) if text],
         "summary": _summarise(result, len(rejected)),
         "warnings": collect_warnings(result, rejected),
-        "errors": [plot_rms(result, straight)],
-        "paper": tabulate_beside_paper(result, rms, straight),
+        "cameras": tabulate_cameras(model),
+        "slider": script,
+        "slider_hash": f"sha256-{b64encode(sha256(script.encode()).digest()).decode()}",
+        "errors": [plot_rms(result, straight, paper=paper)] if curves else [],
+        "paper": tabulate_beside_paper(result, rms, straight) if paper else [],
         "predicted": plot_predicted_errors(model),
         "residuals": [
             plot_mean_residuals(result),
@@ -138,8 +150,8 @@ def write_calibration_report(
         ],
         "distortion": [plot_distortion(camera) for camera in examples],
         "residual_field": plot_residual_field(model, examples),
-        "pixel_size": plot_pixel_sizes(model),
-        "parameters": plot_parameters(model),
+        "pixel_size": plot_pixel_sizes(model) if curves else [],
+        "parameters": plot_parameters(model) if curves else [],
         "coverage": [
             plot_coverage(result),
             plot_reached_shares(result),
@@ -167,6 +179,12 @@ def write_calibration_report(
     return write_page(path, render("calibration.html.j2", values))
 
 
+def _slider_script() -> str:
+    """The script of the slider: it has no network, and the page allows no other script."""
+    file = files("semcal_ros.report.html") / "templates" / "magnification_slider.js"
+    return file.read_text(encoding="utf-8")
+
+
 def _choose_evenly(views: list[FoundView], count: int) -> list[FoundView]:
     """Choose at most ``count`` views evenly, including the first and the last."""
     if len(views) <= count:
@@ -188,7 +206,6 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
     held_out = compute_held_out_px(result)
     size = [model.at(g).pixel_size_m[0] for g in (low, high)]
     corners = sum(len(v.image_xy) for v in result.views)
-    paper = f"paper: {PAPER_RMS_PX[0]:g} to {PAPER_RMS_PX[1]:g} px"
     span = f"{low:g}× to {high:g}×" if high > low else f"{low:g}×"
     pixel = (
         f"{format_length(size[0])} to {format_length(size[1])}"
@@ -204,7 +221,7 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
             if held_out is not None
             else "needs 3 magnifications",
         ),
-        ("Error of all views", format_px(result.fit.rms_px()), f"RMS of all corners; {paper}"),
+        ("Error of all views", format_px(result.fit.rms_px()), "RMS of all corners"),
         ("Magnification", span, f"{len(model.magnifications)} calibrated, continuous in between"),
         ("Pixel size", pixel, "along x"),
         ("Views", f"{len(result.views)} used", f"{rejected} rejected"),

@@ -79,7 +79,7 @@ _NO_FOCAL = "It is not shown here: somewhere ρ is not positive, which is no per
 _GROUPS = (
     (
         "Centre of the distortion",
-        "The paper's figure 10.",
+        "Where the scan has no distortion.",
         (
             _Panel("ex", "Distortion centre, column", "px"),
             _Panel("ey", "Distortion centre, row", "px"),
@@ -87,7 +87,7 @@ _GROUPS = (
     ),
     (
         "Strength of the distortion",
-        "The paper's figure 11. At half the image width from the centre, 10⁻³ is a displacement of "
+        "At half the image width from the centre, 10⁻³ is a displacement of "
         "0.05 % of the image width for the radial part.",
         (
             _Panel("xi_r", "Radial distortion", "10⁻³", 1e3),
@@ -96,7 +96,7 @@ _GROUPS = (
     ),
     (
         "Projection",
-        "The paper's figure 12: focal length, aspect ratio and skew. The focal length is the scale "
+        "Focal length, aspect ratio and skew. The focal length is the scale "
         "m over the inverse distance ρ of the scan pivot.",
         (
             _FOCAL,
@@ -106,7 +106,7 @@ _GROUPS = (
     ),
     (
         "Scale, principal point and scan pivot",
-        "Not among the paper's figures: what the focal length consists of, and the principal "
+        "What the focal length consists of, and the principal "
         "point, which is one for all magnifications where a magnification alone cannot show it.",
         (
             _Panel("m", "Scale, deviation from nominal", "%", 100.0, 100.0),

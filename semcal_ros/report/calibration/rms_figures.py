@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures of the errors against the magnification, beside those of the paper."""
+"""Figures of the errors against the magnification."""
 
 from __future__ import annotations
 
@@ -48,8 +48,10 @@ __all__ = ["plot_residual_histogram", "plot_rms"]
 _HISTOGRAM_LIMIT = 5.0
 
 
-def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Picture:
-    """Plot RMS and held-out RMS at each magnification, beside the values of the paper.
+def plot_rms(
+    result: CalibrationResult, straight: Mapping[float, float], *, paper: bool = False
+) -> Picture:
+    """Plot RMS and held-out RMS at each magnification, on request beside the values of the paper.
 
     ``straight`` is the error without correction of the distortion.
     """
@@ -62,7 +64,8 @@ def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Pict
     figure = create_figure(4.6, 3.9)
     axes = figure.add_subplot()
     style_axes(axes, xlabel="magnification", ylabel="RMS error (px)")
-    for value, style in zip(PAPER_RMS_PX, ("--", "-."), strict=True):
+    beside = PAPER_RMS_PX if paper else ()
+    for value, style in zip(beside, ("--", "-."), strict=False):
         axes.axhline(
             value, color=REFERENCE, linestyle=style, linewidth=1.2, label=f"paper: {value:g} px"
         )
@@ -73,15 +76,15 @@ def plot_rms(result: CalibrationResult, straight: Mapping[float, float]) -> Pict
     axes.plot(g, noise, "_", color=ACCENT, markersize=9, markeredgewidth=1.6, label="corner noise")
     _plot_held_out(axes, g, held)
     set_magnification_axis(axes, g[0], g[-1])
-    shown = np.concatenate([values, held, uncorrected, noise, PAPER_RMS_PX])
+    shown = np.concatenate([values, held, uncorrected, noise, beside])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     set_log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
     add_legend(axes, loc="upper center", ncols=2)
     return encode_figure(
         figure,
-        f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px, "
-        f"beside the paper's {PAPER_RMS_PX[0]:g} and {PAPER_RMS_PX[1]:g} px.",
-        "The paper's figure 13. Held out: the images of this magnification, judged by a "
+        f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px"
+        + (f", beside the paper's {beside[0]:g} and {beside[1]:g} px." if beside else "."),
+        "Held out: the images of this magnification, judged by a "
         "calibration from all other magnifications. Hollow: the lowest and highest one, which are "
         "extrapolated in this test. Corner noise: what the uncertainty of the corners alone "
         "explains.",
