@@ -134,7 +134,7 @@ def write_calibration_report(
     script = _slider_script() if curves else ""
     values = {
         "title": remove_control_characters(title),
-        "verdict": [text for text in (verdict.describe(), verdict.advise()) if text],
+        "verdict": [_sentence(text) for text in (verdict.describe(), verdict.advise()) if text],
         "summary": _summarise(result, len(rejected)),
         "warnings": collect_warnings(result, rejected),
         "cameras": tabulate_cameras(model),
@@ -177,6 +177,12 @@ def write_calibration_report(
         "images": extra,
     }
     return write_page(path, render("calibration.html.j2", values))
+
+
+def _sentence(text: str) -> str:
+    """What the terminal says, as a page says it; Nm would be newton metres."""
+    text = text.replace("nm per px is known", "The scale (nm per px) is known", 1)
+    return text[:1].upper() + text[1:].replace("+-", "±") + "."
 
 
 def _slider_script() -> str:
@@ -222,7 +228,13 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
             else "needs 3 magnifications",
         ),
         ("Error of all views", format_px(result.fit.rms_px()), "RMS of all corners"),
-        ("Magnification", span, f"{len(model.magnifications)} calibrated, continuous in between"),
+        (
+            "Magnification",
+            span,
+            f"{len(model.magnifications)} calibrated, continuous in between"
+            if high > low
+            else "the only one calibrated",
+        ),
         ("Pixel size", pixel, "along x"),
         ("Views", f"{len(result.views)} used", f"{rejected} rejected"),
         ("Corners", f"{corners}", f"{corners / len(result.views):.0f} per view"),

@@ -65,7 +65,7 @@ _ACROSS = 17
 
 
 def plot_predicted_errors(model: CalibrationModel) -> list[Picture]:
-    """Plot a map over distance and magnification, maps over the field, and curves.
+    """Plot a map over distance and magnification, maps over the field, and curves; of one magnification only its field.
 
     The list is empty for a calibration without uncertainty.
     """
@@ -77,8 +77,10 @@ def plot_predicted_errors(model: CalibrationModel) -> list[Picture]:
     worst = (
         cameras[int(np.nanargmax(np.nanmax(shape, axis=1)))] if _has_finite(shape) else cameras[0]
     )
-    pictures = [_plot_fields(model, worst), _plot_curves(model, cameras, lattice, shape)]
-    return [_plot_map(model), *pictures] if len(cameras) > 1 else pictures
+    fields = _plot_fields(model, worst)
+    if len(cameras) == 1:
+        return [fields]
+    return [_plot_map(model), fields, _plot_curves(model, cameras, lattice, shape)]
 
 
 def _has_finite(values: Array) -> bool:

@@ -212,7 +212,7 @@ def test_single_magnification_without_the_optional_parts(
     assert "What to watch" in parsed.text
     assert "Fewer than 3 views at magnification 800." in parsed.text
     # One distortion picture instead of three, two predictions, no curves, none of a rejected view or the caller.
-    assert len(parsed.named("img")) == 10
+    assert len(parsed.named("img")) == 9
     assert not {"pixel-size", "parameters", "paper"} & {s["id"] for s in parsed.named("section")}
     assert parsed.named("script") == [] and parsed.named("input") == []
     assert "The camera at 800×" in parsed.text
