@@ -28,9 +28,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
-from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
@@ -40,8 +41,20 @@ __all__ = ["Disparity", "TiltGeometry", "find_tilt_geometry", "match_densely"]
 _RATIO = 0.8
 # Three times the 0.7 px that a SIFT feature of a coarser octave is uncertain by.
 _TOLERANCE_PX = 2.0
+# A match is compared with so many around it: enough for a median that one wrong match among them does not move.
+_NEIGHBOURS = 8
+# Robust sigmas by which it may be shifted against them: relief is steeper in places than its spread tells.
+_NEIGHBOUR_SIGMAS = 6.0
 # Fewer verified matches leave the axis to a handful of places of the specimen.
 _LEAST_INLIERS = 20
+# Share of the picture that the other must show. With less, the axis comes from a strip along one edge: at a tenth it was
+# seen to be off by three of its sigmas, at a quarter not.
+_LEAST_OVERLAP = 0.2
+# Matches from which an overlap is computed: an affine map needs three.
+_OVERLAP_MATCHES = 5
+# RMS parallax over the width of the picture, beyond which matches are taken for wrong ones: relief of a tenth of the
+# field at 30 degrees makes a twentieth.
+_LARGEST_PARALLAX = 0.05
 # A pair of pictures of which less agrees is not described by one parallel projection.
 _LEAST_INLIER_SHARE = 0.25
 # The parallax must exceed the noise of the matches by this factor, or the axis is a fit of noise.
@@ -121,19 +134,25 @@ def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: floa
     Raises
     ------
     StructureError
-        If too few matches agree, or they show no parallax.
+        If too few matches agree, they show no parallax, or the pictures have too little in common.
     """
     one, two = _match_features(first, second)
+    if _OVERLAP_MATCHES <= len(one) < _LEAST_INLIERS:
+        _check_overlap(one, two, first, second)
     if len(one) < _LEAST_INLIERS:
         raise _refuse_matches(f"only {counted(len(one), 'match', 'matches')}")
     centre, second_centre = _centre_of(first), _centre_of(second)
     found = fit_epipolar(one - centre, two - second_centre, _TOLERANCE_PX, trials=2000)
-    count = int(np.count_nonzero(found.inliers))
+    kept = found.inliers.copy()
+    kept[kept] = _agree_with_neighbours(one[kept], two[kept])
+    if np.count_nonzero(kept) >= _LEAST_INLIER_SHARE * len(one):
+        _check_overlap(one[kept], two[kept], first, second)
+    count = int(np.count_nonzero(kept))
     if count < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * len(one)):
         raise _refuse_matches(
             f"only {count} of {counted(len(one), 'match', 'matches')} agree with a tilt"
         )
-    one, two, matches = one[found.inliers], two[found.inliers], len(one)
+    one, two, matches = one[kept], two[kept], len(one)
     joint = np.hstack([two - second_centre, one - centre])
     values, vectors = np.linalg.eigh(np.cov(joint.T) * (count - 1))
     # Of one picture twice, rounding makes them zero or less.
@@ -266,6 +285,45 @@ def _match_features(first: AnyImage, second: AnyImage) -> tuple[Array, Array]:
     pairs = np.array([[*points[m.queryIdx].pt, *others[m.trainIdx].pt] for m in good])
     pairs = np.unique(pairs.reshape(-1, 4), axis=0)
     return pairs[:, :2], pairs[:, 2:]
+
+
+def _agree_with_neighbours(first: Array, second: Array) -> Mask:
+    """Which matches are shifted as those around them in the first picture.
+
+    A wrong match that happens to lie on its epipolar line passes every test of the epipolar geometry. One of them,
+    shifted by a hundred px where relief shifts by one, outweighs a thousand right ones in the direction of the axis.
+    """
+    if len(first) <= _NEIGHBOURS:
+        return np.ones(len(first), dtype=np.bool_)
+    shifts = second - first
+    around = cKDTree(first).query(first, _NEIGHBOURS + 1)[1][:, 1:]
+    apart = shifts - np.median(shifts[around], axis=1)
+    spread = max(mad_sigma(apart[:, 0]), mad_sigma(apart[:, 1]))
+    limit = max(_TOLERANCE_PX, _NEIGHBOUR_SIGMAS * spread)
+    return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) < limit)
+
+
+def _check_overlap(first: Array, second: Array, image: AnyImage, other: AnyImage) -> None:
+    """Refuse pictures of which the matches, if an affine map describes them, have too little in common."""
+    design = np.column_stack([first, np.ones(len(first))])
+    matrix, _, rank, _ = np.linalg.lstsq(design, second, rcond=None)
+    residual = second - design @ matrix
+    extent = np.array(image.shape[1::-1], dtype=np.float64)
+    # Wrong matches, or too few places for an affine map, tell no overlap.
+    if rank < 3 or np.max(np.std(residual, axis=0) / extent) > _LARGEST_PARALLAX:
+        return
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    seen = np.column_stack([unit * extent, np.ones(4)]) @ matrix
+    frame = unit * np.array(other.shape[1::-1], dtype=np.float64)
+    area = cv2.intersectConvexConvex(seen.astype(np.float32), frame.astype(np.float32))[0]
+    share = float(area) / abs(float(np.linalg.det(matrix[:2]))) / float(np.prod(extent))
+    if share < _LEAST_OVERLAP:
+        x, y = seen.mean(axis=0) - frame.mean(axis=0)
+        raise StructureError(
+            f"the pictures share {share:.0%} of their field: the second is shifted by {x:+.0f}, {y:+.0f} px",
+            expected=f"at least {_LEAST_OVERLAP:.0%} in common",
+            do="bring the same place back to the middle after tilting, or record at a lower magnification",
+        )
 
 
 def _describe_normal(normal: Array, near_axis_rad: float) -> Array:
