@@ -24,7 +24,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import PATH
 from semcal_ros.cli.output import echo_notes
-from semcal_ros.workflows.export_camera import EXPORT_FORMATS, export_calibration
+from semcal_ros.workflows.export_camera import EXPORT_FORMATS, LOSSY_PX, export_calibration
 
 __all__ = ["command"]
 
@@ -54,8 +54,21 @@ _TOLD_PX = 0.1
     is_flag=True,
     help="The camera of rectified images, which every format holds exactly.",
 )
+@click.option(
+    "--lossy",
+    type=click.FloatRange(min=0.0),
+    default=LOSSY_PX,
+    show_default=True,
+    metavar="PX",
+    help="Refuse a format that is further from the calibration than this somewhere in the image.",
+)
 def command(
-    calibration: Path, kind: str, output: Path, magnification: tuple[float, ...], rectified: bool
+    calibration: Path,
+    kind: str,
+    output: Path,
+    magnification: tuple[float, ...],
+    rectified: bool,
+    lossy: float,
 ) -> None:
     """CALIBRATION as a file of another program: OpenCV, ROS, mrcal, COLMAP, Fiji, or a table.
 
@@ -66,7 +79,7 @@ def command(
     """
     model = Calibration.load(calibration)
     done = export_calibration(
-        model, kind, output, magnifications=magnification, rectified=rectified
+        model, kind, output, magnifications=magnification, rectified=rectified, lossy_px=lossy
     )
     for path in done.paths:
         click.echo(f"{kind}: {path}")

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import ast
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -79,6 +80,33 @@ def test_the_stated_difference_of_raw_images_is_the_true_one(calibration, tmp_pa
     # Without any distortion the same points are further off.
     ideal = camera.project_ideal(points_of(camera))
     assert done.worst_px < 0.5 * worst(ideal, camera)
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix"), [("opencv", ".yaml"), ("ros", ".yaml"), ("colmap", ".txt")]
+)
+def test_what_a_format_cannot_hold_is_refused(calibration, tmp_path, kind, suffix):
+    path = tmp_path / f"camera{suffix}"
+    with pytest.raises(
+        InvalidValueError, match=rf"{kind} .* at 2500x to 0\.2\d px.*0\.1 px"
+    ) as refused:
+        export_calibration(calibration, kind, path, magnifications=[G], lossy_px=0.1)
+    assert not path.exists()
+    # The bound that it proposes is one that it accepts.
+    proposed = float(str(refused.value).split("--lossy ")[1].rstrip(")"))
+    done = export_calibration(calibration, kind, path, magnifications=[G], lossy_px=proposed)
+    assert 0.9 * proposed < done.worst_px <= proposed
+    export_calibration(calibration, kind, path, magnifications=[G], lossy_px=1e-5, rectified=True)
+
+
+def test_by_default_a_loss_of_more_than_a_pixel_or_so_is_refused(calibration, tmp_path):
+    # A skew that no pinhole has.
+    skew = replace(calibration.functions["skew"], coefficients=np.array([0.2]))
+    bent = {**calibration.functions, "skew": skew}
+    odd = Calibration.from_model(replace(calibration, functions=bent))
+    assert fit_pinhole(odd.at(G)).worst_px > 1.5
+    with pytest.raises(InvalidValueError, match="--lossy"):
+        export_calibration(odd, "opencv", tmp_path / "camera.yaml", magnifications=[G])
 
 
 def test_a_radial_distortion_about_the_principal_point_is_held(tmp_path):

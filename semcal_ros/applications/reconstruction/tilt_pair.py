@@ -47,8 +47,8 @@ _NEIGHBOURS = 8
 _NEIGHBOUR_SIGMAS = 6.0
 # Fewer verified matches leave the axis to a handful of places of the specimen.
 _LEAST_INLIERS = 20
-# Share of the picture that the other must show. With less, the axis comes from a strip along one edge: at a tenth it was
-# seen to be off by three of its sigmas, at a quarter not.
+# Share of the picture that the other must show. With less, the axis comes from a strip along one edge: at a tenth it
+# was seen to be off by three of its sigmas, at a quarter not.
 _LEAST_OVERLAP = 0.2
 # Matches from which an overlap is computed: an affine map needs three.
 _OVERLAP_MATCHES = 5

@@ -181,7 +181,7 @@ def test_tilts_that_say_nothing_are_refused(
 
 @pytest.mark.slow
 def test_the_axis_is_within_its_uncertainty() -> None:
-    """30 pairs of five specimens, each with other noise. One false match on its epipolar line made 6 of it."""
+    """30 pairs of five specimens, each with other noise. In such a set, one false match on its line made the RMS 6."""
     scores = []
     for specimen in range(5):
         surface = _Specimen(specimen)
