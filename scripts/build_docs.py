@@ -144,10 +144,9 @@ def without_sphinx(html: str) -> str:
 
 def messages_page() -> str:
     """Every message of an error that the source can raise, so that a search finds it."""
-    found: dict[str, tuple[str, str, str]] = {}
-    reasons: set[tuple[str, str]] = set()
+    found: dict[str, tuple[str, str]] = {}
+    reasons: set[str] = set()
     for path in sorted(PACKAGE.rglob("*.py")):
-        place = str(path.relative_to(ROOT))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call):
                 continue
@@ -156,26 +155,24 @@ def messages_page() -> str:
             if kind.endswith("Error") and node.args:
                 text = _text_of(node.args[0])
                 if _WORD.search(text):
-                    found.setdefault(text, (words.get("expected", ""), words.get("do", ""), place))
+                    found.setdefault(text, (words.get("expected", ""), words.get("do", "")))
             elif kind == "Rejection" and _WORD.search(
                 reason := words.get("reason") or "".join(map(_text_of, node.args[1:2]))
             ):
-                reasons.add((reason, place))
+                reasons.add(reason)
     parts = ["# Messages", ""]
     parts += [
         "Generated from the source: what went wrong, what was expected, and what to do. An ellipsis is a value.",
         "By symptom: [Troubleshooting](../howto/troubleshooting.md).",
         "",
-        "| message | expected | what to do | raised in |",
-        "|---|---|---|---|",
+        "| message | expected | what to do |",
+        "|---|---|---|",
     ]
     for text in sorted(found, key=_order):
-        *words_of, place = found[text]
-        parts.append(f"| {' | '.join(map(_cell, (text, *words_of)))} | `{place}` |")
+        parts.append(f"| {' | '.join(map(_cell, (text, *found[text])))} |")
     parts += ["", "## Why a view, a frame or a match was not used", ""]
-    parts += ["| reason | given in |", "|---|---|"]
-    for reason, place in sorted(reasons, key=lambda row: _order(row[0])):
-        parts.append(f"| {_cell(reason)} | `{place}` |")
+    parts += ["| reason |", "|---|"]
+    parts += [f"| {_cell(reason)} |" for reason in sorted(reasons, key=_order)]
     return "\n".join([*parts, ""])
 
 

@@ -36,6 +36,8 @@ TOLERANCE = 0.05
 @pytest.mark.slow
 def test_the_first_calibration_prints_what_the_page_shows(tmp_path: Path) -> None:
     assert run_page(DOC / "tutorials" / "first_calibration.md", tmp_path, TOLERANCE) == 7
+    # Goes on in the same folder.
+    assert run_page(DOC / "howto" / "views.md", tmp_path, TOLERANCE) == 7
 
 
 def test_a_listing_is_read_and_compared_line_by_line(tmp_path: Path) -> None:
