@@ -16,47 +16,20 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
 import os
 import re
 import signal
 import socket
-import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-from tornado.websocket import websocket_connect
 
+from tests.helpers.live_page import corrected_view
 from tests.helpers.project import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.flaky(reruns=1)]
-
-PICTURE_S = 60.0
-
-
-async def _calibrated_picture(address: str) -> dict[str, Any]:
-    """What the page is told of the first corrected picture with a calibrated scale."""
-    page = await websocket_connect(f"{address.replace('http', 'ws', 1)}live")
-    try:
-        while True:
-            told = await page.read_message()
-            assert told is not None
-            if isinstance(told, str):
-                continue
-            (length,) = struct.unpack_from("<I", told)
-            header: dict[str, Any] = json.loads(told[4 : 4 + length])
-            for picture in header["pictures"]:
-                scale = picture["scale"]
-                if picture["name"] == "corrected" and scale and "±" in scale["bar_label"]:
-                    return header
-    finally:
-        page.close()
-        while await page.read_message() is not None:
-            pass
 
 
 def _nodes() -> set[str]:
@@ -91,8 +64,7 @@ def test_one_command_shows_the_corrected_stream_and_ends_with_ctrl_c() -> None:
             assert line
             found = re.search(r"open (http://\S+/)", line)
         try:
-            header = asyncio.run(asyncio.wait_for(_calibrated_picture(found[1]), PICTURE_S))
-            assert {picture["name"] for picture in header["pictures"]} == {"raw", "corrected"}
+            corrected_view(found[1])
             assert len(_nodes() - before) == 2
         finally:
             demo.send_signal(signal.SIGINT)

@@ -30,6 +30,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 
 from semcal_ros.bridge.conditions import read_conditions
+from tests.helpers.live_page import corrected_view, viewing
 from tests.helpers.node_scenes import stamp_of
 from tests.helpers.ros_process import LATCHED, Peer, running
 
@@ -145,6 +146,26 @@ def test_live_frames_and_what_the_microscope_says(peer: Peer, configuration: Pat
         assert len(heard.images) == count
         assert peer.trigger(f"{NODE}/start").success
         heard.wait_frames()
+
+
+def test_a_corrected_frame_on_the_page(
+    peer: Peer, configuration: Path, calibration_file: Path
+) -> None:
+    given = {"config": "virtual_sem", "calibration": calibration_file}
+    with (
+        running("stream_corrector", given),
+        viewing("--config", "virtual_sem") as address,
+        running("parameter_server", given),
+        demo(peer, configuration),
+    ):
+        view = corrected_view(address)
+    pictures = {picture["name"]: picture for picture in view["pictures"]}
+    # The whole field as the microscope scans it, though the calibration is of square images.
+    assert pictures["corrected"]["size"] == [1536, 1024]
+    # The nominal scale of 150 um, which this calibration changes by a per cent or two.
+    scale = pictures["corrected"]["scale"]
+    assert scale["calibrated"]
+    assert scale["nm_per_px"] == pytest.approx(150e3 / 1536, rel=0.05)
 
 
 def test_moves_within_limits(peer: Peer, configuration: Path) -> None:

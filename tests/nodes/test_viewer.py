@@ -20,15 +20,14 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from sensor_msgs.msg import Image
 
 from tests.helpers.chromium import BROWSER, Page, chromium
+from tests.helpers.live_page import viewing
 from tests.helpers.node_scenes import write_recording
 from tests.helpers.project import ROOT
 from tests.helpers.ros_process import Peer, running
@@ -47,34 +46,6 @@ SEM = {
     "width": SIZE,
     "height": SIZE,
 }
-START_S = 60.0
-
-
-@contextmanager
-def viewing(*arguments: str) -> Iterator[str]:
-    """``semcal view`` as a user starts it; the address that it prints."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        [sys.executable, "-m", "semcal_ros", "view", "--port", "0", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        env=environment,
-    ) as process:
-        try:
-            assert process.stdout is not None
-            said = ""
-            deadline = time.monotonic() + START_S
-            while not (found := re.search(r"open (http://\S+?)(;|\s|$)", said)):
-                line = process.stdout.readline()
-                assert line and time.monotonic() < deadline, said
-                said += line
-            yield found[1]
-        finally:
-            process.terminate()
-            process.wait(30)
-        assert process.returncode == 0
 
 
 @pytest.fixture
@@ -207,7 +178,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
             capture_output=True,
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
-            timeout=START_S,
+            timeout=60,
             check=False,
         )
     assert done.returncode == 2
