@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+import webbrowser
 from pathlib import Path
 
 import click
@@ -50,7 +51,8 @@ _VIEWS, _VIEW_SIZE = 4, 320
     help="Width and height of the images, px.",
 )
 @click.option("--duration", type=DURATION, help="End by itself after this time, such as 60s.")
-def command(port: int, size: int, duration: float | None) -> None:
+@click.option("--browser", is_flag=True, help="Also open the page in the browser of this computer.")
+def command(port: int, size: int, duration: float | None, browser: bool) -> None:
     """Show a virtual microscope in the browser, raw and corrected: no instrument, no files.
 
     It calibrates the virtual microscope from simulated pictures of the grid, starts virtual_sem, parameter_server and
@@ -84,5 +86,11 @@ def command(port: int, size: int, duration: float | None) -> None:
             )
             done = calibrate_recording(bag, config="virtual_sem", on_progress=on_progress)
         done.calibration.save(file)
-        status = run_demo(file, port=port, size=size, duration_s=duration or 0.0, say=click.echo)
+
+        def say(address: str, about: str) -> None:
+            click.echo(f"open {address} ({about})")
+            if browser:
+                webbrowser.open(address)
+
+        status = run_demo(file, port=port, size=size, duration_s=duration or 0.0, say=say)
     sys.exit(status)

@@ -87,7 +87,7 @@ def _start(nodes: ExitStack, name: str, **parameters: object) -> None:
 
 
 def run_demo(
-    calibration: Path, *, port: int, size: int, duration_s: float, say: Callable[[str], None]
+    calibration: Path, *, port: int, size: int, duration_s: float, say: Callable[[str, str], None]
 ) -> int:
     """Run the nodes and the page until Ctrl-C.
 
@@ -102,7 +102,7 @@ def run_demo(
     duration_s
         End by itself after so long; 0: never.
     say
-        Called with where the page is, once the nodes have been started.
+        Called with the address of the page and how to join, once the nodes have been started.
 
     Returns
     -------
@@ -123,6 +123,6 @@ def run_demo(
             _start(nodes, "parameter_server", **given)
             _start(nodes, "stream_corrector", **given)
             _start(nodes, "virtual_sem", **scene, width=size, height=size)
-            say(f"open {address} (ROS_DOMAIN_ID={domain}, topics in {_NAMESPACE}; Ctrl-C ends it)")
+            say(address, f"ROS_DOMAIN_ID={domain}, topics in {_NAMESPACE}; Ctrl-C ends it")
 
         return run_node(lambda: _DemoViewer(begin, duration_s), arguments)
