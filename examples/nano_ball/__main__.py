@@ -133,7 +133,8 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
             tracker.add(frame.image, camera, (frame.stamp_ns - SIMULATED_START_NS) * 1e-9)
     keyframes = tracker.finish()
     chosen = [keyframes[int(k)] for k in np.linspace(0, len(keyframes) - 1, 3)]
-    figure = create_figure(9.6, 2.6)
+    figure = create_figure(9.6, 2.8)
+    figure.set_layout_engine("constrained", h_pad=0.1)
     for column, keyframe in enumerate(chosen):
         axes = figure.add_subplot(1, 3, column + 1)
         axes.imshow(keyframe.image, cmap="gray", vmin=0, vmax=200)
@@ -142,6 +143,9 @@ def picture_of_tracks(bag: Path, config: Path, model: Calibration, frames: int) 
         axes.set(xlim=(left, left + 420.0), ylim=(319.5, -0.5), xticks=[], yticks=[])
         title = f"frame {keyframe.index}, {keyframe.camera.magnification:g}x"
         axes.set_title(title, fontsize=9, color=INK)
+        bar_px = 500e-9 / keyframe.camera.pixel_size_m[0]
+        axes.plot((left + 20.0, left + 20.0 + bar_px), (300.0, 300.0), color="white", linewidth=2.0)
+        axes.text(left + 20.0, 290.0, "500 nm", color="white", fontsize=8)
     return encode_png(figure, 100.0)
 
 
@@ -160,14 +164,15 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
     shape: Any = trimesh.load(mesh, process=False)
     vertices = np.asarray(shape.vertices)
     error = distances_nm(vertices, true_nm)
-    figure = create_figure(8.0, 3.0)
+    figure = create_figure(9.0, 3.0)
+    figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.08, wspace=0.08)
     axes = figure.add_subplot(1, 2, 1)
     reach = max(3.0, float(np.percentile(np.abs(error), 98)))
     shown = axes.scatter(*vertices[:, :2].T, c=error, s=9, cmap="RdBu_r", vmin=-reach, vmax=reach)
     style_axes(axes, xlabel="X (nm)", ylabel="Y (nm)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
-    figure.colorbar(shown, ax=axes, label="distance from the true sphere (nm)")
+    figure.colorbar(shown, ax=axes, label="from the true sphere (nm)")
     axes = figure.add_subplot(1, 2, 2)
     axes.hist(error, bins=31, color=OURS)
     axes.axvline(0.0, color=SECOND, linewidth=1.0)

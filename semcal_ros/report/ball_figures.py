@@ -17,11 +17,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from semcal_ros.applications.reconstruction import Ball, Structure
@@ -61,18 +63,20 @@ def write_ball_figure(structure: Structure, ball: Ball, file: Path) -> None:
 def plot_ball(structure: Structure, ball: Ball) -> Figure:
     """Plot cloud and mesh, seen obliquely from the gun, and distances from the sphere."""
     figure = create_figure(9.6, 3.4)
+    # No layout engine knows how much room the labels of a 3D box take.
+    figure.set_layout_engine("none")
     on_ball = ball.sphere.inliers
     centre = ball.sphere.centre_m
     points = _turn_upright(structure.points_m - centre)
     near = np.linalg.norm(points, axis=1) < 2.0 * _NM * ball.sphere.radius_m
-    cloud = figure.add_subplot(1, 3, 1, projection="3d")
+    cloud: Any = figure.add_axes((0.01, 0.06, 0.32, 0.84), projection="3d")
     cloud.scatter(*points[on_ball].T, s=3, c=OURS, label="on the ball")
     other = near & ~on_ball
     if other.any():
         cloud.scatter(*points[other].T, s=3, c=SECOND, label="not on it")
     cloud.set_title(counted(np.count_nonzero(on_ball), "point"), fontsize=9, color=INK)
-    add_legend(cloud, loc="lower left")
-    surface = figure.add_subplot(1, 3, 2, projection="3d")
+    add_legend(cloud, loc="upper left", bbox_to_anchor=(-0.02, 1.04))
+    surface: Any = figure.add_axes((0.35, 0.06, 0.32, 0.84), projection="3d")
     vertices = _turn_upright(ball.mesh.vertices_m - centre)
     triangles = Poly3DCollection(
         vertices[ball.mesh.faces],
@@ -91,11 +95,14 @@ def plot_ball(structure: Structure, ball: Ball) -> Figure:
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
         axes.set_box_aspect((1, 1, 1))
         axes.view_init(elev=48, azim=-70)
-        axes.tick_params(labelsize=6, colors=MUTED)
+        axes.tick_params(labelsize=6, colors=MUTED, pad=-1)
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_major_locator(MaxNLocator(3))
+            axis.labelpad = -2
         axes.set_xlabel("X (nm)", fontsize=7)
         axes.set_ylabel("-Y (nm)", fontsize=7)
         axes.set_zlabel("-Z, to the gun (nm)", fontsize=7)
-    _plot_distances(figure.add_subplot(1, 3, 3), ball)
+    _plot_distances(figure.add_axes((0.77, 0.16, 0.21, 0.68)), ball)
     return figure
 
 
@@ -110,7 +117,7 @@ def _plot_distances(axes: Axes, ball: Ball) -> None:
     style_axes(axes, xlabel="distance from the sphere (nm)", ylabel="points")
     low, high = (_NM * value for value in ball.interval_m)
     axes.set_title(
-        f"diameter {_NM * ball.diameter_m:.1f} nm (95 %: {low:.1f} to {high:.1f})",
+        f"{_NM * ball.diameter_m:.1f} nm across\n95 %: {low:.1f} to {high:.1f} nm",
         fontsize=9,
         color=INK,
     )
