@@ -113,7 +113,7 @@ def command(
         from semcal_ros.report.drift_figures import write_drift_figure
 
         with show_progress("drawing"):
-            write_drift_figure(track.path, plot)
+            write_drift_figure(track.path, plot, recording.name)
     echo_notes(track.notes)
     if calibration is None:
         echo_nominal_unit(

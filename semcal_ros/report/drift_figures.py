@@ -79,7 +79,7 @@ class _Kind:
     mark: str
 
 
-def write_drift_figure(path: DriftPath, file: Path) -> None:
+def write_drift_figure(path: DriftPath, file: Path, recording: str = "") -> None:
     """Write :func:`plot_drift` completely or not at all.
 
     Parameters
@@ -88,6 +88,8 @@ def write_drift_figure(path: DriftPath, file: Path) -> None:
         Drift of at least one frame.
     file
         Name that ends in ``.png``, ``.svg`` or ``.pdf``.
+    recording
+        Name of the recording, for the title, which also says how large a pixel is.
 
     Raises
     ------
@@ -97,8 +99,17 @@ def write_drift_figure(path: DriftPath, file: Path) -> None:
         The file cannot be written.
     """
     drawn = io.BytesIO()
-    plot_drift(path).savefig(drawn, format=file.suffix.lower().removeprefix("."), dpi=_DPI)
+    title = ", ".join(part for part in (recording, _describe_pixels(path)) if part)
+    plot_drift(path, title).savefig(drawn, format=file.suffix.lower().removeprefix("."), dpi=_DPI)
     atomic_write_bytes(file, drawn.getvalue())
+
+
+def _describe_pixels(path: DriftPath) -> str:
+    """Size of the rectified pixels of the first and of the last frame; empty where it is not known."""
+    if not path.calibrated or len(path) == 0:
+        return ""
+    sizes = [f"{1e9 / path[k].px_from_unit[0, 0]:.4g}" for k in (0, -1)]
+    return " to ".join(dict.fromkeys(sizes)) + " nm per px"
 
 
 def plot_drift(path: DriftPath, title: str = "") -> Figure:

@@ -215,6 +215,13 @@ def test_files_of_each_kind(tmp_path: Path, suffix, start):
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
 
 
+def test_the_figure_names_the_recording_and_the_size_of_a_pixel(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Figure, "suptitle", lambda _figure, text, **_options: seen.append(text))
+    write_drift_figure(sample(4), tmp_path / "drift.svg", "gold")
+    assert seen == ["gold, 40 nm per px"]
+
+
 def test_an_empty_path_is_refused():
     with pytest.raises(InvalidValueError, match="without frames"):
         plot_drift(DriftPath([]))
