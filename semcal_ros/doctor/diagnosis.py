@@ -31,6 +31,7 @@ from semcal_ros.doctor.environment import collect_environment
 from semcal_ros.doctor.environment_checks import ENVIRONMENT_CHECKS, check_domain, check_rclpy
 from semcal_ros.doctor.findings import Finding, Severity, note, problem
 from semcal_ros.doctor.graph_checks import (
+    CONDITIONS,
     Topic,
     check_nodes,
     check_parameters,
@@ -40,6 +41,7 @@ from semcal_ros.doctor.graph_checks import (
 )
 from semcal_ros.doctor.observations import Environment, Session
 from semcal_ros.doctor.stream_checks import (
+    check_conditions,
     check_diagnostics,
     check_images,
     check_large_images,
@@ -141,6 +143,8 @@ def evaluate(
     for topic in topics:
         if topic.keys == "stage":
             found += check_stage(topic, session, config)
+        if topic.what == CONDITIONS:
+            found += check_conditions(topic, session)
     return found + check_diagnostics(session, namespace)
 
 

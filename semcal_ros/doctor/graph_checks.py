@@ -20,11 +20,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 
 __all__ = [
+    "CONDITIONS",
     "Topic",
     "check_nodes",
     "check_parameters",
@@ -36,6 +38,8 @@ __all__ = [
 
 _IMAGE = "sensor_msgs/msg/Image"
 _CLOCK = "/clock"
+#: What the topic with the operating conditions carries.
+CONDITIONS = "conditions"
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ def suite_topics(config: MicroscopeConfig, namespace: str) -> tuple[Topic, ...]:
             Topic(resolve_topic(name, namespace), kind, what, single=one)
             for name, kind, what, one in outputs
         ),
+        # Published by some microscopes only, and named by no configuration: checked where it is.
+        Topic(resolve_topic("conditions", namespace), CONDITIONS_TYPE, CONDITIONS),
     )
 
 

@@ -32,6 +32,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
@@ -39,7 +40,7 @@ from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.doctor.graph_checks import Topic
+from semcal_ros.doctor.graph_checks import CONDITIONS, Topic
 from semcal_ros.doctor.observations import (
     Arrival,
     Endpoint,
@@ -114,6 +115,7 @@ class _Observer:
         self._image: Any = None
         self._magnification: Any = None
         self._stage: Any = None
+        self._conditions: dict[str, float | str] | None = None
         self._calibration: str | None = None
         self._statuses: dict[str, Status] = {}
         images, magnification = topics[:2]
@@ -128,6 +130,7 @@ class _Observer:
             f"{namespace}/projection_covariance_stamped": lambda _message: None,
         }
         self._takes.update({t.name: self._take_stage for t in topics if t.keys == "stage"})
+        self._takes.update({t.name: self._take_conditions for t in topics if t.what == CONDITIONS})
         self._classes = {t.name: message_class(t.type) for t in topics if t.name in self._takes}
         self._subscribed: set[str] = set()
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEPTH)
@@ -154,6 +157,7 @@ class _Observer:
             reading_trouble=trouble,
             stage=stage,
             stage_trouble=stage_trouble,
+            conditions=self._conditions,
             calibration_text=self._calibration,
             statuses=tuple(self._statuses.values()),
         )
@@ -212,6 +216,9 @@ class _Observer:
 
     def _take_stage(self, message: Any) -> None:
         self._stage = message
+
+    def _take_conditions(self, message: Any) -> None:
+        self._conditions = read_conditions(message)
 
     def _take_calibration(self, message: Any) -> None:
         self._calibration = message.data

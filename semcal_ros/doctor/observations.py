@@ -208,6 +208,8 @@ class Session:
         The last magnification, and why it could not be read; None where none came.
     stage, stage_trouble
         The last reading of the stage, and why the last message could not be used; None where none came.
+    conditions
+        What the topic ``conditions`` said last; None where nothing came.
     calibration_text
         Of the topic; None where none came.
     statuses
@@ -222,5 +224,6 @@ class Session:
     reading_trouble: str = ""
     stage: StageReading | None = None
     stage_trouble: str = ""
+    conditions: Mapping[str, float | str] | None = None
     calibration_text: str | None = None
     statuses: tuple[Status, ...] = ()

@@ -17,22 +17,29 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig, load_config
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.errors import MessageError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import judge_calibrations
 from semcal_ros.doctor.findings import Finding, note, ok, problem
-from semcal_ros.doctor.graph_checks import Topic, suite_topics
+from semcal_ros.doctor.graph_checks import CONDITIONS, Topic, suite_topics
 from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, ImageSeen, Session
-from semcal_ros.doctor.stream_checks import check_images, check_stage, check_stamps
+from semcal_ros.doctor.stream_checks import (
+    check_conditions,
+    check_images,
+    check_stage,
+    check_stamps,
+)
 from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
 from semcal_ros.files.bags.topics import topic_matches
 
@@ -94,6 +101,8 @@ def diagnose_recording(path: Path, config_name: str, calibration: Path | None) -
     for topic in topics:
         if topic.keys == "stage":
             found += check_stage(topic, session, config)
+        if topic.what == CONDITIONS:
+            found += check_conditions(topic, session)
     return found
 
 
@@ -126,7 +135,7 @@ def _read(
     """Read the recording; also return the number of images before the first magnification."""
     images, magnification = topics[:2]
     namespace = next(t.name for t in topics if t.what == _CALIBRATION)
-    wanted = {t.name: t.type for t in topics if t.is_input} | {namespace: "std_msgs/msg/String"}
+    wanted = {t.name: t.type for t in topics if t.is_input or t.what in (_CALIBRATION, CONDITIONS)}
     held = {t.name for t in bag.topics if wanted.get(t.name) == t.type}
     arrivals: dict[str, list[Arrival]] = {name: [] for name in held}
     last: dict[str, RawMessage] = {}
@@ -189,4 +198,9 @@ def _with_readings(
             session = replace(session, stage=position)
         except SemcalError as error:
             session = replace(session, stage_trouble=str(error))
+    told = next((messages.get(t.name) for t in topics if t.what == CONDITIONS), None)
+    if told is not None:
+        # A recording may redefine the type: then nothing is known.
+        with suppress(MessageError):
+            session = replace(session, conditions=read_conditions(told))
     return session

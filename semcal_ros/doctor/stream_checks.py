@@ -25,6 +25,7 @@ from statistics import median
 from semcal_ros.bridge.stage import missing_joints
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.findings import Finding, note, ok, problem
@@ -34,6 +35,7 @@ from semcal_ros.middleware.transport_advice import transport_advice
 
 __all__ = [
     "MagnificationSeen",
+    "check_conditions",
     "check_diagnostics",
     "check_images",
     "check_large_images",
@@ -171,6 +173,36 @@ def check_stage(topic: Topic, session: Session, config: MicroscopeConfig) -> lis
             )
         ]
     return [ok("stage", _format_angles(session.stage))]
+
+
+def check_conditions(topic: Topic, session: Session) -> list[Finding]:
+    """Check whether the microscope says its conditions; empty without a publisher of the right type."""
+    senders = session.graph.publishers.get(topic.name, ())
+    if not any(sender.type == topic.type for sender in senders):
+        return []
+    if session.conditions is None:
+        return [
+            note(
+                topic.what,
+                f"{topic.name} has a publisher, but nothing arrived within {session.seconds:g} s; nodes cannot tell"
+                " whether the calibration was made under the same conditions",
+                do="change one of the conditions once, or make the publisher transient local",
+            )
+        ]
+    if not session.conditions:
+        return [
+            note(
+                topic.what,
+                f"{topic.name} says nothing that is known",
+                expected="key-value pairs such as accelerating_voltage_v and working_distance_m, in SI units",
+                do="correct the keys (doc/nodes.md, Conditions), or the node",
+            )
+        ]
+    parts = (
+        describe_condition(name, (value,) if isinstance(value, str) else (value,))
+        for name, value in session.conditions.items()
+    )
+    return [ok(topic.what, ", ".join(f"{label} {text}" for label, text in parts))]
 
 
 def _format_angles(stage: StageReading) -> str:

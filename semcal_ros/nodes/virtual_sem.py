@@ -42,6 +42,8 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.synthetic import (
     DRIFTS,
     PRESETS,
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
     SPECIMEN_KINDS,
     STAGES,
     TYPICAL_GRID,
@@ -52,6 +54,7 @@ from semcal_ros.synthetic import (
     SimulatedStage,
     StagePosition,
     VirtualMicroscope,
+    conditions_of,
     drift_preset,
     make_stage,
     pose_on_stage,
@@ -102,11 +105,16 @@ _PARAMETERS = (
         "height_m", 0.0, "Height of the specimen along the beam.", "m", -1e-3, 1e-3
     ),
     ParameterDeclaration(
-        "voltage_v", 10e3, "Voltage that is told; the image does not depend on it.", "V", 10.0, 1e6
+        "voltage_v",
+        SIMULATED_VOLTAGE_V,
+        "Voltage that is told; the image does not depend on it.",
+        "V",
+        10.0,
+        1e6,
     ),
     ParameterDeclaration(
         "working_distance_m",
-        10e-3,
+        SIMULATED_WORKING_DISTANCE_M,
         "Working distance that is told; the image does not depend on it.",
         "m",
         1e-4,
@@ -469,19 +477,12 @@ class VirtualSem(SemNode):
 
     def _announce_conditions(self) -> None:
         """Publish how the frames are taken if that has changed."""
-        timing = self._scene.microscope.timing
-        told: dict[str, float | str] = {
-            "accelerating_voltage_v": self.parameters["voltage_v"],
-            "working_distance_m": self.parameters["working_distance_m"],
-            "scan_rotation_rad": math.radians(self.parameters["scan_rotation_deg"]),
-            "frame_time_s": timing.frame_time_s,
-            "dwell_s": timing.frame_time_s
-            * (1.0 - timing.flyback_fraction)
-            / (self.parameters["width"] * self.parameters["height"] * timing.line_averages),
-            "detector": "simulated",
-            "maker": "semcal_ros",
-            "model": self.parameters["preset"],
-        }
+        told = conditions_of(
+            self._scene.microscope,
+            voltage_v=self.parameters["voltage_v"],
+            working_distance_m=self.parameters["working_distance_m"],
+            scan_rotation_rad=math.radians(self.parameters["scan_rotation_deg"]),
+        )
         if told != self._told:
             self._told = told
             message = DiagnosticStatus()

@@ -20,6 +20,11 @@ arguments.
 
 from __future__ import annotations
 
+from semcal_ros.synthetic.conditions import (
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
+    conditions_of,
+)
 from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
 from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
@@ -65,6 +70,8 @@ __all__ = [
     "NOISE_FREE",
     "NO_DRIFT",
     "PRESETS",
+    "SIMULATED_VOLTAGE_V",
+    "SIMULATED_WORKING_DISTANCE_M",
     "SPECIMEN_KINDS",
     "SQUARES_M",
     "STAGES",
@@ -92,6 +99,7 @@ __all__ = [
     "VirtualMicroscope",
     "VirtualStage",
     "calibration_plan",
+    "conditions_of",
     "drift_plan",
     "drift_preset",
     "make_stage",

@@ -35,6 +35,7 @@ from semcal_ros.synthetic import (
     SimulatedStage,
     VirtualMicroscope,
     calibration_plan,
+    conditions_of,
     drift_plan,
     drift_preset,
     preset,
@@ -245,6 +246,7 @@ def simulate(
         recording.frames,
         _render(recording, advance),
         truth_of(recording),
+        conditions=conditions_of(scope),
         overwrite=overwrite,
     )
     return len(recording)

@@ -53,6 +53,7 @@ from semcal_ros.doctor.observations import (
     Status,
 )
 from semcal_ros.doctor.stream_checks import (
+    check_conditions,
     check_diagnostics,
     check_images,
     check_large_images,
@@ -64,6 +65,7 @@ from semcal_ros.doctor.stream_checks import (
     describe_magnifications,
 )
 from semcal_ros.middleware.fastdds_profile import PROFILE_VARIABLES
+from semcal_ros.workflows.simulate import simulate
 from tests.helpers.node_scenes import make_calibration, write_recording
 from tests.helpers.project import NODES, ROOT
 
@@ -71,7 +73,7 @@ OK, NOTE, PROBLEM = Severity.OK, Severity.NOTE, Severity.PROBLEM
 MIB = 1024**2
 CONFIG = MicroscopeConfig("test", 0.12)
 CALIBRATION = make_calibration()
-IMAGES, MAGNIFICATION, STAGE, RECT, *_ = suite_topics(CONFIG, "/sem")
+IMAGES, MAGNIFICATION, STAGE, RECT, *_, CONDITIONS = suite_topics(CONFIG, "/sem")
 NOW_NS = 1_800_000_000_000_000_000
 AROUND = Environment(
     python=(3, 12),
@@ -493,6 +495,29 @@ def test_a_stage_is_not_needed_but_must_be_of_its_type() -> None:
     assert STAGE.name not in [topic.name for topic in without]
     own = replace(CONFIG, stage=StageConfig(topic="/axes"))
     assert "/axes" in [topic.name for topic in suite_topics(own, "/sem")]
+
+
+def test_what_the_conditions_say() -> None:
+    knob = Endpoint("/driver", CONDITIONS.type, True, True)
+    graph = Graph(publishers={CONDITIONS.name: (knob,)})
+    only(check_topic(CONDITIONS, graph), OK, "/driver")
+    # Most microscopes say none, and need not.
+    assert check_topic(CONDITIONS, Graph()) == check_conditions(CONDITIONS, session()) == []
+    only(check_conditions(CONDITIONS, session(graph=graph)), NOTE, "nothing arrived within 3 s")
+    heard = session(graph=graph, conditions={"accelerating_voltage_v": 5e3, "detector": "SE2"})
+    only(check_conditions(CONDITIONS, heard), OK, "voltage 5 kV", "detector SE2")
+    only(check_conditions(CONDITIONS, session(graph=graph, conditions={})), NOTE, "nothing that is")
+    text = Graph(publishers={CONDITIONS.name: (replace(knob, type="std_msgs/msg/String"),)})
+    only(check_topic(CONDITIONS, text), PROBLEM, "std_msgs/msg/String", CONDITIONS.type)
+    assert check_conditions(CONDITIONS, session(graph=text)) == []
+
+
+def test_a_recording_says_its_conditions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    simulate(tmp_path / "zoom", "zoom", frames=3, size=64)
+    main(["doctor", str(tmp_path / "zoom"), "--config", "virtual_sem"])
+    assert "voltage 10 kV" in capsys.readouterr().out
 
 
 def test_what_the_stage_says() -> None:

@@ -57,6 +57,7 @@ def test_a_simulated_recording_contains_what_was_asked_for(tmp_path):
         "/sem/image_raw": 3,
         "/sem/magnification": 3,
         "/sem/stage": 1,
+        "/sem/conditions": 1,
     }
     with pytest.raises(BagError, match="exists"):
         simulate(tmp_path / "zoom", "zoom", frames=2, size=64)
@@ -112,11 +113,27 @@ def test_the_stage_is_recorded_as_the_configuration_reads_it(tmp_path: Path) -> 
         assert np.all(np.isfinite(stage.message.position))
 
 
+def test_the_conditions_are_recorded_as_a_calibration_reads_them(tmp_path: Path) -> None:
+    simulate(tmp_path / "zoom", "zoom", microscope="ideal", frames=2, size=64)
+    timing = preset("ideal").timing
+    with open_recording(tmp_path / "zoom", load_config("virtual_sem")) as recording:
+        found = [frame.conditions for frame in recording.frames()]
+    assert len(found) == 2 and found[0] == found[1]
+    told = found[0]
+    assert told is not None
+    assert (told.maker, told.model, told.detector) == ("semcal_ros", "ideal", "simulated")
+    assert told.acceleration_voltage_v == 10e3 and told.working_distance_m == 0.01
+    assert told.frame_time_s == timing.frame_time_s and told.scan_rotation_rad == 0.0
+    # The beam is on a pixel for its share of the part of the line that is recorded.
+    pixels_s = 64 * 64 * timing.line_averages * told.dwell_s
+    assert pixels_s == pytest.approx(timing.frame_time_s * (1.0 - timing.flyback_fraction))
+
+
 def test_a_stage_like_no_other_and_a_perfect_one_say_nothing(tmp_path: Path) -> None:
     for name, stage in (("two-axis", STAGES["two-axis"]), ("perfect", None)):
         simulate(tmp_path / name, magnifications=(500.0,), views=2, size=64, stage=stage, grid=None)
         topics = {topic.name for topic in describe_recording(tmp_path / name).topics}
-        assert topics == {"/sem/image_raw", "/sem/magnification"}
+        assert topics == {"/sem/image_raw", "/sem/magnification", "/sem/conditions"}
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
 from semcal_ros.bridge.headers import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import STAGE_TYPE
@@ -67,6 +68,7 @@ def write_simulated(
     images: Iterable[NDArray[Any]],
     truth: Any,
     *,
+    conditions: Mapping[str, float | str] | None = None,
     delay_s: float = 0.0,
     overwrite: bool = False,
 ) -> None:
@@ -81,6 +83,8 @@ def write_simulated(
         :class:`StagedFrame` say where the stage is.
     truth
         Plain data in SI units.
+    conditions
+        How all frames are taken, by the keys of :mod:`semcal_ros.bridge.conditions`; None for a bag that says nothing.
     delay_s
         Delay from the stamp of a frame to its publication.
     overwrite
@@ -96,6 +100,11 @@ def write_simulated(
         writer.add_topic("/sem/magnification", "std_msgs/msg/Float64", latched=True, depth=1)
         for frame, pixels in zip(frames, images, strict=True):
             stamp_ns = SIMULATED_START_NS + round(frame.start_time_s * 1e9)
+            if conditions and magnification is None:
+                told = blank_message(CONDITIONS_TYPE)
+                fill_conditions(told, conditions, "virtual SEM")
+                writer.add_topic("/sem/conditions", CONDITIONS_TYPE, latched=True, depth=1)
+                writer.write("/sem/conditions", stamp_ns - _LEAD_NS, told)
             if frame.magnification != magnification:
                 magnification = frame.magnification
                 value = blank_message("std_msgs/msg/Float64")
