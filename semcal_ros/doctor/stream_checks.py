@@ -198,10 +198,7 @@ def check_conditions(topic: Topic, session: Session) -> list[Finding]:
                 do="correct the keys (doc/nodes.md, Conditions), or the node",
             )
         ]
-    parts = (
-        describe_condition(name, (value,) if isinstance(value, str) else (value,))
-        for name, value in session.conditions.items()
-    )
+    parts = (describe_condition(name, (value,)) for name, value in session.conditions.items())
     return [ok(topic.what, ", ".join(f"{label} {text}" for label, text in parts))]
 
 

@@ -91,6 +91,26 @@ def calibration(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
+def test_an_imported_calibration_measures_the_same(bag, calibration, tmp_path):
+    """Pixel sizes alone are enough where nothing is distorted; their sigma is that of the table."""
+    sizes, nominal = tmp_path / "sizes.csv", tmp_path / "nominal.yaml"
+    rows = [f"{g},{1e9 * SCOPE.camera_at(g).pixel_size_m[0]!r}" for g in (6450.0, 8890.0)]
+    sizes.write_text("\n".join(["magnification,nm per px", *rows]) + "\n")
+    size = ("--image-size", f"{SIZE}x{SIZE}", "--sigma", "1%")
+    assert run("import-calibration", sizes, *size, "-o", nominal) == 0
+    found = []
+    for cal in (calibration, nominal):
+        command = ("measure", "cantilever", bag, "--calibration", cal, *LENGTH)
+        assert run(*command, "-o", tmp_path / "d.csv", "--config", "virtual_sem") == 0
+        found.append(rows_of(tmp_path / "d.csv"))
+    for exact, imported in zip(*found, strict=True):
+        name = "deflection_m"
+        assert float(imported[name]) == pytest.approx(float(exact[name]), rel=1e-3, abs=1e-10)
+    bent = [row for row in found[1] if int(row["pose"]) == 2]
+    assert all(float(r["sigma_m"]) >= 0.009 * abs(float(r["deflection_m"])) for r in bent)
+
+
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))

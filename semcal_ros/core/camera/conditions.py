@@ -94,7 +94,7 @@ _COMPARED = (*_DECISIVE, "detector", "beam_current_a", "dwell_s", "frame_time_s"
 _NO_MAKER = "imagej"
 
 
-def describe_condition(name: str, values: Sequence[str] | Sequence[float]) -> tuple[str, str]:
+def describe_condition(name: str, values: Sequence[str | float]) -> tuple[str, str]:
     """Say a condition for people.
 
     Parameters
@@ -179,7 +179,7 @@ def compare_conditions(
         if not values or value is None:
             continue
         if _differs(name, values, value, height_sigma_m):
-            own = describe_condition(name, (value,))[1]  # type: ignore[arg-type]
+            own = describe_condition(name, (value,))[1]
             found.append(
                 ConditionDifference(
                     name, own, describe_condition(name, values)[1], name in _DECISIVE
