@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from semcal_ros.cli.options import (
     PATH,
     config_option,
     output_option,
+    parse_angles_or_degrees,
     parse_ratio,
     require_folder,
 )
@@ -78,7 +80,12 @@ def _wait_for_enter(text: str) -> None:
     "--by-hand", is_flag=True, help="Say what to set, and wait for Enter; nothing is moved."
 )
 @click.option(
-    "--tilts", default="0,20,40", show_default=True, help="Tilts of each visit, in degrees."
+    "--tilts",
+    default="0deg,20deg,40deg",
+    show_default=True,
+    callback=parse_angles_or_degrees,
+    metavar="ANGLE,...",
+    help="Tilts of each visit; a bare number is in degrees.",
 )
 @click.option(
     "--turn-by",
@@ -103,7 +110,7 @@ def command(
     target: float,
     microscope: str,
     by_hand: bool,
-    tilts: str,
+    tilts: tuple[float, ...],
     turn_by: str,
     most_views: int,
     record: Path | None,
@@ -140,7 +147,7 @@ def command(
         "lowest_magnification": magnifications[0],
         "highest_magnification": magnifications[1],
         "target": target,
-        "tilts_deg": f"'{tilts}'",
+        "tilts_deg": f"'{','.join(f'{math.degrees(tilt):.12g}' for tilt in tilts)}'",
         "turn_by": turn_by,
         "most_views": most_views,
     }

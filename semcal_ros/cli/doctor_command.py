@@ -22,7 +22,7 @@ from pathlib import Path
 import click
 
 from semcal_ros.bridge.names import absolute_namespace
-from semcal_ros.cli.options import PATH, config_option
+from semcal_ros.cli.options import PATH, Quantity, config_option
 from semcal_ros.cli.output import echo_json
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import diagnose
@@ -52,9 +52,10 @@ _ORDER = (Severity.PROBLEM, Severity.NOTE, Severity.OK)
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.1, 3600.0),
-    default=3.0,
+    type=Quantity("time", "s", "3s or 500ms", within=(0.1, 3600.0)),
+    default="3s",
     show_default=True,
+    metavar="TIME",
     help="How long to listen; choose more than one frame takes.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -20,7 +20,13 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import FIGURE_SUFFIXES, PATH, calibration_option, output_option
+from semcal_ros.cli.options import (
+    FIGURE_SUFFIXES,
+    PATH,
+    Quantity,
+    calibration_option,
+    output_option,
+)
 from semcal_ros.cli.output import (
     echo_nominal_unit,
     echo_notes,
@@ -57,9 +63,9 @@ __all__ = ["command"]
 )
 @click.option(
     "--forecast",
-    type=click.FloatRange(min=0.0, min_open=True, max=1e6),
-    metavar="S",
-    help="Also forecast the drift this long after the last frame.",
+    type=Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6)),
+    metavar="TIME",
+    help="Also forecast the drift this long after the last frame, such as 5s.",
 )
 @click.option(
     "--live", is_flag=True, help="Drift as known live, without hindsight from later frames."

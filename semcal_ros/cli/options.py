@@ -43,6 +43,7 @@ __all__ = [
     "overwrite_option",
     "parse_angle",
     "parse_angles",
+    "parse_angles_or_degrees",
     "parse_lengths",
     "parse_ratio",
     "require_folder",
@@ -72,12 +73,22 @@ class Quantity(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gene
         Whether 0 is accepted, too.
     negative
         Whether all numbers are accepted.
+    within
+        Least and largest value in SI, both accepted; None for any.
     """
 
     def __init__(
-        self, what: str, unit: str, example: str, *, zero: bool = False, negative: bool = False
+        self,
+        what: str,
+        unit: str,
+        example: str,
+        *,
+        zero: bool = False,
+        negative: bool = False,
+        within: tuple[float, float] | None = None,
     ) -> None:
         self.name = what
+        self._within = within
         self._negative = negative
         self._zero = zero
         self._unit = unit
@@ -97,7 +108,11 @@ class Quantity(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gene
         if not self._negative and (found < 0.0 or (found == 0.0 and not self._zero)):
             self.fail(f"{value!r} is not {'0 or above' if self._zero else 'above 0'}", param, ctx)
         # Without the rounding error of the unit.
-        return float(f"{found:.12g}")
+        value_si = float(f"{found:.12g}")
+        if self._within is not None and not self._within[0] <= value_si <= self._within[1]:
+            low, high = self._within
+            self.fail(f"{value!r} is not within {low:g} to {high:g} {self._unit}", param, ctx)
+        return value_si
 
     def _is_too_large(self, text: str) -> bool:
         """Whether the number overflows, of a text that is not a quantity."""
@@ -154,6 +169,15 @@ def parse_angles(
         return None
     found = (parse_angle(context, parameter, part) for part in text.split(","))
     return tuple(angle for angle in found if angle is not None)
+
+
+def parse_angles_or_degrees(
+    context: click.Context, parameter: click.Parameter, text: str
+) -> tuple[float, ...]:
+    """Callback of an option for angles such as ``0,20deg``, whose bare numbers are degrees; in rad."""
+    parts = [part.strip() for part in text.split(",")]
+    stated = (part if plain_number(part) is None else f"{part}deg" for part in parts)
+    return parse_angles(context, parameter, ",".join(stated)) or ()
 
 
 overwrite_option = click.option(

@@ -24,6 +24,7 @@ import click
 
 from semcal_ros.applications.reconstruction.tilt_series import HeightMap
 from semcal_ros.cli.options import (
+    LENGTH_OR_ZERO,
     PATH,
     calibration_option,
     dask_option,
@@ -93,10 +94,10 @@ __all__ = ["command"]
 )
 @click.option(
     "--height-sigma",
-    type=click.FloatRange(0.0),
-    default=10e-6,
+    type=LENGTH_OR_ZERO,
+    default="10um",
     show_default=True,
-    metavar="M",
+    metavar="LENGTH",
     help="1-sigma of the height above or below the plane of the calibration.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
