@@ -32,6 +32,7 @@ from rclpy.clock_type import ClockType
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
+from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -102,7 +103,7 @@ class Viewer(SemNode):
         self._number = 0
         self._camera: tuple[object, ScanCamera] | None = None
         self._trace = DriftTrace()
-        self._speed_m_s: float | None = None
+        self._speed: tuple[float, float] | None = None
         self._reports: dict[str, tuple[float, NodeReport]] = {}
         self._progress: tuple[str, str, dict[str, str]] | None = None
         self._overlay: tuple[int, NDArray[Any]] | None = None
@@ -303,13 +304,13 @@ class Viewer(SemNode):
     def _on_drift(self, message: Any, _info: Any) -> None:
         position, covariance = message.pose.pose.position, message.pose.covariance
         sigma_m = math.sqrt(max(covariance[0], covariance[7], 0.0))
-        self._trace.add(
-            stamp_ns_from_msg(message), position.x, position.y, sigma_m, self._speed_m_s
-        )
+        self._trace.add(stamp_ns_from_msg(message), position.x, position.y, sigma_m, self._speed)
 
     def _on_velocity(self, message: Any, _info: Any) -> None:
-        linear = message.twist.twist.linear
-        self._speed_m_s = math.hypot(linear.x, linear.y)
+        linear, covariance = message.twist.twist.linear, message.twist.covariance
+        variance = max(covariance[0], covariance[7], 0.0)
+        known = variance < UNKNOWN_VARIANCE
+        self._speed = (math.hypot(linear.x, linear.y), math.sqrt(variance)) if known else None
 
     def _on_diagnostics(self, message: Any, _info: Any) -> None:
         own = self.get_namespace().rstrip("/") + "/"

@@ -31,6 +31,8 @@ _LEVELS = {0: _OK, 1: _WARN, 2: _ERROR, 3: _ERROR}
 _ORDER = (_ERROR, _WARN, _OK)
 # A node reports every second by default, and up to once a minute; this one has ended or hangs.
 _SILENT_S = 5.0
+# Their diagnostics have a rate, but not of frames.
+_WITHOUT_FRAMES = ("calibration_server", "parameter_server")
 
 # What a node says -> level, words (with the groups of the expression), what to do. The first that fits counts.
 _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
@@ -164,7 +166,7 @@ def _explain_part(report: NodeReport, part: str) -> Note:
         if found := re.fullmatch(pattern, part):
             return Note(level, name, found.expand(words), do)
     # What this table does not know is in words already.
-    return Note(_LEVELS.get(report.level, _WARN), name, part, "")
+    return Note(_LEVELS.get(report.level, _WARN), name, f"says: {part}", "")
 
 
 def explain(reports: Sequence[NodeReport]) -> tuple[Note, ...]:
@@ -191,7 +193,7 @@ def explain(reports: Sequence[NodeReport]) -> tuple[Note, ...]:
         found.append(
             Note(
                 _WARN,
-                "nobody",
+                "",
                 "no node of the suite has reported yet",
                 "start the nodes, or look under which --namespace they are",
             )
@@ -209,14 +211,14 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 def describe_rates(reports: Sequence[NodeReport]) -> tuple[Rate, ...]:
     """Return the frames per second of all nodes that publish some.
 
-    A calibration server has views, which come as they are asked for.
+    A calibration server has views, which come as they are asked for, and a parameter server has no frames.
     """
     rates = []
     for report in reports:
         rate = _number(report.values, "rate_hz")
         published = _number(report.values, "published")
         gone = report.age_s > _SILENT_S
-        if rate is None or not published or gone or report.name == "calibration_server":
+        if rate is None or not published or gone or report.name in _WITHOUT_FRAMES:
             continue
         latency = _number(report.values, "latency_mean_ms")
         longest = _number(report.values, "latency_max_ms")

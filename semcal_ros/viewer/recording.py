@@ -339,9 +339,8 @@ class RecordingSource:
         update = follower.update(frame, time_s, camera, self._config.scan)
         self._known[number] = update
         self._followed += 1
-        speed_m_s = float(np.hypot(*update.velocity_m_s))
         x_m, y_m = (float(v) for v in update.drift_m)
-        self._trace.add(frame.stamp_ns, x_m, y_m, _sigma_m(update), speed_m_s)
+        self._trace.add(frame.stamp_ns, x_m, y_m, _sigma_m(update))
         if number == self._index:
             with self._changed:
                 self._renew = True

@@ -110,11 +110,14 @@ class Note:
 
 @dataclass(frozen=True)
 class DriftPanel:
-    """The drift: a sentence, its way as (x, y) in nm, oldest first, and where on it the frame that is shown stands."""
+    """The drift: a sentence, its way as (x, y) in nm, oldest first, where on it the frame that is shown stands, and the
+    1-sigma of the newest (0: not known), below which the way is noise.
+    """
 
     text: str
     trace_nm: tuple[tuple[float, float], ...] = ()
     at_nm: tuple[float, float] | None = None
+    sigma_nm: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.files.images.scale_bar import format_length
 from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.source import DriftPanel, Magnification
 
@@ -75,22 +74,30 @@ class DriftTrace:
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque(maxlen=_KEPT)
         self._last: tuple[int, float, float, float] | None = None
-        self._speed_m_s: float | None = None
+        self._speed: tuple[float, float] | None = None
 
     def clear(self) -> None:
         """Forget everything."""
         self._points.clear()
-        self._last = self._speed_m_s = None
+        self._last = self._speed = None
 
     def add(
-        self, stamp_ns: int, x_m: float, y_m: float, sigma_m: float, speed_m_s: float | None = None
+        self,
+        stamp_ns: int,
+        x_m: float,
+        y_m: float,
+        sigma_m: float,
+        speed: tuple[float, float] | None = None,
     ) -> None:
-        """Add the drift of a frame; one that is exactly zero, or older than the last, begins anew."""
+        """Add the drift of a frame; one that is exactly zero, or older than the last, begins anew.
+
+        ``speed`` is its amount and 1-sigma, m/s, where they are known.
+        """
         if (x_m == 0.0 and y_m == 0.0) or (self._last and stamp_ns < self._last[0]):
             self.clear()
         self._points.append((1e9 * x_m, 1e9 * y_m))
         self._last = stamp_ns, x_m, y_m, sigma_m
-        self._speed_m_s = speed_m_s
+        self._speed = speed
 
     @property
     def last(self) -> tuple[int, float, float, float] | None:
@@ -103,12 +110,14 @@ class DriftTrace:
             return DriftPanel(missing)
         _, x_m, y_m, sigma_m = self._last
         text = f"{format_with_sigma(math.hypot(x_m, y_m), sigma_m)} since the start"
-        if self._speed_m_s is not None:
-            text += f", {format_length(60.0 * self._speed_m_s)} per minute"
+        if self._speed is not None:
+            speed_m_s, speed_sigma_m_s = self._speed
+            text += f", {format_with_sigma(60.0 * speed_m_s, 60.0 * speed_sigma_m_s)} per minute"
         points = list(self._points)
         step = max(1, math.ceil(len(points) / _DRAWN))
         drawn = points[::step]
         if drawn[-1] != points[-1]:
             drawn.append(points[-1])
         rounded = tuple((round(x, 3), round(y, 3)) for x, y in drawn)
-        return DriftPanel(text, rounded, points[-1])
+        sigma_nm = 1e9 * sigma_m if math.isfinite(sigma_m) else 0.0
+        return DriftPanel(text, rounded, points[-1], sigma_nm)

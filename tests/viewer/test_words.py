@@ -83,6 +83,7 @@ def test_rates_are_of_nodes_that_publish() -> None:
         NodeReport("odd", 0, "", {"rate_hz": "many", "published": "3"}),
         NodeReport("old", 0, "", {"rate_hz": "3", "published": "3"}),
         NodeReport("gone", 0, "", values, age_s=60.0),
+        NodeReport("parameter_server", 0, "", {"rate_hz": "0.0", "published": "3"}),
     ]
     corrector, old = describe_rates(reports)
     assert (corrector.rate_hz, corrector.latency_ms, corrector.longest_ms) == (9.8, 31.0, 44.0)
@@ -104,9 +105,10 @@ def test_the_drift_is_told_with_its_sigma_and_drawn_with_few_points() -> None:
     trace = DriftTrace()
     assert trace.panel("none").text == "none"
     for k in range(5000):
-        trace.add(1000 * k, 1e-12 * k, -2e-12 * k, 0.4e-9, 2e-9)
+        trace.add(1000 * k, 1e-12 * k, -2e-12 * k, 0.4e-9, (2e-9, 0.1e-9))
     panel = trace.panel()
-    assert panel.text == "11.18 ± 0.40 nm since the start, 120 nm per minute"
+    assert panel.text == "11.18 ± 0.40 nm since the start, 120.0 ± 6.0 nm per minute"
+    assert panel.sigma_nm == pytest.approx(0.4)
     assert len(panel.trace_nm) <= 302
     assert panel.trace_nm[-1] == panel.at_nm == pytest.approx((4.999, -9.998))
     # A reset sets the drift to zero, a replay that begins again goes back in time.

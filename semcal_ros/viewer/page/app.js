@@ -9,7 +9,7 @@ const canvases = Object.fromEntries(Object.entries(figures).map(([n, f]) => [n, 
 const state = {
   socket: null, shown: {}, header: null, layout: "both", blink: "raw", tool: "ruler",
   zoom: 1, centre: [0.5, 0.5], contrast: "auto", low: 0, high: 255,
-  ruler: null, rulerText: "", drag: null, seeking: false, trace: [], measuredAt: 0,
+  ruler: null, rulerText: "", drag: null, seeking: false, trace: [], traceSigma: 0, measuredAt: 0,
 };
 const MOST_ZOOM = 32;
 const BLINK_MS = 700;
@@ -104,6 +104,9 @@ function onText(message) {
 }
 function answer(text, level) { $("answer").textContent = text; $("answer").className = level; }
 
+// A slow scan has frames per second below one.
+function rateText(hz) { return hz < 0.95 ? hz.toFixed(2) : hz.toFixed(1); }
+
 function showStatus(s) {
   $("title").textContent = s.title;
   document.title = `semcal view: ${s.title}`;
@@ -113,20 +116,21 @@ function showStatus(s) {
   badge.hidden = !s.magnification.explanation;
   badge.className = `badge ${{ ok: "ok", outside: "error", unknown: "warn" }[s.magnification.state]}`;
   const rate = s.rates.find((r) => r.name.includes("corrector")) ?? s.rates[0];
-  $("rate").textContent = rate ? `${rate.rate_hz.toFixed(1)} frames/s${rate.latency_ms === null ? "" : `, ${rate.latency_ms.toFixed(0)} ms old`}` : "no frames yet";
+  $("rate").textContent = rate ? `${rateText(rate.rate_hz)} frames/s${rate.latency_ms === null ? "" : `, ${rate.latency_ms.toFixed(0)} ms old`}` : "no frames yet";
   fill($("rates"), s.rates, "tr", (row, r) => {
     const latency = r.latency_ms === null ? "" : `${r.latency_ms.toFixed(0)}, ${r.longest_ms.toFixed(0)} ms`;
-    fill(row, [r.name, r.rate_hz.toFixed(1), latency], "td", (cell, text) => setText(cell, text));
+    fill(row, [r.name, rateText(r.rate_hz), latency], "td", (cell, text) => setText(cell, text));
   });
   fill($("notes"), s.notes, "li", (item, note) => {
     item.className = note.level;
     // What is fine is said of several at once, what is not of one.
-    const words = note.level === "ok" ? [["", note.text], ["who", ` ${note.who}`]] : [["", `${note.who} ${note.text}`], ["who", ""]];
+    const words = note.level === "ok" ? [["", note.text], ["who", ` ${note.who}`]] : [["", `${note.who} ${note.text}`.trim()], ["who", ""]];
     fill(item, [...words, ["do", note.do]], "span", (span, [kind, text]) => { span.className = kind; setText(span, text); span.hidden = !text.trim(); });
   });
   $("drift-text").textContent = s.drift.text;
   state.trace = s.drift.trace_nm;
   state.traceAt = s.drift.at_nm;
+  state.traceSigma = s.drift.sigma_nm;
   drawTrace();
   for (const button of all("[data-action]")) button.disabled = !s.actions.includes(button.dataset.action);
   showCalibration(s.calibration);
@@ -258,9 +262,9 @@ function drawTrace() {
   canvas.width = Math.round(canvas.clientWidth * ratio); canvas.height = Math.round(canvas.clientHeight * ratio);
   const pen = canvas.getContext("2d"), xs = state.trace.map((p) => p[0]), ys = state.trace.map((p) => p[1]);
   const middle = (v) => (Math.min(...v) + Math.max(...v)) / 2, span = (v) => Math.max(...v) - Math.min(...v);
-  // The same scale in both directions; below a nanometre only noise would be seen.
-  const margin = 24 * ratio;
-  const scale = Math.min((canvas.width - margin) / Math.max(span(xs), 1), (canvas.height - 2 * margin) / Math.max(span(ys), 1));
+  // The same scale in both directions; below a nanometre, or two 1-sigmas to either side, only noise would be seen.
+  const margin = 24 * ratio, least = Math.max(1, 4 * state.traceSigma);
+  const scale = Math.min((canvas.width - margin) / Math.max(span(xs), least), (canvas.height - 2 * margin) / Math.max(span(ys), least));
   const place = ([x, y]) => [canvas.width / 2 + (x - middle(xs)) * scale, canvas.height / 2 + (y - middle(ys)) * scale - margin / 4];
   pen.strokeStyle = "#ffb86b"; pen.lineWidth = 1.5 * ratio; pen.lineJoin = "round"; pen.beginPath();
   state.trace.forEach((p, k) => { const [x, y] = place(p); if (k) pen.lineTo(x, y); else pen.moveTo(x, y); });
