@@ -192,3 +192,39 @@ def test_drift_of_recursive_averages_is_that_of_their_effective_time() -> None:
     assert error(0.0) < 0.1
     # The stamps alone would be wrong by three passes.
     assert error(averages - 1.0) > 0.5
+
+
+@pytest.mark.slow
+def test_the_stated_uncertainty_of_averaged_passes_is_honest() -> None:
+    """20 recordings of a steady drift, each with another specimen, in px; passes that are averaged before."""
+    # After fewer frames the process noise is not known yet, and the sigma is on the safe side.
+    size, frames, seeds, noise = 96, 6, 20, 20.0
+
+    def follow(seed: int, averages: int) -> tuple[np.ndarray, np.ndarray]:
+        texture = Texture(seed, 256, 1.5, 5.0)
+        rng = np.random.default_rng((averages, seed))
+        velocity = rng.normal(0.0, 0.3, 2)
+        history = DriftHistory()
+        tracker = DriftTracker(history=history)
+        for k in range(frames):
+            # Passes in an instant, in the middle of their time.
+            middles = k + (np.arange(averages) + 0.5) / averages
+            passes = [texture.view((velocity[0] * t, velocity[1] * t), size) for t in middles]
+            image = 128.0 + 40.0 * np.mean(passes, axis=0)
+            image += noise / np.sqrt(averages) * rng.standard_normal(image.shape)
+            timing = ScanTiming(1.0 / averages, averages)
+            assert tracker.update(image.astype(np.float32), float(k), None, timing).accepted
+        updates = history.smooth().updates
+        moved = updates[-1].drift_m - updates[0].drift_m
+        truth = velocity * (updates[-1].time_s - updates[0].time_s)
+        return moved - truth, np.sqrt(np.diag(updates[-1].covariance)[:2])
+
+    stated = []
+    for averages in (2, 8):
+        found = [follow(seed, averages) for seed in range(seeds)]
+        z = np.array([error / sigma for error, sigma in found])
+        # The RMS of 40 scores scatters by 0.11; that of x and y of one specimen is nearly independent.
+        assert 0.7 < np.sqrt(np.mean(z**2)) < 1.35, (averages, z)
+        stated.append(float(np.median([sigma for _, sigma in found])))
+    # Four times the passes: half of the noise.
+    assert stated[1] == pytest.approx(0.5 * stated[0], rel=0.15)
