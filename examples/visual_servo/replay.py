@@ -86,13 +86,12 @@ def replay(folder: Path, bag: Path, goal: PlanePose, rate: float) -> dict[int, n
     goals |= {"goal_rotation_deg": math.degrees(goal.angle_rad)}
     # Live, the newest frame wins; here all frames are to be measured, however busy the machine is.
     every = {"drift_tracking": "every_frame", "qos_overrides./sem/image_raw.subscription.depth": 50}
-    all_of_them = {"qos_overrides./sem/image_rect.subscription.depth": 50}
     rclpy.init()
     node = rclpy.create_node("referee", namespace="/sem")
     try:
         nodes.start("parameter_server", calibrated)
         nodes.start("stream_corrector", {**calibrated, **every})
-        nodes.start("visual_servo", {**common, **goals, **all_of_them, "start": True})
+        nodes.start("visual_servo", {**common, **goals, "start": True})
         queue = QoSProfile(depth=100)
         node.create_subscription(PoseWithCovarianceStamped, "visual_servo/error", on_error, queue)
         # The servo hears the corrector; both hear the magnification, and the corrector the images.

@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
+from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from semcal_ros.applications.servoing import (
@@ -116,6 +117,11 @@ class VisualServo(SemNode):
             # As the watchdog, not to wait for the end of the work on a frame.
             self.endpoints.trigger_service("~/stop", self._on_stop, alone),
         ]
+        # A simulated clock is at zero until its first message, and leaps where a replay is moved on.
+        self._clock_leapt = False
+        leap = Duration(seconds=_OTHER_CLOCK_S)
+        threshold = JumpThreshold(min_forward=leap, min_backward=Duration(seconds=-_OTHER_CLOCK_S))
+        self._leaps = self.get_clock().create_jump_callback(threshold, post_callback=self._on_leap)
         # A simulated clock may stand still; the stage must not keep moving because of it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog = self.create_timer(_TICK_S, self._watch, alone, clock=steady)
@@ -205,6 +211,10 @@ class VisualServo(SemNode):
 
     # -- frames ------------------------------------------------------------------------------------
 
+    def _on_leap(self, _leap: TimeJump) -> None:
+        # No more than this: whoever sets the clock waits for it, and the lock may be held for a while.
+        self._clock_leapt = True
+
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
@@ -235,6 +245,9 @@ class VisualServo(SemNode):
         # What takes long, without the lock: the watchdog may have to stop the stage meanwhile.
         view = find_target(frame.image, self._target)
         with self._lock:
+            if self._clock_leapt:
+                # How late frames were by the time of before tells nothing of how late they are now.
+                self._clock_leapt, self._least_delay_s = False, np.inf
             time_s, now_s, age_s = self._times(frame.stamp_ns)
             # The work on a frame takes time, too, and a frame of another clock cannot be younger than that.
             age_s = max(age_s, time.monotonic() - arrived_s)

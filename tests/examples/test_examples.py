@@ -115,6 +115,8 @@ def test_nano_ball(tmp_path: Path) -> None:
     follow_tutorial("tilt_series", tmp_path)
 
 
+# Four processes must get their turns within a stream's interval.
+@pytest.mark.flaky(reruns=1)
 def test_visual_servo(tmp_path: Path) -> None:
     out = tmp_path / "out"
     # A frame a second; nodes on a busy machine pass over those for which they are late.

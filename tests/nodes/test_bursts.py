@@ -63,9 +63,6 @@ from tests.helpers.stream_bench import (
     round_trip_s,
 )
 
-# Images at the limit of what two processes carry; a machine that stops one of them loses some.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 BURST_S = 2.0
 OVERLOAD = 10.0
 # px. Work enough for the node that sending ten times as much is still easy.

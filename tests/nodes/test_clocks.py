@@ -48,9 +48,6 @@ from tests.helpers.stream_bench import (
     shifted_texture,
 )
 
-# Several processes that share one clock; a machine that stops one of them for seconds makes it late.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 TRACKING = (COMPENSATOR, CORRECTOR)
 # A day in 2027, and how far the clock is set back.
 NOW_S = 1_800_000_000

@@ -29,7 +29,7 @@ import pytest
 from tests.helpers.live_page import corrected_view
 from tests.helpers.project import ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.flaky(reruns=1)]
+pytestmark = pytest.mark.slow
 
 
 def _nodes() -> set[str]:

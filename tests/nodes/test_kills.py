@@ -49,9 +49,6 @@ from tests.helpers.stream_bench import (
     shifted_texture,
 )
 
-# Waits for what the middleware notices of killed processes, which takes as long as it likes.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 SERVER = "/sem/parameter_server"
 
 

@@ -52,9 +52,6 @@ from tests.helpers.stream_bench import (
     restartable,
 )
 
-# Waits for what the middleware notices of killed processes, which takes as long as it likes.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 # -- the sources -------------------------------------------------------------------------------------
 
 

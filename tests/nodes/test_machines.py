@@ -23,8 +23,6 @@ from benchmarks.network.namespaces import why_not
 
 pytestmark = [
     pytest.mark.skipif(bool(why_not()), reason=f"no network namespaces here: {why_not()}"),
-    # Three machines on the processors of one, which others use too.
-    pytest.mark.flaky(reruns=1),
 ]
 
 

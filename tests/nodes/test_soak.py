@@ -23,9 +23,6 @@ import pytest
 from tests.helpers.node_soak import Soak
 from tests.helpers.ros_process import Peer
 
-# All nodes at once, for as long as the soak takes.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 DURATION_S = 8.0
 
 

@@ -45,9 +45,6 @@ from tests.helpers.node_scenes import (
 )
 from tests.helpers.ros_process import LATCHED, PATIENT, RELIABLE, NodeProcess, Peer, running
 
-# Several nodes and their files at once; a machine that stops one of them for seconds makes it late.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 MAGNIFICATION = 2000.0
 SERVER, RECTIFIER, CORRECTOR = "/sem/parameter_server", "/sem/rectifier", "/sem/stream_corrector"
 

@@ -34,7 +34,6 @@ from tests.helpers.ros_process import Peer, running
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.flaky(reruns=1),
     pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed"),
 ]
 SIZE = 96

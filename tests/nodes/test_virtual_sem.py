@@ -29,9 +29,6 @@ from std_msgs.msg import Float64
 from tests.helpers.node_scenes import stamp_of
 from tests.helpers.ros_process import LATCHED, PATIENT, RELIABLE, Peer, running
 
-# Counts frames while another process measures beside the stream; seen to fail at a load of 6 on 2 cores.
-pytestmark = pytest.mark.flaky(reruns=1)
-
 SEM = "/sem/virtual_sem"
 SIZE = 192
 # A frame of eight passes at the default timing lasts 0.53 s.

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, Float64MultiArray
 
@@ -44,9 +45,6 @@ from semcal_ros.synthetic import NOISE_FREE, Pose, preset, render_frame
 from semcal_ros.synthetic.specimens.target import TargetSpecimen
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import LATCHED, RELIABLE, NodeProcess, Peer, running
-
-# Four processes must get their turns within a stream's interval; seen to fail at a load of 8 on 2 cores.
-pytestmark = pytest.mark.flaky(reruns=1)
 
 SERVO = "/sem/visual_servo"
 SIZE = 256
@@ -207,6 +205,23 @@ def test_frames_that_come_too_late_do_not_move_it(peer: Peer, ahead_s: float) ->
         assert "frames are" in state["message"]
         microscope.late_s = -ahead_s
         microscope.frames_until(lambda: _moves(microscope), "motion again")
+
+
+def test_a_simulated_clock_that_begins_after_the_frames_does_not_make_them_old(peer: Peer) -> None:
+    clock = peer.node.create_publisher(ClockMessage, "/clock", RELIABLE)
+    with servoed(peer, use_sim_time=True, start=False) as (microscope, _):
+        # Without a clock it is the year 1970.
+        microscope.frames_until(lambda: len(microscope.errors) > 3, "measurements without a clock")
+        peer.wait_for(lambda: clock.get_subscription_count(), "the node at the clock")
+        count = len(microscope.errors)
+
+        def measured() -> bool:
+            message = ClockMessage()
+            message.clock.sec, message.clock.nanosec = divmod(time.time_ns(), 10**9)
+            clock.publish(message)
+            return len(microscope.errors) > count + 10
+
+        microscope.frames_until(measured, "measurements by the clock")
 
 
 def test_a_start_without_a_stream_says_what_it_waits_for(peer: Peer) -> None:
