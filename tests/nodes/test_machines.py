@@ -21,9 +21,7 @@ import pytest
 from benchmarks.network.__main__ import Case, measured
 from benchmarks.network.namespaces import why_not
 
-pytestmark = [
-    pytest.mark.skipif(bool(why_not()), reason=f"no network namespaces here: {why_not()}"),
-]
+pytestmark = pytest.mark.skipif(bool(why_not()), reason=f"no network namespaces here: {why_not()}")
 
 
 @pytest.mark.timeout(180)

@@ -212,7 +212,7 @@ def test_a_simulated_clock_that_begins_after_the_frames_does_not_make_them_old(p
     with servoed(peer, use_sim_time=True, start=False) as (microscope, _):
         # Without a clock it is the year 1970.
         microscope.frames_until(lambda: len(microscope.errors) > 3, "measurements without a clock")
-        peer.wait_for(lambda: clock.get_subscription_count(), "the node at the clock")
+        peer.wait_for(clock.get_subscription_count, "the node at the clock")
         count = len(microscope.errors)
 
         def measured() -> bool:
