@@ -43,7 +43,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.view_coverage import measure_view_coverage
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
-from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import (
     CalibrationError,
     InvalidValueError,
@@ -99,6 +99,8 @@ _PARAMETERS = (
     ),
     *ACQUISITION,
 )
+# Stamps that are behind by more are of another clock, or of so slow a scan that one follows the other.
+_OTHER_CLOCK_NS = 30 * 10**9
 # Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
 _PICTURE_S = 600.0
 _POLL_S = 0.1
@@ -554,11 +556,27 @@ class CalibrationServer(StreamNode):
         """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
         with self._lock:
             wanted = self._pictures + count
-        self._wait_until(
-            lambda: self._pictures >= wanted,
-            MicroscopeError("no picture comes any more"),
-            _PICTURE_S,
-        )
+        asked_ns = self.get_clock().now().nanoseconds
+
+        def there() -> bool:
+            with self._lock:
+                newest = self._newest
+                if self._pictures < wanted or newest is None:
+                    return False
+            # Pictures of a scan that began before may still come, more than one where they overlap.
+            late_ns = asked_ns - newest.frame.stamp_ns
+            return late_ns <= 0 or late_ns > _OTHER_CLOCK_NS
+
+        self._wait_until(there, MicroscopeError("no picture comes any more"), _PICTURE_S)
+
+    def look(self) -> LatticeDetection | None:
+        """See :class:`~semcal_ros.nodes.acquisition.follow.Lookout`."""
+        with self._lock:
+            newest = self._newest
+        if newest is None:
+            return None
+        found = find_lattice(to_gray(newest.frame.image, newest.frame.encoding))
+        return None if isinstance(found, Rejection) else found
 
     def take(self, request: ViewRequest) -> str:
         """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""

@@ -57,6 +57,7 @@ from semcal_ros.synthetic import (
     conditions_of,
     drift_preset,
     make_stage,
+    pose_at,
     pose_on_stage,
     preset,
     read_position,
@@ -199,6 +200,15 @@ _PARAMETERS = (
         4.0,
         fixed=True,
     ),
+    ParameterDeclaration(
+        "grid_extent", 0, "Squares a side of the grid; 0: endless.", "", 0, 100_000, fixed=True
+    ),
+    ParameterDeclaration(
+        "tilt_carries_away",
+        False,
+        "Whether a tilt about an axis that misses the specimen carries it away; else x and y bring it back.",
+        fixed=True,
+    ),
     # There is nothing to break, and nobody to ask.
     *motion_with(allow_motion=True, min_tilt=-1.05, min_magnification=1.0, max_magnification=1e8),
 )
@@ -216,6 +226,10 @@ class VirtualSem(SemNode):
         super().__init__("virtual_sem", _PARAMETERS)
         self._start_ns = self.get_clock().now().nanoseconds
         self._mechanics = self._stage_with_faults()
+        # Where x and y are, if a tilt does not move them.
+        self._travel_m: tuple[float, float] | None = None
+        if self.parameters["tilt_carries_away"] and self._mechanics.axis_rad is not None:
+            self._travel_m = (0.0, 0.0)
         self._random = np.random.default_rng((self.parameters["seed"], 0x57A6))
         pose, self._position = self._placed()
         self._scene = LiveScene(
@@ -317,6 +331,7 @@ class VirtualSem(SemNode):
             curvature=1.0 / radius_m if radius_m > 0.0 else 0.0,
             wave=self.parameters["grid_wave"],
             squares_sigma=self.parameters["grid_squares"],
+            extent_squares=self.parameters["grid_extent"],
         )
 
     def _placed(self) -> tuple[Pose, StagePosition | None]:
@@ -328,7 +343,11 @@ class VirtualSem(SemNode):
         if self._mechanics.axis_rad is None:
             pose = Pose.tilted(tilt, axis, rotation, (0.0, 0.0, height_m))
             return Pose(turn @ pose.R, turn @ pose.t_m), None
-        pose, position = pose_on_stage(self._mechanics, tilt, rotation, axis, height_m=height_m)
+        if self._travel_m is None:
+            pose, position = pose_on_stage(self._mechanics, tilt, rotation, axis, height_m=height_m)
+        else:
+            position = StagePosition(tilt, rotation, *self._travel_m)
+            pose = pose_at(self._mechanics, position, axis, height_m=height_m)
         position = replace(position, scan_rotation_rad=scan)
         seen = Pose(turn @ pose.R, turn @ pose.t_m)
         return seen, read_position(self._mechanics, position, self._random)
@@ -411,7 +430,11 @@ class VirtualSem(SemNode):
         for result in self.set_parameters(turned):
             if not result.successful:
                 raise MicroscopeError(result.reason)
-        if "x" in target or "y" in target:
+        if self._travel_m is not None and ("x" in target or "y" in target):
+            x_m, y_m = self._travel_m
+            self._travel_m = target.get("x", x_m), target.get("y", y_m)
+            self._set_pose(0.0)
+        elif "x" in target or "y" in target:
             # A tilt about an axis that misses the specimen has brought it back to the beam by x and y.
             now_s, before = self._now_s(), self.position()
             x, y = self._scene.stage.position_at(now_s)[0]

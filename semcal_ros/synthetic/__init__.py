@@ -59,6 +59,7 @@ from semcal_ros.synthetic.stage import (
     SimulatedStage,
     StagePosition,
     make_stage,
+    pose_at,
     pose_on_stage,
     read_position,
 )
@@ -104,6 +105,7 @@ __all__ = [
     "drift_preset",
     "make_stage",
     "parameters_of",
+    "pose_at",
     "pose_on_stage",
     "preset",
     "random_poses",

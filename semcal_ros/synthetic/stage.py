@@ -44,6 +44,7 @@ __all__ = [
     "SimulatedStage",
     "StagePosition",
     "make_stage",
+    "pose_at",
     "pose_on_stage",
     "read_position",
     "stage_views",
@@ -370,17 +371,47 @@ def pose_on_stage(
     direction = stage.axis_rad if direction_rad is None else direction_rad
     if direction is None:
         raise InvalidValueError("a stage without a tilt axis", expected="the direction of the tilt")
-    along = np.array([np.cos(direction), np.sin(direction), 0.0])
-    across = np.array([-along[1], along[0], 0.0])
-    beam = np.array([0.0, 0.0, 1.0])
-    pivot = stage.miss_m[0] * across + stage.miss_m[1] * beam
-    lean = _turn(along, tilt_rad)
-    # The stage carries the specimen to s on the tilted plane: X = lean (s - pivot) + pivot.
+    pivot, lean = _pivot_and_lean(stage, tilt_rad, direction)
     beside = np.asarray(offset_m, dtype=np.float64) - (pivot - lean @ pivot)[:2]
-    travel = np.append(np.linalg.solve(lean[:2, :2], beside), 0.0)
-    origin = lean @ (travel - pivot) + pivot + height_m * beam
-    position = StagePosition(tilt_rad, rotation_rad, float(travel[0]), float(travel[1]))
-    return Pose(lean @ _turn(beam, rotation_rad), origin), position
+    x, y = np.linalg.solve(lean[:2, :2], beside)
+    position = StagePosition(tilt_rad, rotation_rad, float(x), float(y))
+    return pose_at(stage, position, direction, height_m=height_m), position
+
+
+def pose_at(
+    stage: SimulatedStage,
+    position: StagePosition,
+    direction_rad: float,
+    *,
+    height_m: float = 0.0,
+) -> Pose:
+    """Return the specimen in the sem frame with the stage at a true position.
+
+    Parameters
+    ----------
+    stage
+        Its axis may miss the specimen, which a tilt then carries away from the beam.
+    position
+        Its tilt, rotation, x and y.
+    direction_rad
+        Direction of the tilt axis.
+    height_m
+        Height of the specimen without a tilt.
+    """
+    pivot, lean = _pivot_and_lean(stage, position.tilt_rad, direction_rad)
+    # The stage carries the specimen to s on the tilted plane: X = lean (s - pivot) + pivot.
+    travel = np.array([position.x_m, position.y_m, 0.0])
+    origin = lean @ (travel - pivot) + pivot + np.array([0.0, 0.0, height_m])
+    return Pose(lean @ _turn([0.0, 0.0, 1.0], position.rotation_rad), origin)
+
+
+def _pivot_and_lean(
+    stage: SimulatedStage, tilt_rad: float, direction_rad: float
+) -> tuple[Array, Array]:
+    along = np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])
+    across = np.array([-along[1], along[0], 0.0])
+    pivot = stage.miss_m[0] * across + stage.miss_m[1] * np.array([0.0, 0.0, 1.0])
+    return pivot, _turn(along, tilt_rad)
 
 
 def _seen(camera: ScanCamera, points: Array, scale: float) -> tuple[Array, Array]:

@@ -94,6 +94,12 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         r"hears \1 sources at once on \2: \3",
         "end all but one",
     ),
+    (
+        r"the image is (dark|even): (.*)",
+        _WARN,
+        r"sees nothing: the image is \1, \2",
+        "check beam blank, shutter and detector",
+    ),
     (r"paused", _WARN, "is paused", "press Start"),
     (r"stopped", _WARN, "is stopped", "press Start"),
     (

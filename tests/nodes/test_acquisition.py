@@ -110,6 +110,33 @@ def test_semcal_acquire_calibrates_the_virtual_microscope(tmp_path: Path) -> Non
     assert tilts == {0, 1, 2}
 
 
+def test_a_grid_that_a_tilt_carries_away_is_followed(peer: Peer) -> None:
+    """A grid of 100 um on a stage whose axis is 0.5 mm off: 40 degrees carry it by 117 um, out of the field."""
+    scene = {
+        **SEM,
+        "tilt_carries_away": True,
+        "eucentric_error_m": 5e-4,
+        "grid_extent": 20,
+        "magnification": 1500.0,
+    }
+    goal = {**GOAL, "microscope": "virtual_sem", "highest_magnification": 1500.0}
+    progress = Progress(peer)
+    images = peer.collect(Image, "image_raw")
+    stage = peer.collect(JointState, "stage", LATCHED)
+    with running("virtual_sem", scene), running("calibration_server", goal) as server:
+        peer.wait_for(lambda: len(images) > 2 and progress.messages, "frames")
+        assert peer.trigger(f"{SERVER}/acquire").success
+        ended = ("done", "failed", "stopped")
+        peer.wait_for(lambda: progress["acquisition"] in ended, "the end", timeout_s=150.0)
+        assert progress["acquisition"] == "done", server.output
+        assert (progress["taken"], progress["left_out"]) == ("12", "0")
+        way = np.array(
+            [[dict(zip(m.name, m.position, strict=True))[j] for j in "xy"] for m in stage]
+        )
+        # The axis lies along x.
+        assert np.ptp(way[:, 1]) > 5e-5
+
+
 def test_a_person_is_told_what_to_set_and_goes_on_after_a_stop(peer: Peer) -> None:
     progress = Progress(peer)
     images = peer.collect(Image, "image_raw")

@@ -47,6 +47,7 @@ def test_nodes_without_trouble_are_one_line() -> None:
         ("1 Hz; 2 publishers on /sem/image_raw: /sem/a, /sem/b", "error", "2 sources", "end"),
         ("1 Hz; other conditions: voltage 10 kV, calibrated at 5 kV", "warn", "5 kV", "check"),
         ("1 Hz; source lost, trying again: no route", "error", "lost the microscope", "computer"),
+        ("1 Hz; the image is dark: no grey level above 1", "warn", "sees nothing", "beam blank"),
         ("1 Hz; stopped", "warn", "stopped", "Start"),
         ("1 Hz; std_msgs/msg/Int32 on /sem/magnification", "error", "wrong kind", "configuration"),
         ("1 Hz; something new that nobody knows", "warn", "something new", ""),

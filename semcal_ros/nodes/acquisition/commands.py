@@ -41,7 +41,7 @@ _ANSWER_S = 120.0
 _FIND_S = 10.0
 _POLL_S = 0.05
 # A little less than the longest way that `microscope` does in one command by default.
-_STEPS_RAD = {"tilt": 0.3, "rotation": 0.75}
+_STEPS_RAD = {"tilt": 0.3, "rotation": 0.75, "scan_rotation": math.inf}
 
 
 class MicroscopeCommands:
@@ -75,13 +75,18 @@ class MicroscopeCommands:
         self._text = ""
         self._magnification = endpoints.stream_publisher(Float64, f"{name}/set_magnification")
         self._move = endpoints.stream_publisher(JointState, f"{name}/move_stage")
+        group = MutuallyExclusiveCallbackGroup()
         self._motion = endpoints.subscribe(
-            DiagnosticStatus,
-            f"{name}/motion",
-            self._on_motion,
-            latched(),
-            MutuallyExclusiveCallbackGroup(),
+            DiagnosticStatus, f"{name}/motion", self._on_motion, latched(), group
         )
+        self._place: tuple[float, float] | None = None
+        self._joints = endpoints.subscribe(
+            JointState, self._stage.topic, self._on_stage, latched(), group
+        )
+
+    def place(self) -> tuple[float, float] | None:
+        """Return x and y of the stage, m; None for a stage that does not tell them."""
+        return self._place
 
     def set_magnification(self, magnification: float) -> None:
         """Set the magnification; raises :class:`MicroscopeError` if that is refused or fails."""
@@ -98,7 +103,7 @@ class MicroscopeCommands:
         Parameters
         ----------
         target
-            Position of each joint, rad.
+            Position of each joint, rad or m.
         current
             Where they are, as far as that is known.
 
@@ -123,9 +128,24 @@ class MicroscopeCommands:
             part = step / max(steps, 1)
             place = {joint: start + part * (to - start) for joint, (start, to) in ways.items()}
             names = [getattr(self._stage, joint) for joint in place]
-            told = ", ".join(f"{joint} {math.degrees(at):.1f} deg" for joint, at in place.items())
+            told = ", ".join(
+                f"{joint} {math.degrees(at):.1f} deg"
+                if joint in _STEPS_RAD
+                else f"{joint} {1e6 * at:.1f} um"
+                for joint, at in place.items()
+            )
             message = JointState(name=names, position=list(place.values()))
             self._ask(self._move, message, "move_stage", told)
+
+    def _on_stage(self, message: Any, _info: Any) -> None:
+        try:
+            joints = dict(zip(message.name, message.position, strict=True))
+            x, y = float(joints[self._stage.x]), float(joints[self._stage.y])
+        except (KeyError, TypeError, ValueError):
+            # What is wrong with it is said where the angles are read.
+            self._place = None
+        else:
+            self._place = (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
     def _on_motion(self, message: Any, _info: Any) -> None:
         with self._changed:

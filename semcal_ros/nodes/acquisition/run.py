@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
 from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
+from semcal_ros.nodes.acquisition.follow import GridFollower, Lookout, Posture
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
 __all__ = ["ACQUISITION", "AcquisitionRun", "Progress", "ViewTaker", "describe_request", "goal_of"]
@@ -152,11 +153,8 @@ class Progress:
     largest: float = math.nan
 
 
-class ViewTaker(Protocol):
+class ViewTaker(Lookout, Protocol):
     """What looks at the pictures and calibrates; all calls may last, and end by ``still_wanted`` of the run."""
-
-    def wait_for_pictures(self, count: int) -> None:
-        """Return after so many more pictures; raises :class:`MicroscopeError` if they stay away."""
 
     def take(self, request: ViewRequest) -> str:
         """Make a view of the newest picture, and say which; raises :class:`CalibrationError` with what is wrong."""
@@ -208,6 +206,9 @@ class AcquisitionRun:
         self._requested: list[ViewRequest] = []
         self._left_out = 0
         self._in_a_row = 0
+        self._follower = None
+        if commands is not None:
+            self._follower = GridFollower(taker, commands, lambda text: self._show("running", text))
         self._visit = -1
         self._magnification = math.nan
         self.progress = Progress("stopped", "not begun", planned=len(self._waiting))
@@ -264,7 +265,7 @@ class AcquisitionRun:
             self._refuse_unwanted()
             again = f" (again: {fault})" if fault else ""
             self._show("running", f"{described}{again}")
-            self._go(request, self._commands)
+            posture = self._go(request, self._commands)
             self._taker.wait_for_pictures(_PICTURES + attempt)
             try:
                 self._show("running", self._taker.take(request))
@@ -272,7 +273,14 @@ class AcquisitionRun:
                 fault = str(error)
             else:
                 self._in_a_row = 0
+                if self._follower is not None:
+                    self._follower.remember(posture)
                 return
+            if attempt + 1 < _ATTEMPTS and self._follower is not None:
+                try:
+                    self._follower.bring_back(request, posture)
+                except CalibrationError as error:
+                    fault = str(error)
         self._left_out += 1
         self._in_a_row += 1
         if self._in_a_row >= _MOST_LEFT_OUT:
@@ -282,7 +290,7 @@ class AcquisitionRun:
             )
         self._show("running", f"left out: {fault}")
 
-    def _go(self, request: ViewRequest, commands: MicroscopeCommands) -> None:
+    def _go(self, request: ViewRequest, commands: MicroscopeCommands) -> Posture:
         g = request.magnification
         if request.visit != self._visit:
             if g == self._magnification:
@@ -307,3 +315,4 @@ class AcquisitionRun:
             # Where it stands is not known.
             self._visit = -1
             raise
+        return target

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -31,6 +32,7 @@ from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
+from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.middleware.message_types import message_class
@@ -44,7 +46,14 @@ from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.frames.source_timestamps import SourceTimestamps
 
-__all__ = ["FrameInput", "StreamFrame", "StreamNode", "is_late", "nominal_camera"]
+__all__ = [
+    "FrameInput",
+    "StreamFrame",
+    "StreamNode",
+    "describe_darkness",
+    "is_late",
+    "nominal_camera",
+]
 
 # The camera stays the same from frame to frame as long as the magnification does.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
@@ -53,6 +62,11 @@ nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
 # then, and the node is not merely half an interval behind. 40 ms: a person does not notice such a delay, and in a fast
 # stream the scheduling of other processes delays images by as much without the node being too slow.
 _LATE_S, _LATE_INTERVALS = 0.04, 1.5
+# How often an image is looked at whether it shows anything, and at how many of its pixels: cheap, and soon enough.
+_LOOK_S, _LOOKED_AT = 0.5, 1 << 14
+# Grey levels, by bytes per pixel, that the noise of a detector without a beam may reach: of 8 bits two, and as much of
+# the 10 bits or more that fill the lower part of 16.
+_DARKEST = {1: 2, 2: 8}
 # Images per turn of the executor; then timers and services get their turn.
 _AT_ONCE = 8
 
@@ -97,6 +111,24 @@ class StreamFrame:
     def size(self) -> tuple[int, int]:
         """(width, height) in px."""
         return self.image.shape[1], self.image.shape[0]
+
+
+def describe_darkness(image: AnyImage) -> str:
+    """Say that an image shows nothing at all; empty if it shows something.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3) grey levels. Of a large one, a part of the pixels is looked at.
+    """
+    step = max(1, math.isqrt(image.shape[0] * image.shape[1] // _LOOKED_AT))
+    sample = image[::step, ::step]
+    least, greatest = sample.min(), sample.max()
+    if least == greatest:
+        return f"the image is even: all grey levels are {greatest:g}"
+    if image.dtype.kind == "u" and greatest <= _DARKEST.get(image.dtype.itemsize, 0):
+        return f"the image is dark: no grey level above {greatest:g}"
+    return ""
 
 
 def is_late(waited_s: float, interval_s: float) -> bool:
@@ -171,6 +203,8 @@ class FrameInput:
         self._sent_ns: int | None = None
         self._last_interval_s = 0.0
         self._mixed = 0
+        self._dark = ""
+        self._looked_s = -_LOOK_S
 
     def _on_images(self, message: Any, info: MessageInfo) -> None:
         """Process the images that have arrived, oldest first, but skip late ones if there are newer ones.
@@ -235,7 +269,20 @@ class FrameInput:
         self._mixed += mixed
         self._reporter.note("magnification", "unknown" if g is None else g)
         self._reporter.note("frames_mixed", self._mixed)
+        self._look_for_light(image)
         return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
+
+    def _look_for_light(self, image: AnyImage) -> None:
+        """Check now and then whether there is any picture: a blanked beam still gives frames."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = now_s
+        before, self._dark = self._dark, describe_darkness(image)
+        if self._dark and not before:
+            self._reporter.warn(f"{self._dark}; check beam blank, shutter and detector")
+        elif before and not self._dark:
+            self._reporter.info("the image has contrast again")
 
     def _check_transport(self, image_bytes: int) -> None:
         """Check whether this process is set up for images of this size."""
@@ -258,8 +305,8 @@ class FrameInput:
         return bool(self._images.rivals or self._magnification.rivals)
 
     def conditions(self) -> list[str]:
-        """Return, in a few words, whether the images are too large for the transport."""
-        return [self._transport] * bool(self._transport)
+        """Return, in a few words, whether the images are too large for the transport, or show nothing."""
+        return [text for text in (self._transport, self._dark) if text]
 
 
 class StreamNode(SemNode):

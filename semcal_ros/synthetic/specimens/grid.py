@@ -108,6 +108,8 @@ class GridFaults:
         Amplitude of a displacement of the rows in parts of a square, and its period in squares.
     squares_sigma
         Spread of the relative error of each size of squares.
+    extent_squares
+        Squares a side, around the origin, beyond which there is bare substrate; 0 for an endless grid.
     """
 
     stretch: float = 0.0
@@ -116,6 +118,7 @@ class GridFaults:
     wave: float = 0.0
     wave_squares: float = 12.0
     squares_sigma: float = 0.0
+    extent_squares: int = 0
 
     def __post_init__(self) -> None:
         parts = ("stretch", "shear", "wave", "squares_sigma")
@@ -249,6 +252,9 @@ class ChessGrid:
         width = np.hypot(footprint_m[:, 0], footprint_m[:, 1]) / self.square_m
         product = _filter_wave(x_m / self.square_m, float(width[0]))
         product *= _filter_wave(y_m / self.square_m, float(width[1]))
+        if (extent := self.faults.extent_squares) > 0:
+            half_m = 0.5 * extent * self.square_m
+            product[(np.abs(x_m) > half_m) | (np.abs(y_m) > half_m)] = 0.0
         product *= 0.5
         product += 0.5
         return product

@@ -20,11 +20,18 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame, StreamNode, is_late
+from semcal_ros.nodes.frames.stream import (
+    FrameInput,
+    StreamFrame,
+    StreamNode,
+    describe_darkness,
+    is_late,
+)
 from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import image_message, magnification_message, texture
 
@@ -77,12 +84,12 @@ class Bench:
         topic = self.endpoints.subscriptions["magnification"]
         topic.callback(magnification_message(value), info)
 
-    def receive(self, *sent_s: float, waited_s: float = 0.0) -> None:
+    def receive(self, *sent_s: float, waited_s: float = 0.0, image: np.ndarray = IMAGE) -> None:
         """Images that were sent at these times and have waited here for that long, all there at once."""
         received_ns = time.time_ns() - round(waited_s * 1e9)
         messages = [
             (
-                image_message(IMAGE, sent),
+                image_message(image, sent),
                 {"source_timestamp": round(sent * 1e9), "received_timestamp": received_ns},
             )
             for sent in sent_s
@@ -159,6 +166,43 @@ def test_a_microscope_that_says_nothing_after_its_restart_is_believed_again_afte
     monkeypatch.setattr("semcal_ros.nodes.frames.magnification.time.monotonic", lambda: now_s + 4.5)
     bench.receive(1.3)
     assert [frame.magnification for frame in bench.frames] == [1000.0, None, None, 1000.0]
+
+
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (IMAGE, ""),
+        (np.full((32, 32), 130, dtype=np.uint8), "even: all grey levels are 130"),
+        # Noise of a detector without a beam.
+        (np.arange(1024).reshape(32, 32).astype(np.uint8) % 3, "dark: no grey level above 2"),
+        (np.arange(1024).reshape(32, 32).astype(np.uint16) % 9, "dark: no grey level above 8"),
+        # A dim picture of 12 bits.
+        (np.arange(1024).reshape(32, 32).astype(np.uint16) % 64, ""),
+        # A label across a large image is seen although not all of it is looked at.
+        (np.kron(IMAGE, np.ones((40, 40), dtype=np.uint8)), ""),
+        (np.zeros((32, 32, 3), dtype=np.uint8), "even: all grey levels are 0"),
+    ],
+)
+def test_an_image_without_a_picture_is_told(image: np.ndarray, said: str) -> None:
+    assert describe_darkness(image) == (f"the image is {said}" if said else "")
+
+
+def test_a_blanked_beam_is_told_and_its_end_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    now_s = [100.0]
+    monkeypatch.setattr("semcal_ros.nodes.frames.stream.time.monotonic", lambda: now_s[0])
+    blank = np.zeros((32, 32), dtype=np.uint8)
+    for image in (IMAGE, blank, blank, IMAGE):
+        now_s[0] += 1.0
+        bench.receive(now_s[0], image=image)
+        dark = [text for text in bench.input.conditions() if "the image is even" in text]
+        assert len(dark) == (image is blank)
+    # It is a frame all the same, and once is enough to say it.
+    assert len(bench.frames) == 4
+    assert bench.log == [
+        "the image is even: all grey levels are 0; check beam blank, shutter and detector",
+        "the image has contrast again",
+    ]
 
 
 def test_one_turn_of_the_executor_is_bounded() -> None:
