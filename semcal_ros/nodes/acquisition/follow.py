@@ -156,10 +156,12 @@ class GridFollower:
         # The tilt shortens one direction, which the next look corrects.
         scale = request.magnification * _turn(posture.get("scan_rotation", 0.0))
         for _ in range(_MOST_MOVES):
-            if self._px_per_m is None:
-                self._px_per_m = np.linalg.solve(scale, self._learn(request, seen))
+            learned = self._px_per_m
+            if learned is None:
+                learned = np.asarray(np.linalg.solve(scale, self._learn(request, seen)))
+                self._px_per_m = learned
                 seen = self._seen()
-            px_per_m = scale @ self._px_per_m
+            px_per_m: Array = scale @ learned
             way = find_stage_move(seen, px_per_m)
             # Never farther than the image: what is seen cannot be off by more.
             longest = float(max(seen.image_size)) / float(np.linalg.norm(px_per_m, 2))
