@@ -47,6 +47,7 @@ from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
+    invert_symmetric,
     prepare_geometry,
     solve_step,
     squared_residuals,
@@ -274,12 +275,11 @@ def _align(
 ) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift with the common gradient of enough pixels."""
     shift = np.asarray(start_px, dtype=np.float64)
-    mean = float(image.at(levels[0].factor).mean(dtype=np.float64))
     passes = 0
     for level in levels[:-1]:
         hessian = None
         for _ in range(_MAX_COARSE_PASSES):
-            comparison = _compare(level, image, shift / level.factor, mean, hessian, enough)
+            comparison = _compare(level, image, shift / level.factor, hessian, enough)
             if isinstance(comparison, Rejection):
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
@@ -289,7 +289,7 @@ def _align(
                 break
     hessian = None
     for _ in range(_MAX_PASSES):
-        comparison = _compare(levels[-1], image, shift / levels[-1].factor, mean, hessian, enough)
+        comparison = _compare(levels[-1], image, shift / levels[-1].factor, hessian, enough)
         if isinstance(comparison, Rejection):
             return comparison
         passes += 1
@@ -312,13 +312,12 @@ def _compare(
     level: PyramidLevel,
     image: Pyramid,
     shift: Array,
-    mean: float,
     hessian: Array | None,
     enough: int = HESSIAN_PIXELS,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
     comparison, None to compute it from enough pixels."""
-    pixels = image.at(level.factor)
+    pixels = image.centred(level.factor)
     size = pixels.shape[1], pixels.shape[0]
     window = tile_window(level, size, shift)
     if window is None:
@@ -326,24 +325,22 @@ def _compare(
         reason = f"too little overlap ({100.0 * shared:.0f} % of the image)"
         return Rejection(MatchFailure.TOO_LITTLE_OVERLAP, reason)
     geometry = prepare_geometry(level, window)
-    sums = tile_sums(level, window, pixels, shift, mean, hessian, enough)
+    sums = tile_sums(level, window, pixels, shift, hessian, enough)
     fit = solve_step(geometry, sums)
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
         return _find_chance_gradient(level, geometry, information, enough) or Rejection(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
-    return _Comparison(level, window, geometry, sums, fit, shift, size, mean)
+    return _Comparison(level, window, geometry, sums, fit, shift, size, image.mean)
 
 
 def _find_chance_gradient(
     level: PyramidLevel, geometry: TileGeometry, information: Array, enough: int
 ) -> Rejection[MatchFailure] | None:
     """Reject images that have no more gradient in common than chance gives, in one direction or all."""
-    energy = geometry.normal_matrices.sum(axis=0)[:2, :2] * np.outer(
-        geometry.gradient_share, geometry.gradient_share
-    )
-    pixels = min(float(geometry.normal_matrices[:, 3, 3].sum()), float(enough))
+    energy = geometry.total[:2, :2] * np.outer(geometry.gradient_share, geometry.gradient_share)
+    pixels = min(float(geometry.total[3, 3]), float(enough))
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
     values, vectors = np.linalg.eigh(information)
@@ -378,7 +375,7 @@ def _covariance(comparison: _Comparison) -> Array:
     """(2, 2) covariance from the scatter of the blocks' scores, whatever the colour and the strength
     of the noise.
     """
-    inverse = np.asarray(np.linalg.inv(comparison.fit.information), dtype=np.float64)
+    inverse = invert_symmetric(comparison.fit.information)
     return _robust_covariance(comparison, comparison.fit.scores, inverse)
 
 
@@ -409,7 +406,7 @@ def _summarise(
     comparison: _Comparison, covariance: Array, converged: bool, passes: int
 ) -> Alignment:
     level, fit = comparison.level, comparison.fit
-    whole = comparison.geometry.normal_matrices.sum(axis=0)
+    whole = comparison.geometry.total
     cross = comparison.sums.cross.reshape(-1, 4).sum(axis=0)
     pixels = float(whole[3, 3])
     error = float(squared_residuals(comparison.geometry, comparison.sums, fit).sum())
@@ -447,11 +444,11 @@ def _overlap_fraction(reference: tuple[int, int], image: tuple[int, int], shift:
 
 def _tile_information(comparison: _Comparison) -> Array:
     """(tiles, 2, 2) each tile's part of the information, in the proportion of its gradients."""
-    own = comparison.geometry.normal_matrices[:, :2, :2]
-    scale = np.sqrt(np.diag(comparison.fit.information) / np.diag(own.sum(axis=0)))
+    own, information = comparison.geometry.tile_energies, comparison.fit.information
+    scale = np.sqrt(np.diag(information))
     tiles = own * np.outer(scale, scale)
     # The products of x and y: those of the common information, spread evenly.
-    missing = comparison.fit.information[0, 1] - tiles[:, 0, 1].sum()
+    missing = information[0, 1] - tiles[:, 0, 1].sum()
     tiles[:, 0, 1] += missing / len(tiles)
     tiles[:, 1, 0] = tiles[:, 0, 1]
     return np.asarray(tiles)
@@ -465,23 +462,24 @@ def _compare_halves(
     if comparison.geometry.has_constant_gain:
         # The halves of a lone particle tell nothing without each other.
         return difference, variance
-    cols = comparison.window.cols.stop - comparison.window.cols.start
-    scores, shape = comparison.fit.scores, (-1, cols)
-    whole, total = comparison.fit.information, scores.sum(axis=0)
+    rows, cols = len(comparison.window.y), len(comparison.window.x)
+    whole = comparison.fit.information
+    scores = comparison.fit.scores.reshape(rows, cols, 2)
     # The variance of the whole exceeds that of white noise by the same factor as that of its halves.
-    colour = np.diag(covariance) / np.diag(np.linalg.inv(whole))
-    on_grid, scores_on_grid = weights.reshape(*shape, 2, 2), scores.reshape(*shape, 2)
-    rows = len(on_grid)
+    colour = np.diag(covariance) / np.diag(invert_symmetric(whole))
+    on_grid = weights.reshape(rows, cols, 2, 2)
+    weights_by_col, scores_by_col = (np.add.reduce(a, axis=0) for a in (on_grid, scores))
+    weights_by_row, scores_by_row = (np.add.reduce(a, axis=1) for a in (on_grid, scores))
+    total = scores_by_col.sum(axis=0)
     halves = (
-        (on_grid[:, : cols // 2], scores_on_grid[:, : cols // 2]),
-        (on_grid[: rows // 2], scores_on_grid[: rows // 2]),
+        (weights_by_col[: cols // 2], scores_by_col[: cols // 2]),
+        (weights_by_row[: rows // 2], scores_by_row[: rows // 2]),
     )
     for k, (half_weights, half_scores) in enumerate(halves):
-        half = half_weights.sum(axis=(0, 1))
+        half, score = half_weights.sum(axis=0), half_scores.sum(axis=0)
         if not (well_posed(half) and well_posed(whole - half)):
             continue
-        score = half_scores.sum(axis=(0, 1))
-        inverses = np.linalg.inv(half), np.linalg.inv(whole - half)
+        inverses = invert_symmetric(half), invert_symmetric(whole - half)
         difference[k] = -inverses[0] @ score + inverses[1] @ (total - score)
         variance[k] = (np.diag(inverses[0]) + np.diag(inverses[1])) * colour
     return difference, variance
@@ -489,24 +487,32 @@ def _compare_halves(
 
 def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
-    cols = comparison.window.cols.stop - comparison.window.cols.start
-    y = np.repeat(comparison.window.y, cols)
-    powers = np.stack([np.ones_like(y), y], axis=1)
+    rows, cols = len(comparison.window.y), len(comparison.window.x)
+    # The shift is the same for all tiles of a row.
+    by_row = np.add.reduce(weights.reshape(rows, cols, 2, 2), axis=1)
+    powers = np.stack([np.ones(rows), comparison.window.y], axis=1)
     pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
-    whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
+    whole = (by_row.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
-    if len(comparison.window.y) < _MIN_SHEAR_ROWS or np.linalg.cond(scaled) > _MAX_CONDITION:
+    if rows < _MIN_SHEAR_ROWS or not _well_conditioned(scaled):
         return np.full(4, np.nan), np.full((4, 4), np.inf)
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 4)
-    step = -inverse @ scores.sum(axis=0)
+    scores = comparison.fit.scores.reshape(rows, cols, 2)
+    step = -inverse @ (powers.T @ np.add.reduce(scores, axis=1)).ravel()
     joint = np.append(comparison.shift + step[:2], step[2:])
     # What the step explains is not noise.
-    explained = np.einsum("tij,tj->ti", weights, powers @ step.reshape(2, 2))
-    residual = comparison.fit.scores + explained
-    scores = (powers[:, :, None] * residual[:, None, :]).reshape(-1, 4)
-    return joint, _robust_covariance(comparison, scores, inverse)
+    steps = powers @ step.reshape(2, 2)
+    explained = weights.reshape(rows, cols, 2, 2) @ steps[:, None, :, None]
+    residual = scores + explained[..., 0]
+    tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
+    return joint, _robust_covariance(comparison, tilted.reshape(-1, 4), inverse)
+
+
+def _well_conditioned(matrix: Array) -> bool:
+    """Whether the eigenvalues of a symmetric matrix are not too different."""
+    values = np.abs(np.linalg.eigvalsh(matrix))
+    return bool(values.max() <= _MAX_CONDITION * values.min())
 
 
 def _measure_row_power(comparison: _Comparison, modes: int) -> Array | None:
@@ -547,7 +553,7 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 3, 3)
     information = whole.transpose(2, 0, 3, 1).reshape(6, 6)
     scaled, scale = equilibrate(information)
-    if np.linalg.cond(scaled) > _MAX_CONDITION:
+    if not _well_conditioned(scaled):
         return None
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 6)
@@ -573,8 +579,7 @@ def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array)
     For comparing competing shifts of the same two images: a paired test over tiles tells whether one
     explains the image better than chance and model error allow.
     """
-    mean = float(image.at(level.factor).mean(dtype=np.float64))
-    comparison = _compare(level, image, shift_px / level.factor, mean, None)
+    comparison = _compare(level, image, shift_px / level.factor, None)
     if isinstance(comparison, Rejection):
         return None
     energies = np.full(level.normal_matrices.shape[:2], np.nan)

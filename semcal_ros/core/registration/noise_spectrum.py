@@ -90,12 +90,26 @@ def _rings(rows: int, cols: int) -> tuple[Array, Indices, Array, Array]:
     return window, ring, middle, count
 
 
-def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
-    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
+@lru_cache(maxsize=8)
+def _corners(rows: int, cols: int) -> tuple[Array, Array, Indices, float]:
+    """Window, the same with the sum 1, indices of the coefficients that hold noise only, and the window's
+    energy.
+    """
+    window, ring, middle, _ = _rings(rows, cols)
+    corners = np.flatnonzero(middle[ring] > _NOISE_BAND * np.pi)
+    return window, window / window.sum(), corners, float(np.sum(window**2))
+
+
+def _cut_middle(image: AnyImage, crop_px: int) -> Array:
     rows, cols = min(image.shape[0], crop_px), min(image.shape[1], crop_px)
     top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
-    crop = image[top : top + rows, left : left + cols].astype(np.float64)
-    window, ring, middle, count = _rings(rows, cols)
+    return image[top : top + rows, left : left + cols].astype(np.float64)
+
+
+def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
+    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
+    crop = _cut_middle(image, crop_px)
+    window, ring, middle, count = _rings(*crop.shape)
     crop = (crop - float(np.sum(crop * window) / window.sum())) * window
     spectrum = scipy.fft.rfft2(crop).ravel()
     power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
@@ -112,7 +126,12 @@ def _noise_floor(w: Array, power: Array, count: Array) -> float:
 
 def estimate_noise_variance(image: AnyImage) -> float:
     """Variance of the white part of ``image`` per pixel, from its middle."""
-    return _noise_floor(*_radial_spectrum(image, _NOISE_CROP_PX))
+    crop = _cut_middle(image, _NOISE_CROP_PX)
+    # Of the spectrum, only its corners.
+    window, weights, corners, energy = _corners(*crop.shape)
+    crop = (crop - float(np.vdot(crop, weights))) * window
+    noise = scipy.fft.rfft2(crop).take(corners)
+    return float(np.vdot(noise, noise).real) / (len(corners) * energy)
 
 
 def measure_image(
@@ -161,6 +180,7 @@ def _find_signal(power: Array, noise: float, count: Array) -> Array:
     return np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
 
 
+@lru_cache(maxsize=32)
 def gaussian_taps(sigma_px: float) -> Array:
     """Odd number of weights of a Gaussian, summing to one; ``[1]`` for sigma 0."""
     if sigma_px <= 0.0:

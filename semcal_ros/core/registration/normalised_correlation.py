@@ -50,6 +50,8 @@ _MIN_HEIGHT = 0.5
 _MAX_PEAKS = 8
 # Shading is what is broader than an eighth of the field; a blur by a 16th of it keeps that.
 _SHADING_PARTS = 16.0
+# A maximum is higher than what lies around it.
+_NEIGHBOURS = np.ones((5, 5), np.uint8)
 # Fewer samples along an axis do not make a correlation.
 _MIN_SAMPLES = 4.0
 # Reductions times sizes of images for which the reference's part of a surface is kept: the sizes
@@ -86,12 +88,27 @@ class CoarsePeak:
 
 @dataclass(frozen=True)
 class _SurfacePart:
-    """What one image contributes to the surface of a pair of sizes."""
+    """What one image contributes to the surface of a pair of sizes: its spectrum, and the sum and the standard
+    deviation (times the root of their number) of the samples that overlap at each shift.
+    """
 
-    reduced: Image
     spectrum: NDArray[np.complex64]
     sums: Image
     deviation: Image
+
+
+@dataclass(frozen=True)
+class _ReferencePart:
+    """The same of the reference, as the surface uses it.
+
+    ``spectrum`` is conjugate, ``means`` are those of what overlaps, ``weight`` turns products into scores, and
+    is 0 where too little overlaps.
+    """
+
+    shape: tuple[int, ...]
+    spectrum: NDArray[np.complex64]
+    means: Image
+    weight: Image
 
 
 @dataclass(frozen=True)
@@ -99,19 +116,20 @@ class _SurfaceGeometry:
     """What a surface looks like for two sizes.
 
     ``reference_spans`` and ``image_spans`` are the first and last-plus-one samples of reference and
-    image that overlap at each shift (rows, then columns), ``count`` (rows, cols) the number of
-    overlapping samples, ``root`` its square root, ``allowed`` whether it is enough, ``size`` that
-    of the Fourier transforms.
+    image that overlap at each shift (rows, then columns), ``per_count`` (rows, cols) one over the number of
+    overlapping samples, ``root`` the square root of that number, ``allowed`` whether it is enough, ``size`` that
+    of the Fourier transforms. ``sampled`` are the indices of an eighth of the allowed shifts.
     """
 
     shift_x: Indices
     shift_y: Indices
     reference_spans: tuple[tuple[Indices, ...], tuple[Indices, ...]]
     image_spans: tuple[tuple[Indices, ...], tuple[Indices, ...]]
-    count: Image
+    per_count: Image
     root: Image
     allowed: Mask
     size: tuple[int, int]
+    sampled: Indices
 
 
 @dataclass(frozen=True)
@@ -129,11 +147,11 @@ class CoarseReference:
 
     pyramid: Pyramid
     min_overlap: float
-    _parts: LruCache[tuple[int, tuple[int, ...]], _SurfacePart | None] = field(
+    _parts: LruCache[tuple[int, tuple[int, ...]], _ReferencePart | None] = field(
         default_factory=lambda: LruCache(_KEPT_PARTS), repr=False, compare=False
     )
 
-    def part(self, factor: int, image_shape: tuple[int, ...]) -> _SurfacePart | None:
+    def part(self, factor: int, image_shape: tuple[int, ...]) -> _ReferencePart | None:
         """The reference's part of the surface for one reduction and one size of reduced image; None
         where no shift overlaps enough.
         """
@@ -141,12 +159,16 @@ class CoarseReference:
             (factor, image_shape), lambda: self._prepare(factor, image_shape)
         )
 
-    def _prepare(self, factor: int, image_shape: tuple[int, ...]) -> _SurfacePart | None:
+    def _prepare(self, factor: int, image_shape: tuple[int, ...]) -> _ReferencePart | None:
         small = remove_shading(self.pyramid.at(factor))
         geometry = _plan_surface(small.shape, image_shape, self.min_overlap)
         if geometry is None:
             return None
-        return _prepare_part(small, geometry, *geometry.reference_spans)
+        part = _prepare_part(small, geometry, *geometry.reference_spans)
+        # The spread of a chance correlation grows as the overlap shrinks.
+        weight = np.where(geometry.allowed, geometry.root / part.deviation, np.float32(0.0))
+        means = part.sums * geometry.per_count
+        return _ReferencePart(small.shape, np.conj(part.spectrum), means, weight)
 
 
 def find_coarse_peaks(
@@ -198,19 +220,18 @@ def _find_peaks_at(
     reference_part = reference.part(factor, small.shape)
     if reference_part is None:
         return []
-    geometry = _plan_surface(reference_part.reduced.shape, small.shape, reference.min_overlap)
+    geometry = _plan_surface(reference_part.shape, small.shape, reference.min_overlap)
     assert geometry is not None
     image_part = _prepare_part(small, geometry, *geometry.image_spans)
-    ncc = _correlate(reference_part, image_part, geometry)
-    # The spread of a chance correlation grows as the overlap shrinks.
-    score = ncc * geometry.root
+    score = _score(reference_part, image_part, geometry)
     top = float(score.max())
     if not top > 0.0:
         return []
-    searched = score[::4, ::2][geometry.allowed[::4, ::2]]
+    searched = score.take(geometry.sampled)
     spread = mad_sigma(searched - np.median(searched))
-    local = cv2.dilate(score, np.ones((5, 5), np.uint8)) <= score
-    rows, cols = np.nonzero(local & (score >= np.float32(_MIN_HEIGHT * top)))
+    local = cv2.dilate(score, _NEIGHBOURS) <= score
+    local &= score >= np.float32(_MIN_HEIGHT * top)
+    rows, cols = np.divmod(np.flatnonzero(local), score.shape[1])
     highest = np.argsort(-score[rows, cols], kind="stable")
     origin = int(geometry.shift_x[0]), int(geometry.shift_y[0])
     distances = np.hypot(
@@ -224,7 +245,8 @@ def _find_peaks_at(
         fine_row, fine_col = _interpolate_vertex(score, int(row), int(col))
         shift = ((fine_col + origin[0]) * factor, (fine_row + origin[1]) * factor)
         height = float(score[row, col]) / max(spread, 1e-12)
-        peaks.append(CoarsePeak(shift, float(ncc[row, col]), height, float(factor)))
+        correlation = float(score[row, col] / geometry.root[row, col])
+        peaks.append(CoarsePeak(shift, correlation, height, float(factor)))
     return peaks
 
 
@@ -272,6 +294,9 @@ def _plan_surface(
     ]
     count = np.outer(last_y - first_y, last_x - first_x).astype(np.float64)
     smaller = float(min(reference[0] * reference[1], image[0] * image[1]))
+    allowed = count >= min_overlap * smaller
+    sampled = np.zeros_like(allowed)
+    sampled[::4, ::2] = allowed[::4, ::2]
     return _SurfaceGeometry(
         shift_x=shift_x,
         shift_y=shift_y,
@@ -280,10 +305,11 @@ def _plan_surface(
             (first_y + shift_y, last_y + shift_y),
             (first_x + shift_x, last_x + shift_x),
         ),
-        count=count.astype(np.float32),
+        per_count=(1.0 / count).astype(np.float32),
         root=np.sqrt(count).astype(np.float32),
-        allowed=count >= min_overlap * smaller,
+        allowed=allowed,
         size=(size[0], size[1]),
+        sampled=np.flatnonzero(sampled),
     )
 
 
@@ -297,14 +323,10 @@ def _prepare_part(
     # Shading was removed, so that single precision is enough for differences of the sums.
     sums = _sum_boxes(np.asarray(table, dtype=np.float32), rows, cols)
     energies = _sum_boxes(np.asarray(squares, dtype=np.float32), rows, cols)
-    variance = energies - sums**2 / geometry.count
-    floor = 1e-9 * max(float(variance.max()), 1e-30)
-    return _SurfacePart(
-        image,
-        scipy.fft.rfft2(image, geometry.size),
-        sums,
-        np.sqrt(np.maximum(variance, np.float32(floor))),
-    )
+    energies -= sums * sums * geometry.per_count
+    floor = 1e-9 * max(float(energies.max()), 1e-30)
+    deviation = np.sqrt(np.maximum(energies, np.float32(floor)))
+    return _SurfacePart(scipy.fft.rfft2(image, geometry.size), sums, deviation)
 
 
 def _sum_boxes(
@@ -319,12 +341,25 @@ def _sum_boxes(
     return np.asarray(sums.T)
 
 
-def _correlate(reference: _SurfacePart, image: _SurfacePart, geometry: _SurfaceGeometry) -> Image:
-    """Correlation coefficients at all shifts; 0 where too little overlaps."""
-    size = geometry.size
-    wrapped = scipy.fft.irfft2(image.spectrum * np.conj(reference.spectrum), size)
-    cross = wrapped[geometry.shift_y % size[0]][:, geometry.shift_x % size[1]]
-    cross -= reference.sums * image.sums / geometry.count
-    cross /= reference.deviation * image.deviation
-    cross[~geometry.allowed] = 0.0
-    return np.asarray(cross, dtype=np.float32)
+def _score(reference: _ReferencePart, image: _SurfacePart, geometry: _SurfaceGeometry) -> Image:
+    """Correlation coefficients at all shifts, times the root of the number of samples; 0 where too little
+    overlaps.
+    """
+    wrapped = scipy.fft.irfft2(image.spectrum * reference.spectrum, geometry.size)
+    # Negative shifts are at the end.
+    below_y, below_x = -int(geometry.shift_y[0]), -int(geometry.shift_x[0])
+    above_y, above_x = len(geometry.shift_y) - below_y, len(geometry.shift_x) - below_x
+    if min(below_y, below_x, above_y, above_x) < 1:
+        # Neither image contains all of the other one's overlaps.
+        rows, cols = geometry.shift_y % geometry.size[0], geometry.shift_x % geometry.size[1]
+        cross = wrapped[rows][:, cols]
+    else:
+        cross = np.empty(geometry.root.shape, dtype=np.float32)
+        cross[:below_y, :below_x] = wrapped[-below_y:, -below_x:]
+        cross[:below_y, below_x:] = wrapped[-below_y:, :above_x]
+        cross[below_y:, :below_x] = wrapped[:above_y, -below_x:]
+        cross[below_y:, below_x:] = wrapped[:above_y, :above_x]
+    cross -= reference.means * image.sums
+    cross /= image.deviation
+    cross *= reference.weight
+    return np.asarray(cross)

@@ -21,6 +21,7 @@ gradient is made orthogonal to them, and only a shift explains what remains of i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindo
 __all__ = [
     "TileFit",
     "TileGeometry",
+    "invert_symmetric",
     "prepare_geometry",
     "solve_step",
     "squared_residuals",
@@ -43,6 +45,8 @@ _MIN_GRADIENT_ENERGY = 0.5
 # Sums of single-precision pixels are good to 1e-7 and no better: what is below is rounding.
 _RCOND = 1e-9
 _MIN_DETERMINANT = 1e-6
+# Numbers of tiles for which the ramps are kept: those of a few windows at each resolution.
+_MAX_SHAPES = 32
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class TileGeometry:
         (2, 2 p) coefficients by which gain and offset explain the gradient.
     gradient_share
         (2,) fraction of the gradient's RMS that they do not explain.
+    total
+        (4, 4) sum of the normal matrices.
     """
 
     normal_matrices: Array
@@ -69,6 +75,27 @@ class TileGeometry:
     inverse: Array
     projection: Array
     gradient_share: Array
+    total: Array
+
+    @cached_property
+    def explained(self) -> tuple[Array, Array]:
+        """(n, 2) parts of the gradient that gain and offset explain, in grey levels and in ones."""
+        count = self.ramps.shape[1]
+        gain, offset = self.projection[:, :count], self.projection[:, count:]
+        return self.ramps @ gain.T, self.ramps @ offset.T
+
+    @cached_property
+    def levels_and_ones(self) -> tuple[Array, Array]:
+        """(n, 4) columns of the normal matrices that belong to the grey level and to one."""
+        level, one = np.ascontiguousarray(self.normal_matrices[:, :, 2:].transpose(2, 0, 1))
+        return level, one
+
+    @cached_property
+    def tile_energies(self) -> Array:
+        """(n, 2, 2) products of the gradient, each scaled so that the sums of its squares are one."""
+        own = self.normal_matrices[:, :2, :2]
+        scale = 1.0 / np.sqrt(np.diag(self.total)[:2])
+        return np.asarray(own * np.outer(scale, scale))
 
     @property
     def has_constant_gain(self) -> bool:
@@ -105,36 +132,40 @@ def prepare_geometry(level: PyramidLevel, window: TileWindow) -> TileGeometry:
 
 
 def _compute_geometry(level: PyramidLevel, window: TileWindow) -> TileGeometry:
-    rows = np.linspace(-1.0, 1.0, window.rows.stop - window.rows.start)
-    cols = np.linspace(-1.0, 1.0, window.cols.stop - window.cols.start)
-    y, x = np.meshgrid(rows, cols, indexing="ij")
-    ramps = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    shape = len(window.y), len(window.x)
     normal_matrices = level.normal_matrices[window.rows, window.cols].reshape(-1, 4, 4)
-    energy = np.diag(normal_matrices[:, :2, :2].sum(axis=0))
-    with_ramps = _eliminate_gain_and_offset(normal_matrices, ramps)
-    constant = _eliminate_gain_and_offset(normal_matrices, ramps[:, :1])
+    ramps, pairs = _make_ramps(shape)
+    whole = (normal_matrices.reshape(-1, 16).T @ pairs).reshape(4, 4, 3, 3).transpose(0, 2, 1, 3)
+    energy = np.diag(whole[:2, 0, :2, 0])
+    with_ramps = _eliminate_gain_and_offset(normal_matrices, ramps, whole)
+    constant = _eliminate_gain_and_offset(normal_matrices, ramps[:, :1], whole)
     lost = with_ramps.gradient_share**2 * energy < (
         _MIN_GRADIENT_ENERGY * constant.gradient_share**2 * energy
     )
     return constant if np.any(lost) else with_ramps
 
 
-def _eliminate_gain_and_offset(normal_matrices: Array, ramps: Array) -> TileGeometry:
+@lru_cache(maxsize=_MAX_SHAPES)
+def _make_ramps(shape: tuple[int, int]) -> tuple[Array, Array]:
+    """(n, 3) one, x and y of the tiles, from -1 to 1, and (n, 9) their products."""
+    rows, cols = (np.linspace(-1.0, 1.0, count) for count in shape)
+    y, x = np.meshgrid(rows, cols, indexing="ij")
+    ramps = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    return ramps, (ramps[:, :, None] * ramps[:, None, :]).reshape(len(ramps), -1)
+
+
+def _eliminate_gain_and_offset(normal_matrices: Array, ramps: Array, whole: Array) -> TileGeometry:
+    """The geometry for the first terms; ``whole`` (4, 3, 4, 3) are the sums for all of them."""
     count = ramps.shape[1]
-    pairs = (ramps[:, :, None] * ramps[:, None, :]).reshape(len(ramps), -1)
-    whole = (
-        (normal_matrices.reshape(-1, 16).T @ pairs)
-        .reshape(4, 4, count, count)
-        .transpose(0, 2, 1, 3)
-    )
-    normal = whole[2:, :, 2:, :].reshape(2 * count, 2 * count)
-    mixed = whole[:2, 0, 2:, :].reshape(2, 2 * count)
-    plain = np.diag(whole[:2, 0, :2, 0])
+    normal = whole[2:, :count, 2:, :count].reshape(2 * count, 2 * count)
+    mixed = whole[:2, 0, 2:, :count].reshape(2, 2 * count)
+    total = whole[:, 0, :, 0]
+    plain = np.diag(total)[:2]
     inverse = invert_scaled(normal, rcond=_RCOND)
     projection = mixed @ inverse
     remaining = plain - np.sum(projection * mixed, axis=1)
     share = np.sqrt(np.maximum(remaining, 0.0) / np.maximum(plain, 1e-30))
-    return TileGeometry(normal_matrices, ramps, inverse, projection, share)
+    return TileGeometry(normal_matrices, ramps, inverse, projection, share, total)
 
 
 def well_posed(matrix: Array) -> bool:
@@ -147,6 +178,12 @@ def well_posed(matrix: Array) -> bool:
     return a > 0.0 and c > 0.0 and a * c - b * b > _MIN_DETERMINANT * a * c
 
 
+def invert_symmetric(matrix: Array) -> Array:
+    """Inverse of a :func:`well_posed` (2, 2) matrix."""
+    a, b, c = float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
+    return np.array([[c, -b], [-b, a]]) / (a * c - b * b)
+
+
 def solve_step(geometry: TileGeometry, sums: TileSums) -> TileFit | None:
     """Gain, offset and step, or None where the gradient leaves a direction undetermined.
 
@@ -156,16 +193,15 @@ def solve_step(geometry: TileGeometry, sums: TileSums) -> TileFit | None:
     information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
     if not well_posed(information):
         return None
-    normal_matrices, ramps = geometry.normal_matrices, geometry.ramps
-    count = ramps.shape[1]
+    ramps, count = geometry.ramps, geometry.ramps.shape[1]
     cross = sums.cross.reshape(-1, 4)
     terms = geometry.inverse @ (cross[:, 2:].T @ ramps).ravel()
     gain, offset = ramps @ terms[:count], ramps @ terms[count:]
-    residual = cross - normal_matrices[:, :, 2] * gain[:, None]
-    residual = residual - normal_matrices[:, :, 3] * offset[:, None]
-    scores = residual[:, :2] - (residual[:, 2:3] * ramps) @ geometry.projection[:, :count].T
-    scores = scores - (residual[:, 3:4] * ramps) @ geometry.projection[:, count:].T
-    step = -np.linalg.solve(information, scores.sum(axis=0))
+    level, one = geometry.levels_and_ones
+    residual = cross - level * gain[:, None] - one * offset[:, None]
+    by_gain, by_offset = geometry.explained
+    scores = residual[:, :2] - residual[:, 2:3] * by_gain - residual[:, 3:4] * by_offset
+    step = -invert_symmetric(information) @ scores.sum(axis=0)
     return TileFit(scores, information, terms[:count], terms[count:], step)
 
 

@@ -23,20 +23,22 @@ touching the pixels again. What does not depend on the image is computed once pe
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import AnyImage, Array, Image
+from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.fractional_delay import (
     FINE,
     SHARP,
     Band,
     gradients,
-    sample_shifted,
+    gradients_transposed,
+    sample_tiles,
 )
 from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smooth
 
@@ -65,6 +67,9 @@ HESSIAN_PIXELS = 12_000
 ALL_PIXELS = 2**62
 # They lie in bands at the top, in the middle and at the bottom of the overlap.
 _HESSIAN_BANDS = 3
+# Windows for which what does not depend on the image is kept: an image that is shifted by little to either side
+# along both axes loses a row or a column of tiles at either end, or none.
+_KEPT_WINDOWS = 9
 # Images that are smooth by less have structure beyond the band of the shorter filters.
 _SHARP_PX = 0.3
 
@@ -100,9 +105,12 @@ class PyramidLevel:
     mean: float
     products: Image
     normal_matrices: Array
-    #: Geometry of the latest window, by its key.
+    #: Geometry of the latest windows, by their keys.
     geometries: LruCache[tuple[int, int, int, int], TileGeometry] = field(
-        default_factory=lambda: LruCache(1), repr=False, compare=False
+        default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
+    )
+    _curvatures: LruCache[tuple[object, ...], _Curvature] = field(
+        default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
     )
 
     @property
@@ -148,6 +156,31 @@ class TileSums:
     cross: Array
     energy: Array
     hessian: Array
+
+
+@dataclass(frozen=True)
+class _Curvature:
+    """Second derivatives of the reference over some rows of tiles.
+
+    The products of the reference's gradient with that of the image, summed over pixels, are those of the
+    image itself with minus the second derivatives of the reference, which are computed once.
+
+    Attributes
+    ----------
+    rows
+        (k,) rows of tiles, counted from the first of the window.
+    weights
+        (3, columns, k * n) factors of their pixels for the elements xx, xy and yy of the Hessian.
+    energy
+        (columns, 2) squares of the reference's gradient by x and by y that take part.
+    first
+        First of the columns in the reference.
+    """
+
+    rows: Indices
+    weights: Image
+    energy: Array
+    first: int
 
 
 def _band(sigma_px: float) -> Band:
@@ -210,6 +243,7 @@ class Pyramid:
 
     def __init__(self, image: AnyImage) -> None:
         self._levels: dict[int, AnyImage] = {1: image}
+        self._centred: dict[int, Image] = {}
 
     def at(self, factor: int) -> AnyImage:
         """Averaged over squares of ``factor`` px, a power of two; what does not fill a square is
@@ -225,6 +259,19 @@ class Pyramid:
             small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
             self._levels[factor] = np.asarray(small)
         return self._levels[factor]
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean grey level."""
+        return float(cv2.mean(cast("NDArray[np.float32]", self.full))[0])
+
+    def centred(self, factor: int) -> Image:
+        """As :meth:`at`, in single precision and without the mean."""
+        if factor not in self._centred:
+            level = self.at(factor).astype(np.float32)
+            level -= np.float32(self.mean)
+            self._centred[factor] = level
+        return self._centred[factor]
 
     @property
     def full(self) -> AnyImage:
@@ -255,80 +302,87 @@ def tile_window(
     return TileWindow(ranges[1], ranges[0], middles[0], middles[1])
 
 
-def _window_rectangle(level: PyramidLevel, window: TileWindow) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the window in the reference."""
-    left = level.origin[0] + window.cols.start * level.side[0]
-    top = level.origin[1] + window.rows.start * level.side[1]
-    width = (window.cols.stop - window.cols.start) * level.side[0]
-    height = (window.rows.stop - window.rows.start) * level.side[1]
-    return left, top, width, height
-
-
 def tile_sums(
     level: PyramidLevel,
     window: TileWindow,
-    image: AnyImage,
+    image: Image,
     shift: Array,
-    mean: float,
     hessian: Array | None,
     enough: int = HESSIAN_PIXELS,
 ) -> TileSums:
-    """Sums over the window's tiles of ``image`` sample_shifted at the reference's pixels plus ``shift``.
+    """Sums over the window's tiles of ``image`` sampled at the reference's pixels plus ``shift``.
 
-    ``image`` is at the resolution of the level; ``mean`` is subtracted from it. ``hessian`` is
+    ``image`` is at the resolution of the level, about its mean (:meth:`Pyramid.centred`). ``hessian`` is
     that of an earlier shift of the same images, None to compute it from ``enough`` pixels.
     """
-    left, top, width, height = _window_rectangle(level, window)
-    side_x, side_y = level.side
+    rows, cols = window.rows, window.cols
     whole = np.rint(shift).astype(int)
-    corner = (left + int(whole[0]), top + int(whole[1]))
-    smoothing = gaussian_taps(level.sigma_px)
-    fraction = np.asarray(shift - whole, dtype=np.float64)
-    band = _band(level.sigma_px)
-    sampled = sample_shifted(image, corner, (width, height), fraction, smoothing, band, -mean)
-    rows, cols = height // side_y, width // side_x
-    tiles = _split_into_tiles(sampled, level.side)
-    products = level.products[window.rows, window.cols]
-    cross = np.empty((rows, cols, 4))
-    cross[..., :3] = (products @ tiles[..., None])[..., 0]
-    cross[..., 3] = tiles @ np.ones(side_x * side_y, dtype=np.float32)
-    energy = np.einsum("rcn,rcn->rc", tiles, tiles).astype(np.float64)
-    return TileSums(
-        cross,
-        energy,
-        _common_hessian(level, window, sampled, enough) if hessian is None else hessian,
+    corner = (
+        level.origin[0] + cols.start * level.side[0] + int(whole[0]),
+        level.origin[1] + rows.start * level.side[1] + int(whole[1]),
     )
-
-
-def _split_into_tiles(image: Image, side: tuple[int, int]) -> Image:
-    """(rows, cols, n) the pixels of each tile."""
-    rows, cols = image.shape[0] // side[1], image.shape[1] // side[0]
-    cut = image.reshape(rows, side[1], cols, side[0]).transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(cut).reshape(rows, cols, side[0] * side[1])
+    count = cols.stop - cols.start, rows.stop - rows.start
+    fraction = np.asarray(shift - whole, dtype=np.float64)
+    band, smoothing = _band(level.sigma_px), gaussian_taps(level.sigma_px)
+    sampled = sample_tiles(image, corner, count, level.side, fraction, smoothing, band)
+    if hessian is None:
+        hessian = _common_hessian(level, window, sampled, enough)
+    tiles = sampled.transpose(1, 0, 2)
+    cross = np.empty((count[1], count[0], 4))
+    cross[..., :3] = (level.products[rows, cols] @ tiles[..., None])[..., 0]
+    cross[..., 3] = tiles @ np.ones(tiles.shape[2], dtype=np.float32)
+    energy = np.einsum("crn,crn->rc", sampled, sampled).astype(np.float64)
+    return TileSums(cross, energy, hessian)
 
 
 def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image, enough: int) -> Array:
     """Products of both images' gradients, scaled from enough rows of tiles to all of them."""
-    side, band = level.side[1], _band(level.sigma_px)
-    rows = len(window.y)
-    wanted = max(1, -(-enough // (sampled.shape[1] * side * _HESSIAN_BANDS)))
-    bands = [(0, rows)]
-    if wanted * _HESSIAN_BANDS < rows:
-        starts = (
-            rows * (2 * k + 1) // (2 * _HESSIAN_BANDS) - wanted // 2 for k in range(_HESSIAN_BANDS)
-        )
-        bands = [(first, first + wanted) for first in starts]
-    normal_matrices = level.normal_matrices[window.rows, window.cols]
-    total, used = np.zeros((2, 2)), np.zeros((4, 4))
-    for first, last in bands:
-        # The derivatives reach beyond the band, and are mirrored at the edges of the window.
-        above = min(band.reach, first * side)
-        part = sampled[first * side - above : last * side + band.reach]
-        products = level.products[window.rows, window.cols][first:last, :, :2]
-        used += normal_matrices[first:last].sum(axis=(0, 1))
-        for axis, own in enumerate(gradients(part, band)):
-            tiles = _split_into_tiles(own[above : above + (last - first) * side], level.side)
-            total[:, axis] += (products @ tiles[..., None])[..., 0].sum(axis=(0, 1))
-    whole = np.diag(normal_matrices.sum(axis=(0, 1)))[:2]
-    share = np.sqrt(whole / np.maximum(np.diag(used)[:2], 1e-30))
-    return np.asarray(0.5 * (total + total.T) * np.outer(share, share))
+    rows, cols = window.rows, window.cols
+    picked, unused = _pick_rows(level, window, enough)
+    # Where few pixels take part, those at the edge of the window count.
+    exact = (cols.start, cols.stop) if len(picked) == len(window.y) else None
+    curvature = level._curvatures.get_or_compute(
+        (rows.start, rows.stop, enough, exact),
+        lambda: _compute_curvature(level, rows, cols if exact else None, picked, unused),
+    )
+    own = slice(cols.start - curvature.first, cols.stop - curvature.first)
+    pixels = sampled[:, curvature.rows].reshape(-1)
+    xx, xy, yy = (float(part.reshape(-1) @ pixels) for part in curvature.weights[:, own])
+    normal_matrices = level.normal_matrices[rows, cols]
+    whole = np.array([normal_matrices[..., 0, 0].sum(), normal_matrices[..., 1, 1].sum()])
+    share = np.sqrt(whole / np.maximum(curvature.energy[own].sum(axis=0), 1e-30))
+    return np.array([[xx, xy], [xy, yy]]) * np.outer(share, share)
+
+
+def _pick_rows(level: PyramidLevel, window: TileWindow, enough: int) -> tuple[Indices, int]:
+    """Rows of tiles with enough pixels, in bands of equal height, and the lines at either end of a band that
+    do not count, because their derivatives reach beyond it.
+    """
+    rows, band = len(window.y), _band(level.sigma_px)
+    lines = -(-enough // (len(window.x) * level.side[0] * _HESSIAN_BANDS)) + 2 * band.reach
+    tall = -(-lines // level.side[1])
+    if tall * _HESSIAN_BANDS >= rows:
+        return np.arange(rows), 0
+    middles = rows * (2 * np.arange(_HESSIAN_BANDS) + 1) // (2 * _HESSIAN_BANDS)
+    return ((middles - tall // 2)[:, None] + np.arange(tall)).ravel(), band.reach
+
+
+def _compute_curvature(
+    level: PyramidLevel, rows: slice, cols: slice | None, picked: Indices, unused: int
+) -> _Curvature:
+    columns = slice(0, level.products.shape[1]) if cols is None else cols
+    (side_x, side_y), band = level.side, _band(level.sigma_px)
+    tiles = level.products[rows, columns][picked, :, :2]
+    count, across = tiles.shape[:2]
+    planes = tiles.reshape(count, across, 2, side_y, side_x).transpose(2, 0, 3, 1, 4)
+    slopes = np.ascontiguousarray(planes).reshape(2, count * side_y, across * side_x)
+    if unused:
+        # The bands lie one below the other; nothing that counts reaches from one to the next.
+        bands = slopes.reshape(2, _HESSIAN_BANDS, -1, across * side_x)
+        bands[:, :, :unused] = bands[:, :, -unused:] = 0.0
+    energy = np.einsum("kic,kic->kc", slopes, slopes).reshape(2, across, side_x)
+    xx, xy = gradients_transposed(slopes[0], band)
+    yx, yy = gradients_transposed(slopes[1], band)
+    second = np.stack([xx, 0.5 * (xy + yx), yy]).reshape(3, count, side_y, across, side_x)
+    weights = np.ascontiguousarray(second.transpose(0, 3, 1, 2, 4)).reshape(3, across, -1)
+    return _Curvature(picked, weights, energy.sum(axis=2, dtype=np.float64).T, columns.start)

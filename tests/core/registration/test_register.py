@@ -31,7 +31,9 @@ from semcal_ros.core.registration.fractional_delay import (
     SHARP,
     Band,
     gradients,
+    gradients_transposed,
     sample_shifted,
+    sample_tiles,
 )
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.register import (
@@ -253,6 +255,27 @@ def test_subpixel_filters_are_exact_for_band_limited_pictures(band: Band) -> Non
         patch = sample_shifted(picture, (10, 12), (100, 90), np.array(fraction), plain, band, 0.0)
         moved = TEXTURE.view((-fraction[0], -fraction[1]), 128)[12:102, 10:110]
         assert float(np.sqrt(np.mean((patch - moved) ** 2))) < 2e-3
+
+
+@pytest.mark.parametrize("corner", [(10, 12), (2, 1), (13, 14)])
+def test_tiles_are_what_the_filters_give(corner: tuple[int, int]) -> None:
+    picture = TEXTURE.view((0.0, 0.0), 64).astype(np.float32)
+    fraction, smoothing = np.array([0.3, -0.4]), np.array([0.1, 0.2, 0.4, 0.2, 0.1])
+    # The second and the third reach beyond the edges.
+    whole = sample_shifted(picture, corner, (49, 48), fraction, smoothing, FINE, 0.0)
+    tiles = sample_tiles(picture, corner, (7, 6), (7, 8), fraction, smoothing, FINE)
+    joined = tiles.reshape(7, 6, 8, 7).transpose(1, 2, 0, 3).reshape(48, 49)
+    # Single precision, of an image of unit RMS.
+    np.testing.assert_allclose(joined, whole, atol=3e-6)
+
+
+@pytest.mark.parametrize("band", [FINE, SHARP])
+def test_transposed_gradients_are_those_of_the_other_factor(band: Band) -> None:
+    one, other = np.random.default_rng(0).standard_normal((2, 40, 33), dtype=np.float32)
+    slopes, transposed = gradients(one, band), gradients_transposed(other, band)
+    for slope, back in zip(slopes, transposed, strict=True):
+        # Sums of some 1300 products of unit size in single precision.
+        assert float(np.vdot(slope, other)) == pytest.approx(float(np.vdot(one, back)), abs=1e-3)
 
 
 def test_jitter_of_the_scan_lines_is_in_the_covariance() -> None:
