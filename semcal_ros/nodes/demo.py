@@ -29,7 +29,7 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Float64
 
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.viewer import Viewer
+from semcal_ros.nodes.viewer import Viewer, give_way
 
 __all__ = ["DEMO_MAGNIFICATIONS", "run_demo"]
 
@@ -123,6 +123,8 @@ def run_demo(
             _start(nodes, "parameter_server", **given)
             _start(nodes, "stream_corrector", **given)
             _start(nodes, "virtual_sem", **scene, width=size, height=size)
+            # After the others, which would inherit it.
+            give_way()
             say(address, f"ROS_DOMAIN_ID={domain}, topics in {_NAMESPACE}; Ctrl-C ends it")
 
         return run_node(lambda: _DemoViewer(begin, duration_s), arguments)

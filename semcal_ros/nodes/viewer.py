@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections.abc import Sequence
@@ -56,7 +57,7 @@ from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 
-__all__ = ["Viewer", "run_viewer"]
+__all__ = ["Viewer", "give_way", "run_viewer"]
 
 _PARAMETERS = (
     CALIBRATION,
@@ -87,6 +88,8 @@ _CALIBRATION_ACTIONS = {
 }
 _SLOW = ("add_view", "check")
 _SERVER = "calibration_server"
+# A tenth of the processor against a node that wants it too.
+_NICE = 10
 
 
 class Viewer(SemNode):
@@ -399,6 +402,12 @@ class Viewer(SemNode):
         )
 
 
+def give_way() -> None:
+    """Lower the priority of this process: pictures for a person wait for the stream, and not the other way round."""
+    os.nice(_NICE)
+
+
 def run_viewer(args: Sequence[str] | None = None) -> int:
     """Run the node, which is no executable of its own: ``semcal view`` is its command."""
+    give_way()
     return run_node(Viewer, args)

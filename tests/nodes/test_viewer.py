@@ -60,7 +60,10 @@ def wait_bright(page: Page, picture: str) -> None:
     """
     page.wait_for(
         f"(() => {{ const c = document.querySelector('figure[data-picture={picture}] canvas');"
-        " const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let s = 0, q = 0, n = 0;"
+        # A copy to read from: the browser warns of a canvas that is drawn to and read again and again.
+        " const copy = document.createElement('canvas'); copy.width = c.width; copy.height = c.height;"
+        " const pen = copy.getContext('2d', {willReadFrequently: true}); pen.drawImage(c, 0, 0);"
+        " const d = pen.getImageData(0, 0, c.width, c.height).data; let s = 0, q = 0, n = 0;"
         " for (let i = 0; i < d.length; i += 4) { s += d[i]; q += d[i] * d[i]; n += 1; }"
         " return Math.sqrt(q / n - (s / n) ** 2) > 30; })()"
     )
