@@ -149,7 +149,7 @@ def nodes(size: int, folder: Path) -> Iterator[tuple[RectifierNode, StreamCorrec
     (folder / "config.yaml").write_text(CONFIG.text, encoding="utf-8")
     given = {"calibration": folder / "cal.yaml", "config": folder / "config.yaml"}
     # Registration is measured here and now, however long it takes.
-    given |= {"drift_tracking": "every_frame"}
+    given |= {"stream_corrector:drift_tracking": "every_frame"}
     arguments = [part for k, v in given.items() for part in ("-p", f"{k}:={v}")]
     rclpy.init(args=["benchmark", "--ros-args", "--log-level", "error", *arguments])
     made = RectifierNode(), StreamCorrector()

@@ -29,6 +29,10 @@ if TYPE_CHECKING:  # its fit needs scipy.optimize, which takes long to import
 
 __all__ = ["fill_camera_info", "fill_raw_camera_info"]
 
+# Matrices of three rows, row by row.
+_ZEROS: list[float] = [0.0] * 9
+_IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
 
 def fill_camera_info(
     message: Any,
@@ -63,16 +67,16 @@ def fill_camera_info(
     copy_header(message.header, header)
     message.width, message.height = int(width), int(height)
     message.distortion_model = "plumb_bob"
-    k, r = np.zeros((3, 3)), np.zeros((3, 3))
+    k, r = _ZEROS, _ZEROS
     if camera is not None and camera.rho > 0.0:
         with np.errstate(over="ignore"):
             pinhole = camera.resized(width, height).rectified.K
         if np.all(np.isfinite(pinhole)):
-            k, r = pinhole, np.eye(3)
-    assign_floats(message, "d", np.zeros(5))
+            k, r = pinhole.ravel().tolist(), _IDENTITY
+    assign_floats(message, "d", [0.0] * 5)
     assign_floats(message, "k", k)
     assign_floats(message, "r", r)
-    assign_floats(message, "p", np.hstack([k, np.zeros((3, 1))]))
+    assign_floats(message, "p", [*k[0:3], 0.0, *k[3:6], 0.0, *k[6:9], 0.0])
 
 
 def fill_raw_camera_info(

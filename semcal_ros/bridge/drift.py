@@ -43,6 +43,8 @@ physical, and finite, since filters that take such messages multiply with it."""
 
 # Relative to the largest entry: above the rounding of single precision (6e-8).
 _SYMMETRY_TOLERANCE = 1e-6
+# Nothing observed: (6, 6), row by row.
+_UNKNOWN = tuple(UNKNOWN_VARIANCE if k % 7 == 0 else 0.0 for k in range(36))
 
 
 def fill_drift(
@@ -123,7 +125,7 @@ def rotation_rate_of(estimate: DriftEstimate) -> tuple[float, float] | None:
 
 
 def _angle_and_variance(estimate: DriftEstimate, index: int) -> tuple[float, float] | None:
-    if not np.any(estimate.similarity):
+    if not estimate.similarity.any():
         return None
     variance = min(float(estimate.similarity_covariance[index, index]), UNKNOWN_VARIANCE)
     return float(estimate.similarity[index]), variance
@@ -142,39 +144,41 @@ def _floats(values: ArrayLike, what: str) -> Array:
 
 def _pair(values: ArrayLike, what: str) -> tuple[float, float]:
     pair = _floats(values, what)
-    if pair.shape != (2,) or not np.all(np.isfinite(pair)):
-        raise InvalidValueError(f"a {what} of {pair.tolist()}", expected="two finite numbers")
-    return float(pair[0]), float(pair[1])
+    numbers = pair.tolist()
+    if pair.shape != (2,) or not all(map(math.isfinite, numbers)):
+        raise InvalidValueError(f"a {what} of {numbers}", expected="two finite numbers")
+    return numbers[0], numbers[1]
 
 
-def _block(covariance: ArrayLike, first: int) -> Array:
-    matrix = whole = _floats(covariance, "covariance")
-    if matrix.shape == (4, 4):
-        matrix = matrix[first : first + 2, first : first + 2]
-    if matrix.shape == (2, 2) and np.isfinite(matrix[0, 1] + matrix[1, 0]):
-        matrix = _bound(matrix)
-    if matrix.shape != (2, 2) or not np.all(np.isfinite(matrix)) or np.any(np.diag(matrix) < 0.0):
+def _block(covariance: ArrayLike, first: int) -> list[list[float]]:
+    whole = _floats(covariance, "covariance")
+    matrix = whole[first : first + 2, first : first + 2] if whole.shape == (4, 4) else whole
+    # Plain numbers from here on: for four of them, arrays take ten times as long.
+    rows = matrix.tolist() if matrix.shape == (2, 2) else []
+    if rows and math.isfinite(rows[0][1] + rows[1][0]):
+        _bound(rows)
+    values = [value for row in rows for value in row]
+    if not (values and all(map(math.isfinite, values)) and min(values[0], values[3]) >= 0.0):
         raise InvalidValueError(
             f"a covariance of shape {whole.shape}",
             expected="a (4, 4) or (2, 2) matrix of numbers with a diagonal that is not negative",
         )
-    scale = float(np.max(np.abs(matrix)))
-    if abs(matrix[0, 1] - matrix[1, 0]) > _SYMMETRY_TOLERANCE * scale:
-        raise InvalidValueError(f"a covariance {matrix.tolist()}", expected="a symmetric matrix")
-    return matrix
+    if abs(values[1] - values[2]) > _SYMMETRY_TOLERANCE * max(map(abs, values)):
+        raise InvalidValueError(f"a covariance {rows}", expected="a symmetric matrix")
+    return rows
 
 
-def _bound(matrix: Array) -> Array:
-    """A (2, 2) covariance with what is infinite in it at :data:`UNKNOWN_VARIANCE`."""
-    unknown = np.isposinf(np.diag(matrix))
-    bounded = np.where(unknown[:, None] | unknown[None, :], 0.0, matrix)
-    bounded[unknown, unknown] = UNKNOWN_VARIANCE
-    return bounded
+def _bound(rows: list[list[float]]) -> None:
+    """Set what is infinite in a (2, 2) covariance to :data:`UNKNOWN_VARIANCE`."""
+    for k in (0, 1):
+        if rows[k][k] == math.inf:
+            rows[k][k] = UNKNOWN_VARIANCE
+            rows[0][1] = rows[1][0] = 0.0
 
 
-def _six_by_six(block: Array, about_z: tuple[float, float] | None) -> Array:
-    full = np.diag(np.full(6, UNKNOWN_VARIANCE))
-    full[:2, :2] = block
+def _six_by_six(block: list[list[float]], about_z: tuple[float, float] | None) -> list[float]:
+    full = list(_UNKNOWN)
+    full[0:2], full[6:8] = block
     if about_z is not None:
-        full[5, 5] = about_z[1]
+        full[-1] = about_z[1]
     return full

@@ -92,7 +92,7 @@ def assign_floats(message: Any, name: str, values: ArrayLike) -> None:
     if isinstance(getattr(message, name), np.ndarray):
         setattr(message, name, flat)
     else:
-        setattr(message, name, array.array("d", flat))
+        setattr(message, name, array.array("d", flat.tobytes()))
 
 
 def new_nested(owner: Any, type_name: str, **fields: Any) -> Any:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,15 @@ def design_matrix(
 
     The coefficients are in the order of ``FUNCTION_NAMES``.
     """
-    blocks = [functions[name].basis(g) for name in FUNCTION_NAMES]
+    rows: dict[object, Array] = {}
+    blocks = []
+    for name in FUNCTION_NAMES:
+        function = functions[name]
+        # Most functions share their basis.
+        key = function.basis_key
+        if key not in rows:
+            rows[key] = function.basis(g)
+        blocks.append(rows[key])
     blocks[0] = blocks[0] * nominal_px_per_m
     matrix = np.zeros((len(blocks), sum(len(b) for b in blocks)))
     column = 0
@@ -172,6 +181,11 @@ class CalibrationModel:
         """(width, height) in px."""
         return self.image_width, self.image_height
 
+    @cached_property
+    def _coefficients(self) -> Array:
+        """All coefficients of the functions, in the order of ``FUNCTION_NAMES``."""
+        return np.concatenate([self.functions[name].coefficients for name in FUNCTION_NAMES])
+
     @property
     def norm_px(self) -> float:
         """Normalisation of the distortion: half the image width, px."""
@@ -199,7 +213,7 @@ class CalibrationModel:
         low, high = self.magnification_range
         in_range = bool(low * (1 - 1e-9) <= g <= high * (1 + 1e-9))
         design = design_matrix(self.functions, g, self.nominal_px_per_m(g))
-        theta = np.concatenate([self.functions[name].coefficients for name in FUNCTION_NAMES])
+        theta = self._coefficients
         size = len(theta)
         covariance = design @ self.covariance[:size, :size] @ design.T
         residual = None

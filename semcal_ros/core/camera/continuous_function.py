@@ -167,6 +167,13 @@ class ContinuousFunction:
         """Number of coefficients without the jumps."""
         return len(self.coefficients) - len(self.breaks)
 
+    @property
+    def basis_key(self) -> tuple[object, ...]:
+        """What :meth:`basis` depends on besides the magnification: equal for functions that share it."""
+        shape = () if len(self.shape) == 0 else tuple(self.shape.tolist())
+        breaks = () if len(self.breaks) == 0 else tuple(self.breaks.tolist())
+        return self.kind, self.size, self.g_range, shape, breaks
+
     def basis(self, g: float) -> Array:
         """Return the (size,) row with ``value = basis(g) @ coefficients``; tangent out of range."""
         low, high = self.g_range
@@ -177,6 +184,8 @@ class ContinuousFunction:
             inside = edge * float(np.exp(step))
             inner = basis_row(self.kind, self.smooth_size, inside, self.g_range, self.shape)
             row = row + (inner - row) / step * np.log(g / edge)
+        if len(self.breaks) == 0:
+            return row
         return np.concatenate([row, (g >= self.breaks).astype(np.float64)])
 
     def __call__(self, g: float) -> float:

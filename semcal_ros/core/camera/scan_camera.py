@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -124,10 +125,11 @@ class ScanCamera:
     residual: FieldSlice | None = None
 
     def __post_init__(self) -> None:
-        values = np.append(self.parameters, [self.magnification, self.norm_px])
-        if not np.all(np.isfinite(values)):
+        values = [self.m, self.aspect, self.skew, self.px, self.py, self.rho, self.xi_r, self.xi_t]
+        values += [self.ex, self.ey, self.magnification, self.norm_px]
+        if not all(map(math.isfinite, values)):
             raise InvalidValueError(
-                f"camera parameters {values.tolist()}", expected="finite numbers"
+                f"camera parameters {[float(value) for value in values]}", expected="finite numbers"
             )
         for name in ("magnification", "m", "aspect", "norm_px", "width", "height"):
             if not getattr(self, name) > 0:

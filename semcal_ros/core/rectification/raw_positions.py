@@ -125,10 +125,11 @@ def raw_from_output(
     if drift is None:
         return xy.copy() if camera is None else camera.raw_from_rect(xy)
     shift = PixelDrift(size, camera, drift, timing)
-    moved = shift.moved(xy)
-    raw = moved if camera is None else camera.raw_from_rect(moved)
     if shift.is_still:
-        return raw
+        moved = shift.moved(xy)
+        return moved if camera is None else camera.raw_from_rect(moved)
+    # What is displaced by little is scanned at nearly the time of its output pixel.
+    raw, contraction = xy, shift.contraction
     for _ in range(_MAX_STEPS):
         # A contraction as long as the drift moves by much less than a row while a row is scanned.
         moved = shift.moved(xy, raw)
@@ -136,7 +137,7 @@ def raw_from_output(
         change_px = np.abs(new - raw)
         raw = new
         # The error that remains is smaller than the step by the same factor again.
-        if not (change_px > _CONVERGED_PX).any():
+        if not (contraction * change_px > _CONVERGED_PX).any():
             return raw
     assert timing is not None
     raise InvalidValueError(
@@ -183,6 +184,23 @@ class PixelDrift:
         moves = self._is_accelerated or bool(self.velocity_px_s.any())
         turns = self._turns and bool(self._rate.any())
         return self._timing is None or not (moves or turns)
+
+    @property
+    def contraction(self) -> float:
+        """By how much a step of the time towards that of the raw pixel makes its error smaller, at least; at most 1.
+
+        Rows by which the drift at its fastest moves while a row is scanned, twice, because the distortion stretches
+        what moves.
+        """
+        if self._timing is None:
+            return 0.0
+        width, height = self._size
+        time_s = self._timing.acquisition_time_s
+        speed = float(np.hypot(*self.velocity_px_s))
+        speed += 2.0 * float(np.hypot(*self._half_acceleration_px)) * time_s
+        if self._turns:
+            speed += float(np.hypot(*self._rate[:, 0])) * (width + height)
+        return min(2.0 * speed * self._timing.frame_time_s / height, 1.0)
 
     def displacement(self, raw: Array) -> Array:
         """(n, 2) by how much the drift displaces what is scanned at raw pixels (n, 2)."""

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,31 @@ class ImageOutput:
         self._compressed.close()
 
 
+class _CameraOutput:
+    """A message about the camera of a frame, filled again only where another camera or size is due.
+
+    Each is filled only for a subscriber of its own.
+    """
+
+    def __init__(
+        self, message: Any, fill: Callable[[Any, ScanCamera | None, Any, int, int], None]
+    ) -> None:
+        self._message = message
+        self._fill = fill
+        # What the message describes, apart from its header.
+        self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
+
+    def message_for(self, camera: ScanCamera | None, frame: StreamFrame) -> Any:
+        """Return the message with the header of a frame."""
+        known = self._described
+        if known is None or known[0] is not camera or known[1] != frame.size:
+            self._fill(self._message, camera, frame.header, *frame.size)
+            self._described = camera, frame.size
+        else:
+            copy_header(self._message.header, frame.header)
+        return self._message
+
+
 class RectifiedOutput:
     """Publishes ``image_rect`` with ``camera_info``, ``projection_stamped`` and ``projection_covariance_stamped``,
     which have its header.
@@ -105,8 +131,24 @@ class RectifiedOutput:
         beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
         covariance = "projection_covariance_stamped"
-        info, projection, spread = CameraInfo(), Image(), Image()
-        self._outputs = [
+        raw = config.image.topic
+        info = _CameraOutput(CameraInfo(), fill_camera_info)
+        projection = _CameraOutput(Image(), fill_stamped_projection)
+        spread = _CameraOutput(Image(), fill_stamped_projection_covariance)
+        raw_info = _CameraOutput(CameraInfo(), self._fill_raw)
+        self._outputs = (
+            (
+                endpoints.camera_publisher(
+                    CameraInfo, f"{raw}/camera_info", endpoints.below(raw, "camera_info")
+                ),
+                raw_info,
+            ),
+            (
+                endpoints.stream_publisher(
+                    Image, covariance, endpoints.beside(covariance, "image_rect")
+                ),
+                spread,
+            ),
             (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
             (
                 endpoints.camera_publisher(
@@ -118,22 +160,7 @@ class RectifiedOutput:
                 endpoints.stream_publisher(Image, matrix, endpoints.beside(matrix, "image_rect")),
                 projection,
             ),
-        ]
-        # Apart, since few need it: it is only filled for a subscriber of its own.
-        self._spread = spread
-        self._spread_publisher = endpoints.stream_publisher(
-            Image, covariance, endpoints.beside(covariance, "image_rect")
         )
-        self._spread_described: tuple[ScanCamera | None, tuple[int, int]] | None = None
-        self._messages = info, projection
-        raw = config.image.topic
-        self._raw_info = CameraInfo()
-        self._raw_publisher = endpoints.camera_publisher(
-            CameraInfo, f"{raw}/camera_info", endpoints.below(raw, "camera_info")
-        )
-        # What the messages describe, apart from their headers.
-        self._described: tuple[ScanCamera | None, tuple[int, int]] | None = None
-        self._raw_described: tuple[ScanCamera | None, tuple[int, int]] | None = None
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """As :meth:`ImageOutput.memory`."""
@@ -146,46 +173,18 @@ class RectifiedOutput:
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""
         # The camera first: a subscriber that has the image can then use it at once.
-        if self._raw_publisher.get_subscription_count():
-            self._describe_raw(camera, frame)
-            copy_header(self._raw_info.header, frame.header)
-            self._raw_publisher.publish(self._raw_info)
-        if self._spread_publisher.get_subscription_count():
-            self._describe_spread(camera, frame)
-            copy_header(self._spread.header, frame.header)
-            self._spread_publisher.publish(self._spread)
-        for publisher, message in self._outputs:
+        for publisher, output in self._outputs:
             if publisher.get_subscription_count():
-                self._describe(camera, frame)
-                copy_header(message.header, frame.header)
-                publisher.publish(message)
+                publisher.publish(output.message_for(camera, frame))
         self._image.publish(frame)
 
-    def _describe(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
-        known = self._described
-        if known is None or known[0] is not camera or known[1] != frame.size:
-            info, projection = self._messages
-            fill_camera_info(info, camera, frame.header, *frame.size)
-            fill_stamped_projection(projection, camera, frame.header, *frame.size)
-            self._described = camera, frame.size
-
-    def _describe_spread(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
-        known = self._spread_described
-        if known is None or known[0] is not camera or known[1] != frame.size:
-            fill_stamped_projection_covariance(self._spread, camera, frame.header, *frame.size)
-            self._spread_described = camera, frame.size
-
-    def _describe_raw(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
-        known = self._raw_described
-        if known is None or known[0] is not camera or known[1] != frame.size:
-            width, height = frame.size
-            model = None if camera is None else fit_plumb_bob(camera, width, height)
-            if model is not None:
-                self._reporter.note("raw_camera_info_error_px", model.worst_px)
-            fill_raw_camera_info(
-                self._raw_info, model, frame.header, width, height + self._databar_rows
-            )
-            self._raw_described = camera, frame.size
+    def _fill_raw(
+        self, message: Any, camera: ScanCamera | None, header: Any, width: int, height: int
+    ) -> None:
+        model = None if camera is None else fit_plumb_bob(camera, width, height)
+        if model is not None:
+            self._reporter.note("raw_camera_info_error_px", model.worst_px)
+        fill_raw_camera_info(message, model, header, width, height + self._databar_rows)
 
 
 class DriftOutput:

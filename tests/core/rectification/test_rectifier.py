@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
+from semcal_ros.core.rectification.raw_positions import PixelDrift, RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
 from tests.helpers.drift_scenes import small_camera
 
@@ -103,6 +103,20 @@ def test_averaged_scans_shear_by_one_pass_only() -> None:
     # The middle of the frame is its centre in time.
     middle = raw_from_output(np.array([[SIZE / 2, SIZE / 2]]), (SIZE, SIZE), None, drift, eight)
     assert middle[0, 0] == pytest.approx(SIZE / 2, abs=0.01)
+
+
+@pytest.mark.parametrize("rows_per_row", [0.001, 0.03, 0.4])
+def test_raw_positions_fulfil_their_equation_however_fast_the_drift_is(rows_per_row: float) -> None:
+    # Steps are left out where those before tell that they would change nothing.
+    speed_m_s = rows_per_row * SIZE / TIMING.frame_time_s / CAMERA.m
+    drift = RasterDrift(
+        np.array([4e-6, -7e-6]), speed_m_s * np.array([0.6, -0.8]), speed_m_s * np.array([0.2, 0.1])
+    )
+    xy = _grid(9, 9) * 20.0 + 10.0
+    raw = raw_from_output(xy, (SIZE, SIZE), CAMERA, drift, TIMING)
+    moved = PixelDrift((SIZE, SIZE), CAMERA, drift, TIMING).moved(xy, raw)
+    # A hundredth of what is promised for maps, and what the last step leaves.
+    np.testing.assert_allclose(CAMERA.raw_from_rect(moved), raw, atol=2e-5)
 
 
 def test_averaged_scans_bend_by_the_mean_over_their_passes() -> None:
