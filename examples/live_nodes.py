@@ -52,7 +52,7 @@ class LiveNodes:
         self._executables = prefix / "lib" / "semcal_ros"
         self._logs = logs
         self._logs.mkdir(parents=True, exist_ok=True)
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, name: str, parameters: Mapping[str, object]) -> subprocess.Popen[bytes]:
         """Start an executable with parameters."""
@@ -62,17 +62,20 @@ class LiveNodes:
             command += ["-p", f"{key}:={text}"]
         with open(self._logs / f"{name}.log", "wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        self._processes.append(process)
+        self._processes[name] = process
         return process
 
     def check(self) -> None:
         """Raise if one has failed."""
-        if any(process.poll() for process in self._processes):
-            raise RuntimeError(f"a node ended; expected all to run; look into {self._logs}")
+        for name, process in self._processes.items():
+            if process.poll():
+                log = self._logs / f"{name}.log"
+                last = log.read_text(errors="replace").strip().splitlines()[-1:]
+                raise RuntimeError(f"{name} ended, expected to run; see {log}: {' '.join(last)}")
 
     def end(self) -> None:
         """End them in the order in which they were started."""
-        for process in self._processes:
+        for process in self._processes.values():
             process.send_signal(signal.SIGINT)
-        for process in self._processes:
+        for process in self._processes.values():
             process.wait(END_S)

@@ -22,15 +22,19 @@
 4. What arrives on their topics is measured against the grid, in the paper's own three rows.
 
 Everything lands in demo_output/.
+
+    python -m examples.demo [--quick] [--output FOLDER]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +49,18 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection
 
-OUTPUT = Path("demo_output")
-CALIBRATED = (100, 250, 600, 1200, 2500, 4000, 6000, 8000, 10000)
-REPLAYED = (400, 1800, 7000)
-FRAMES = 10
+
+@dataclass(frozen=True)
+class Plan:
+    """What is recorded, and where it goes."""
+
+    output: Path
+    calibrated: tuple[int, ...] = (100, 250, 600, 1200, 2500, 4000, 6000, 8000, 10000)
+    views: int = 4
+    replayed: tuple[int, ...] = (400, 1800, 7000)
+    frames: int = 10
+
+
 STAGES: dict[str, tuple[str, float | tuple[float, float]]] = {
     "image_raw": ("without correction", 7.0),
     "image_stabilized": ("with drift correction", 3.0),
@@ -63,34 +75,38 @@ def semcal(*arguments: object) -> None:
     subprocess.run(command, check=True)
 
 
-def calibrate() -> Path:
+def calibrate(plan: Plan) -> Path:
     """Steps 1 and 2."""
-    magnifications = [x for g in CALIBRATED for x in ("--magnification", g)]
-    semcal("simulate", OUTPUT / "grid", "--plan", "grid", "--views", 4, *magnifications)
+    output = plan.output
+    magnifications = [x for g in plan.calibrated for x in ("--magnification", g)]
+    semcal("simulate", output / "grid", "--plan", "grid", "--views", plan.views, *magnifications)
     semcal(
-        "calibrate", OUTPUT / "grid", "-o", OUTPUT / "cal.yaml", "--report", OUTPUT / "report.html"
+        "calibrate", output / "grid", "-o", output / "cal.yaml", "--report", output / "report.html"
     )
-    semcal("at", OUTPUT / "cal.yaml", 5250)
-    return OUTPUT / "cal.yaml"
+    semcal("at", output / "cal.yaml", 5250)
+    return output / "cal.yaml"
 
 
-def replay(calibration: Path) -> Received:
+def replay(plan: Plan, calibration: Path) -> Received:
     """Step 3: the nodes on a replay, as processes of their own."""
-    magnifications = [x for g in REPLAYED for x in ("--magnification", g)]
+    output = plan.output
+    magnifications = [x for g in plan.replayed for x in ("--magnification", g)]
     semcal(
         "simulate",
-        OUTPUT / "replay",
+        output / "replay",
         "--plan",
         "steps",
         "--frames",
-        FRAMES,
+        plan.frames,
         "--drift",
         "fast",
         *magnifications,
     )
     print("\nNodes on the replay:", flush=True)
-    with LiveSuite(OUTPUT / "logs", config="virtual_sem", calibration=calibration) as suite:
-        received = suite.replay(OUTPUT / "replay", frames=FRAMES * len(REPLAYED), rate=1.5)
+    with LiveSuite(output / "logs", config="virtual_sem", calibration=calibration) as suite:
+        received = suite.replay(
+            output / "replay", frames=plan.frames * len(plan.replayed), rate=1.5
+        )
         matrix = suite.parameter("p@2345.6")
     for topic, messages in received.counts().items():
         print(f"  {topic:18} {messages} messages")
@@ -127,22 +143,22 @@ def reprojection_rms(
     return float(np.sqrt(np.mean(np.concatenate(errors))))
 
 
-def frames_at(g: float) -> list[dict[str, Any]]:
+def frames_at(plan: Plan, g: float) -> list[dict[str, Any]]:
     """What truth.json says of the frames at a magnification."""
-    truth = json.loads((OUTPUT / "replay" / "truth.json").read_text())
+    truth = json.loads((plan.output / "replay" / "truth.json").read_text())
     return [f for f in truth["frames"] if f["magnification"] == g]
 
 
-def stamps_at(g: float, received: Received) -> list[int]:
+def stamps_at(plan: Plan, g: float, received: Received) -> list[int]:
     """Header stamps, ns, of the frames at a magnification."""
     start = min(received.images["image_raw"])
-    return [start + round(f["start_time_s"] * 1e9) for f in frames_at(g)]
+    return [start + round(f["start_time_s"] * 1e9) for f in frames_at(plan, g)]
 
 
-def describe_visits() -> str:
+def describe_visits(plan: Plan) -> str:
     """How the magnifications of the replay came back, in truth, and where that is in the errors."""
-    off = (100.0 * (frames_at(g)[0]["visit_scale"] - 1.0) for g in REPLAYED)
-    listed = ", ".join(f"{part:+.2f} % at {g}x" for part, g in zip(off, REPLAYED, strict=True))
+    off = (100.0 * (frames_at(plan, g)[0]["visit_scale"] - 1.0) for g in plan.replayed)
+    listed = ", ".join(f"{part:+.2f} % at {g}x" for part, g in zip(off, plan.replayed, strict=True))
     return (
         f"A magnification does not come back exactly: the scale of the replay is off by {listed}. "
         "The fitted height of the grid takes this up, so it is no part of these errors, but of every "
@@ -150,15 +166,17 @@ def describe_visits() -> str:
     )
 
 
-def measure(received: Received, cal: Calibration) -> dict[str, list[float]]:
+def measure(plan: Plan, received: Received, cal: Calibration) -> dict[str, list[float]]:
     """Step 4: RMS of each stage at each magnification."""
     rows: dict[str, list[float]] = {topic: [] for topic in STAGES}
-    for g in REPLAYED:
-        stamps = stamps_at(g, received)
+    for g in plan.replayed:
+        stamps = stamps_at(plan, g, received)
         first = next(s for s in stamps if s in received.images["image_rect"])
         found = find_lattice(received.images["image_rect"][first])
         assert not isinstance(found, Rejection), found.reason
-        view = GridView(float(g), found.ij * frames_at(g)[0]["square_m"], found.xy, found.sigma_px)
+        view = GridView(
+            float(g), found.ij * frames_at(plan, g)[0]["square_m"], found.xy, found.sigma_px
+        )
         for topic in STAGES:
             images = {s: received.images[topic][s] for s in stamps if s in received.images[topic]}
             rms = reprojection_rms(images, view, cal, rectified=topic == "image_rect")
@@ -167,18 +185,38 @@ def measure(received: Received, cal: Calibration) -> dict[str, list[float]]:
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(description="The whole suite at work, without a microscope.")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder to make")
+    parser.add_argument("--quick", action="store_true", help="fewer views and frames")
+    options = parser.parse_args()
+    plan = Plan(options.output)
+    if options.quick:
+        plan = Plan(options.output, (250, 1000, 4000, 10000), 3, (500, 7000), 6)
     started = time.monotonic()
-    shutil.rmtree(OUTPUT, ignore_errors=True)
-    OUTPUT.mkdir()
-    calibration = calibrate()
-    received = replay(calibration)
+    if plan.output.exists():
+        # Only what the demo has made itself is replaced.
+        made = {
+            "grid",
+            "replay",
+            "logs",
+            "cal.yaml",
+            "report.html",
+            "correction.html",
+            "overview.png",
+        }
+        if not {path.name for path in plan.output.iterdir()} <= made:
+            parser.error(f"--output {plan.output} has other files; choose a new folder")
+        shutil.rmtree(plan.output)
+    plan.output.mkdir(parents=True)
+    calibration = calibrate(plan)
+    received = replay(plan, calibration)
     cal = Calibration.load(calibration)
-    rms = measure(received, cal)
+    rms = measure(plan, received, cal)
 
     print(
         "\nRMS reprojection error in px, grid corners in the live images, magnifications never calibrated:"
     )
-    print(f"{'':40}" + "".join(f"{g:>8}x" for g in REPLAYED) + "      all   paper")
+    print(f"{'':40}" + "".join(f"{g:>8}x" for g in plan.replayed) + "      all   paper")
     rows = []
     for topic, (label, paper) in STAGES.items():
         total = float(np.sqrt(np.mean(np.square(rms[topic]))))
@@ -188,28 +226,28 @@ def main() -> int:
             f"{label:40}" + "".join(f"{v:9.3f}" for v in rms[topic]) + f"{total:9.3f}   {printed}"
         )
 
-    print(describe_visits())
+    print(describe_visits(plan))
     through = set.intersection(*(set(received.images[topic]) for topic in STAGES))
     last = max(through)
     pictures = [
         (f"{label}: last frame", received.images[topic][last])
         for topic, (label, _) in STAGES.items()
     ]
-    stamps = sorted(through & set(stamps_at(REPLAYED[-1], received)))
-    overview(OUTPUT / "overview.png", received.images, stamps, rms, REPLAYED, cal)
+    stamps = sorted(through & set(stamps_at(plan, plan.replayed[-1], received)))
+    overview(plan.output / "overview.png", received.images, stamps, rms, plan.replayed, cal)
     write_correction_report(
         rows,
         pictures,
-        OUTPUT / "correction.html",
+        plan.output / "correction.html",
         title="Live correction of the virtual SEM",
         notes=[
-            f"{FRAMES} frames each at {', '.join(f'{g}x' for g in REPLAYED)}, replayed to the nodes over DDS.",
+            f"{plan.frames} frames each at {', '.join(f'{g}x' for g in plan.replayed)}, replayed to the nodes.",
             "The grid's pose is fitted once per magnification, to the first corrected frame.",
-            describe_visits(),
+            describe_visits(plan),
         ],
     )
     print(
-        f"\nLook at {OUTPUT}/report.html, {OUTPUT}/correction.html and {OUTPUT}/overview.png "
+        f"\nLook at {plan.output}/report.html, {plan.output}/correction.html and {plan.output}/overview.png "
         f"({time.monotonic() - started:.0f} s)"
     )
     return 0

@@ -67,8 +67,6 @@ class LiveSuite:
         self._parameters = {
             "config": config,
             "calibration": str(calibration.absolute()),
-            # Live, the newest frame wins; here all frames are to be measured, however busy the machine is.
-            "qos_overrides./sem/image_raw.subscription.depth": "50",
         }
 
     def __enter__(self) -> LiveSuite:
@@ -77,7 +75,9 @@ class LiveSuite:
             if name == "drift_compensator":
                 del parameters["calibration"]
             if name != "parameter_server":
+                # Live, the newest frame wins; here all frames are to be measured, however busy the machine is.
                 parameters["drift_tracking"] = "every_frame"
+                parameters["qos_overrides./sem/image_raw.subscription.depth"] = "50"
             self._nodes.start(name, parameters)
         rclpy.init()
         self._node = rclpy.create_node("demo", namespace="/sem")

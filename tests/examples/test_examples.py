@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -65,6 +66,37 @@ def follow_tutorial(name: str, folder: Path) -> None:
     # As in the tutorial itself, the example's own command comes first.
     assert listings(page)[0].command.startswith("python -m examples.")
     assert run_page(page, folder, TOLERANCE, but=("python",)) == 1
+
+
+# Five processes must get their turns.
+@pytest.mark.flaky(reruns=1)
+def test_demo(tmp_path: Path) -> None:
+    """What `make demo` runs, with fewer views and frames."""
+    out = tmp_path / "demo"
+    printed = ran("demo", "--output", out)
+    rows = dict(re.findall(r"^(with.*?) {2,}.* ([\d.]+)   [\d.-]+$", printed, re.MULTILINE))
+    error = {name: float(value) for name, value in rows.items()}
+    # Drift moves the last frames by some px, distortion is 1.5 px; a few hundredths are left of both (doc/measured.md).
+    assert list(error) == [
+        "without correction",
+        "with drift correction",
+        "with drift and distortion correction",
+    ]
+    assert error["without correction"] > 1.2 * error["with drift correction"]
+    assert error["with drift correction"] > 0.5
+    assert error["with drift and distortion correction"] < 0.15
+    assert "image_rect         12 messages" in printed
+    assert "p@2345.6 = " in printed
+    for name in ("report.html", "correction.html", "cal.yaml"):
+        assert (out / name).stat().st_size > 5000
+    assert (out / "overview.png").read_bytes()[1:4] == b"PNG"
+    # Somebody's own folder is not replaced.
+    (out / "mine.txt").write_text("mine")
+    command = [sys.executable, "-m", "examples.demo", "--quick", "--output", str(out)]
+    refused = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert "has other files" in refused.stderr
+    assert (out / "cal.yaml").exists()
 
 
 def test_cantilever(tmp_path: Path) -> None:
