@@ -49,7 +49,7 @@ from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.html.encode import encode_png
-from semcal_ros.report.html.style import INK, OURS, SECOND, create_figure, style_axes
+from semcal_ros.report.html.style import INK, OURS, SECOND, add_color_bar, create_figure, style_axes
 from semcal_ros.synthetic.drift import drift_preset
 from semcal_ros.synthetic.specimens.ball import BallPlan, Turning, ball_plan
 
@@ -172,7 +172,7 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
     style_axes(axes, xlabel="X (nm)", ylabel="Y (nm)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
-    figure.colorbar(shown, ax=axes, label="from the true sphere (nm)")
+    add_color_bar(shown, axes, "from the true sphere (nm)")
     axes = figure.add_subplot(1, 2, 2)
     axes.hist(error, bins=31, color=OURS)
     axes.axvline(0.0, color=SECOND, linewidth=1.0)

@@ -68,13 +68,19 @@ def plot_ball(structure: Structure, ball: Ball) -> Figure:
     on_ball = ball.sphere.inliers
     centre = ball.sphere.centre_m
     points = _turn_upright(structure.points_m - centre)
-    near = np.linalg.norm(points, axis=1) < 2.0 * _NM * ball.sphere.radius_m
+    reach = 1.05 * _NM * ball.sphere.radius_m
+    # Outside of its box a 3D axes draws points over the numbers of its axes.
+    in_box = np.all(np.abs(points) < reach, axis=1)
     cloud: Any = figure.add_axes((0.01, 0.06, 0.32, 0.84), projection="3d")
     cloud.scatter(*points[on_ball].T, s=3, c=OURS, label="on the ball")
-    other = near & ~on_ball
+    other = in_box & ~on_ball
     if other.any():
         cloud.scatter(*points[other].T, s=3, c=SECOND, label="not on it")
-    cloud.set_title(counted(np.count_nonzero(on_ball), "point"), fontsize=9, color=INK)
+    title = counted(np.count_nonzero(on_ball), "point")
+    far = np.count_nonzero(~on_ball & ~in_box)
+    if far:
+        title += f", {far} outside of the box"
+    cloud.set_title(title, fontsize=9, color=INK)
     add_legend(cloud, loc="upper left", bbox_to_anchor=(-0.02, 1.04))
     surface: Any = figure.add_axes((0.35, 0.06, 0.32, 0.84), projection="3d")
     vertices = _turn_upright(ball.mesh.vertices_m - centre)
@@ -90,7 +96,6 @@ def plot_ball(structure: Structure, ball: Ball) -> Figure:
     surface.set_title(
         f"mesh: {len(vertices)} vertices, {len(ball.mesh.faces)} faces", fontsize=9, color=INK
     )
-    reach = 1.05 * _NM * ball.sphere.radius_m
     for axes in (cloud, surface):
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
         axes.set_box_aspect((1, 1, 1))

@@ -187,7 +187,8 @@ def plot_poses(agreed: Repeatability) -> Figure:
         lower.set_title(text, fontsize=9, color=INK, loc="left")
     lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     lower.axhline(0.0, color=MUTED, linewidth=0.7)
-    add_legend(upper, loc="upper left")
+    # Above the plot: a beam may bend to either side.
+    add_legend(upper, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.0)
     return figure
 
 

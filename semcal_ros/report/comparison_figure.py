@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +30,20 @@ from semcal_ros.report.html.style import (
     ACCENT,
     INK,
     OURS,
+    add_color_bar,
     choose_arrow_factor,
     create_figure,
     set_magnification_axis,
     style_axes,
     style_field_axes,
 )
+from semcal_ros.report.html.text import format_length
 
 __all__ = ["plot_difference", "write_difference_figure"]
 
 _DPI = 150.0
+# Letters of a line of the title: a line of them is nine of the ten inches of the figure wide.
+_LINE_LENGTH = 100
 
 
 def write_difference_figure(
@@ -66,10 +71,11 @@ def plot_difference(
         (width, height) of the images of the first, px.
     """
     figure = create_figure(10.0, 4.4)
-    figure.suptitle(f"{names[1]} against {names[0]}", fontsize=11)
+    shown = textwrap.fill(f"{names[1]} against {names[0]}", _LINE_LENGTH)
+    figure.suptitle(shown, fontsize=11, color=INK, parse_math=False)
     scale, field = figure.subplots(1, 2)
     _plot_scale(scale, difference)
-    _plot_field(figure, field, max(difference.at, key=lambda one: one.field_sigmas), size)
+    _plot_field(field, max(difference.at, key=lambda one: one.field_sigmas), size)
     return figure
 
 
@@ -86,7 +92,7 @@ def _plot_scale(axes: Axes, difference: CalibrationDifference) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, fontsize=8)
 
 
-def _plot_field(figure: Figure, axes: Axes, worst: DifferenceAt, size: tuple[int, int]) -> None:
+def _plot_field(axes: Axes, worst: DifferenceAt, size: tuple[int, int]) -> None:
     known = np.all(np.isfinite(worst.difference_px), axis=1)
     xy, moved = worst.xy[known], worst.difference_px[known]
     length = np.linalg.norm(moved, axis=1)
@@ -103,9 +109,10 @@ def _plot_field(figure: Figure, axes: Axes, worst: DifferenceAt, size: tuple[int
         cmap="viridis",
         width=0.006,
     )
-    figure.colorbar(arrows, ax=axes, label="difference from the image centre (px)", shrink=0.85)
+    add_color_bar(arrows, axes, "difference from the image centre (px)", shrink=0.85)
+    largest = format_length(worst.worst_px * worst.pixel_size_m)
     axes.set_title(
-        f"at {worst.magnification:.0f}x, arrows {factor:g} times as long: up to {worst.worst_px:.2g} px, "
-        f"{worst.field_sigmas:.1f} sigma",
+        f"at {worst.magnification:.0f}×: up to {worst.worst_px:.2g} px, {largest}, {worst.field_sigmas:.1f} sigma\n"
+        f"arrows {factor:g} times as long",
         fontsize=9,
     )

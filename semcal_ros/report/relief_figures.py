@@ -25,7 +25,7 @@ from semcal_ros.applications.reconstruction.tilt_series import HeightMap
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.report.html.encode import encode_png
-from semcal_ros.report.html.style import create_figure
+from semcal_ros.report.html.style import add_color_bar, create_figure
 
 __all__ = ["plot_relief", "write_relief_figure"]
 
@@ -43,15 +43,17 @@ def plot_relief(heights: HeightMap) -> Figure:
     rows, columns = heights.height_m.shape
     bar = choose_scale_bar(columns, heights.pixel_size_m)
     parts = (
-        ("height (um)", heights.height_m, "viridis"),
-        ("1-sigma (um)", heights.sigma_m, "magma"),
+        ("height", heights.height_m, "viridis"),
+        ("1-sigma of the height", heights.sigma_m, "magma"),
     )
-    for index, (label, values, colours) in enumerate(parts):
+    for index, (name, values, colours) in enumerate(parts):
         axes = figure.add_subplot(1, 2, index + 1)
         axes.set_facecolor("0.8")
-        low, high = np.nanpercentile(1e6 * values, (0.5, 99.5))
-        shown = axes.imshow(1e6 * values, cmap=colours, vmin=low, vmax=high)
-        figure.colorbar(shown, ax=axes, label=label, shrink=0.85)
+        low, high = np.nanpercentile(values, (0.5, 99.5))
+        unit, factor = ("µm", 1e6) if max(abs(low), abs(high)) >= 1e-6 else ("nm", 1e9)
+        low, high = factor * low, factor * high
+        shown = axes.imshow(factor * values, cmap=colours, vmin=low, vmax=high)
+        add_color_bar(shown, axes, f"{name} ({unit})", shrink=0.85)
         left, y = 0.04 * columns, 0.95 * rows
         axes.plot([left, left + bar.length_px], [y, y], color="black", linewidth=5)
         axes.plot([left, left + bar.length_px], [y, y], color="white", linewidth=3)

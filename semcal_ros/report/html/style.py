@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
@@ -41,6 +43,7 @@ __all__ = [
     "OURS",
     "REFERENCE",
     "SECOND",
+    "add_color_bar",
     "add_legend",
     "choose_arrow_factor",
     "choose_log_ticks",
@@ -64,6 +67,8 @@ LIGHT_MAP = LinearSegmentedColormap.from_list("light", ["#ffffff", "#d3e4f3", "#
 _GRID = "#dde2e8"
 # Size of the labels, points.
 _TEXT_PT = 9.0
+# Of the length of a logarithmic axis: "10000×" takes 0.12 of the narrowest axis of a magnification, 3.2 inches.
+_LEAST_TICK_GAP = 0.15
 
 
 def create_figure(width_in: float = 4.2, height_in: float = 3.0) -> Figure:
@@ -93,14 +98,34 @@ def add_legend(axes: Axes, **options: Any) -> None:
     )
 
 
+def add_color_bar(shown: ScalarMappable, axes: Axes, label: str, **options: Any) -> Colorbar:
+    """Add a colour bar with the sizes of type of the other axes."""
+    bar = axes.figure.colorbar(shown, ax=axes, **options)
+    bar.set_label(label, fontsize=_TEXT_PT, color=INK)
+    bar.ax.tick_params(labelsize=_TEXT_PT - 1.0, colors=INK)
+    return bar
+
+
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Choose at least three round numbers from ``low`` to ``high``, if there are that many."""
+    """Choose round numbers from ``low`` to ``high`` whose labels stay apart: at least three, if there are that many."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    for steps in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), tuple(1.0 + 0.5 * k for k in range(18))):
-        ticks = [s * 10.0**d for d in decades for s in steps if low <= s * 10.0**d <= high]
+    choices = [
+        [s * 10.0**d for d in decades for s in steps] for steps in ((1.0,), (1.0, 3.0), (1, 2, 5))
+    ]
+    # Within a decade numbers at equal steps are rounder than those at equal ratios.
+    choices += [[*MaxNLocator(n, steps=[1, 2, 5, 10]).tick_values(low, high)] for n in (4, 6, 10)]
+    least = _LEAST_TICK_GAP * np.log(high / low)
+    best: list[float] = []
+    for choice in choices:
+        ticks: list[float] = []
+        for tick in choice:
+            inside = low <= tick <= high
+            if inside and not (ticks and np.log(tick / ticks[-1]) < least):
+                ticks.append(float(tick))
         if len(ticks) >= 3:
             return ticks
-    return [float(np.sqrt(low * high))]
+        best = max(best, ticks, key=len)
+    return best or [float(np.sqrt(low * high))]
 
 
 def set_magnification_axis(axes: Axes, low: float, high: float) -> None:
@@ -110,7 +135,7 @@ def set_magnification_axis(axes: Axes, low: float, high: float) -> None:
     axes.set_xlim(low / margin, high * margin)
     axes.xaxis.set_major_locator(FixedLocator(choose_log_ticks(low / margin, high * margin)))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda g, _: f"{g:g}×"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda g, _: f"{g:.10g}×"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
