@@ -31,7 +31,7 @@ from semcal_ros.core.errors import Rejection
 SIZE = 256
 DISPLAY_M = 0.12
 HOSTILE = "<script>alert('x')</script>\"><img src=//evil.example/a>"
-VOID = {"meta", "img", "image", "path", "br", "link", "input"}
+VOID = {"meta", "img", "image", "path", "rect", "circle", "line", "br", "link", "input"}
 
 
 def unused(name: str, magnification: float, reason: str, image: Any = None) -> RejectedView:

@@ -76,7 +76,19 @@ def long_words_text() -> str:
     """The calibration page with long words everywhere, without the time that its figures take."""
     long_word = "frame_" + "0123456789" * 12
     row = {"label": long_word, "here": "0.050 px", "paper": "1.45 px (median, section 4.1.3)"}
-    view = {"name": long_word, "magnification": "100×", "corners": 1, "rms": "0.1 px", "ratio": 1.0}
+    view = {
+        **dict.fromkeys(("src", "dots", "arrows", "alt"), ""),
+        "name": long_word,
+        "magnification": "100×",
+        "corners": 1,
+        "rms": "0.1 px",
+        "ratio": 1.0,
+        "facts": [(long_word, long_word)],
+        "caption": long_word,
+        "width": 480,
+        "height": 480,
+        "marks": [{"path": "M1 1l2 2", "text": "0.1 px"}],
+    }
     return render(
         "calibration.html.j2",
         {

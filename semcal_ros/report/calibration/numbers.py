@@ -33,13 +33,11 @@ from semcal_ros.report.html.text import format_length, format_px, remove_control
 __all__ = [
     "PAPER_RMS_PX",
     "MagnificationRow",
-    "ViewRow",
     "collect_facts",
     "collect_warnings",
     "compute_fitted_inner_px",
     "compute_held_out_px",
     "tabulate_magnifications",
-    "tabulate_views",
 ]
 
 # Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
@@ -119,41 +117,6 @@ def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
     rms = rms_by_magnification(result.fit)
     inner = [rms[g] for g in result.model.magnifications[1:-1] if g in result.held_out_rms_px]
     return float(np.sqrt(np.mean(np.square(inner)))) if inner else None
-
-
-@dataclass(frozen=True)
-class ViewRow:
-    """How well one view fits.
-
-    Attributes
-    ----------
-    ratio
-        RMS error over what the 1-sigma of the corners predicts.
-    """
-
-    name: str
-    magnification: str
-    corners: int
-    rms: str
-    ratio: float
-
-
-def tabulate_views(result: CalibrationResult) -> list[ViewRow]:
-    """Tabulate all views; those that fit worst for their uncertainty come first."""
-    rows = []
-    for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
-        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        expected = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
-        rows.append(
-            ViewRow(
-                remove_control_characters(view.name) or "(no name)",
-                f"{view.magnification:g}×",
-                len(residuals),
-                format_px(rms),
-                rms / expected,
-            )
-        )
-    return sorted(rows, key=lambda r: -r.ratio)
 
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:

@@ -58,13 +58,13 @@ from semcal_ros.report.calibration.numbers import (
     compute_fitted_inner_px,
     compute_held_out_px,
     tabulate_magnifications,
-    tabulate_views,
 )
 from semcal_ros.report.calibration.paper import tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import plot_parameters
 from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes
 from semcal_ros.report.calibration.rms_figures import plot_residual_histogram, plot_rms
 from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
+from semcal_ros.report.calibration.worst_views import choose_worst_views
 from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
@@ -79,7 +79,7 @@ _FIRST_OVERLAYS = 8
 _MAX_THUMBNAILS = 12
 # Rows in the list of rejected images, at most.
 _MAX_REJECTED = 200
-# Rows in the table of the views that fit worst.
+# Views that fit worst and can be opened.
 _WORST_VIEWS = 5
 
 
@@ -171,7 +171,7 @@ def write_calibration_report(
             for r in rejected[:_MAX_REJECTED]
         ],
         "rejected_count": len(rejected),
-        "worst_views": tabulate_views(result)[:_WORST_VIEWS],
+        "worst_views": choose_worst_views(result, detections, _WORST_VIEWS),
         "rows": tabulate_magnifications(result),
         "facts": collect_facts(result),
         "images": extra,

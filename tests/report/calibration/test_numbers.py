@@ -51,7 +51,6 @@ from semcal_ros.report.calibration.numbers import (
     compute_fitted_inner_px,
     compute_held_out_px,
     tabulate_magnifications,
-    tabulate_views,
 )
 from semcal_ros.report.calibration.paper import compute_median_px, tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
@@ -236,16 +235,6 @@ def test_focal_length_and_its_interval() -> None:
     groups = plot_parameters(parallel)
     assert [len(group.pictures) for group in groups] == [2, 2, 2, 4]
     assert "not shown" in groups[2].text
-
-
-def test_worst_views_come_first(result: CalibrationResult) -> None:
-    residuals = list(result.fit.residuals_px)
-    residuals[6] = 8.0 * residuals[6]
-    spoilt = replace(result, fit=replace(result.fit, residuals_px=tuple(residuals)))
-    rows = tabulate_views(spoilt)
-    assert rows[0].name == result.views[6].name and rows[0].ratio > 3.0
-    assert [r.ratio for r in rows] == sorted((r.ratio for r in rows), reverse=True)
-    assert any(f"corners of {rows[0].name}" in f for f in collect_warnings(spoilt))
 
 
 def test_what_costs_most_comes_first_and_says_how_many_nm(result: CalibrationResult) -> None:

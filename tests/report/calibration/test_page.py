@@ -47,9 +47,9 @@ from semcal_ros.report.calibration.numbers import (
     compute_fitted_inner_px,
     compute_held_out_px,
     tabulate_magnifications,
-    tabulate_views,
 )
 from semcal_ros.report.calibration.paper import tabulate_beside_paper
+from semcal_ros.report.calibration.worst_views import choose_worst_views
 from semcal_ros.report.html import encode
 from semcal_ros.report.html.page import write_page
 from semcal_ros.report.html.text import format_px
@@ -106,9 +106,10 @@ def test_pictures_are_all_there_with_alt_texts_and_valid_data(page: str) -> None
     # 1 rejected, 1 of the caller.
     assert len(pictures) == 29
     assert all(len(p["alt"] or "") > 5 for p in pictures)
-    overlays = parsed.named("svg")
-    assert len(overlays) == len(parsed.named("image")) == 4
-    assert all("corners" in (o["aria-label"] or "") for o in overlays)
+    drawings = parsed.named("svg")
+    # 4 examples, 5 views that fit worst.
+    assert len(drawings) == len(parsed.named("image")) == 9
+    assert all("corners" in (o["aria-label"] or "") for o in drawings)
     for source in [p["src"] for p in pictures] + [i["href"] for i in parsed.named("image")]:
         match = re.fullmatch(r"data:image/(png|jpeg);base64,(.*)", source or "")
         assert match is not None
@@ -161,8 +162,8 @@ def test_numbers_in_the_page_are_those_of_the_result(page: str, result: Calibrat
     rms, straight = rms_by_magnification(result.fit), compute_rms_without_distortion(result)
     for beside in tabulate_beside_paper(result, rms, straight):
         assert f"{beside.label} {beside.here} {beside.paper}" in text
-    for view in tabulate_views(result)[:5]:
-        assert f"{view.name} {view.magnification} {view.corners} {view.rms}" in text
+    for view in choose_worst_views(result, (), 5):
+        assert f"{view.name}, {view.magnification}: {view.rms}" in text
     for g in result.model.magnification_range:
         camera = result.model.at(g)
         assert camera.covariance is not None

@@ -1,0 +1,275 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The views that fit worst: their pictures or corners, their residuals, and what these look like."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, Array
+from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.coverage import compute_tilts_deg
+from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
+from semcal_ros.report.html.style import choose_arrow_factor
+from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
+
+__all__ = ["WorstView", "choose_worst_views", "describe_pattern"]
+
+# Width of the picture of a view, px: a column of the page.
+_WIDTH = 480
+_JPEG_QUALITY = 75
+# Length of the arrow of a large residual, as a part of the width: neighbouring corners stay apart.
+_ARROW = 0.07
+# Length of the head of an arrow, as a part of its length, and the tangent of half of its angle.
+_HEAD, _HEAD_SLOPE = 0.35, 0.5
+# The longest residuals, whose values are shown when one points at them.
+_WITH_VALUES = 40
+# Deviations of an RMS from what the corners' 1-sigma predicts that are more than chance.
+_DEVIATIONS = 3.0
+# A trend over the field that is worth a word explains more than this part of the squares of the residuals.
+_TREND_SHARE = 0.25
+# The worst corners, and the part of the squares that makes them stand out: by chance they have 0.2 of them.
+_WORST_PART, _WORST_SHARE = 0.05, 0.5
+# Against the median number of corners at this magnification.
+_FEW_CORNERS = 0.5
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The residual of one corner: an SVG path, and its value as text (empty for most)."""
+
+    path: str
+    text: str
+
+
+@dataclass(frozen=True)
+class WorstView:
+    """A view and how it fits.
+
+    Attributes
+    ----------
+    name, magnification, corners, rms
+        Ready to read; the error in px and as a length.
+    ratio
+        RMS error over what the 1-sigma of the corners predicts.
+    facts
+        (name, text) pairs: error, pose, and why it is suspicious.
+    src
+        Data URI of the picture; empty where it is not at hand.
+    width, height
+        Of the drawing, in its units.
+    dots
+        SVG path of the corners.
+    arrows
+        SVG path of the residuals whose values are not shown, and ``marks`` the others.
+    caption
+        Below the drawing.
+    """
+
+    name: str
+    magnification: str
+    corners: int
+    rms: str
+    ratio: float
+    facts: tuple[tuple[str, str], ...]
+    src: str
+    width: int
+    height: int
+    dots: str
+    arrows: str
+    marks: tuple[Mark, ...]
+    alt: str
+    caption: str
+
+
+def choose_worst_views(
+    result: CalibrationResult, detections: Sequence[FoundView], count: int
+) -> list[WorstView]:
+    """Choose the views that fit worst for the uncertainty of their corners, the worst first.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    detections
+        Images of its views, of which those with the same name and magnification are shown.
+    count
+        How many, at most.
+    """
+    ratios = np.array(
+        [
+            _compute_rms_px(residuals) / np.sqrt(2.0 * np.mean(view.sigma_px**2))
+            for view, residuals in zip(result.views, result.fit.residuals_px, strict=True)
+        ]
+    )
+    width, height = result.model.image_size
+    images = {
+        (view.name, view.magnification): view.image
+        for view in detections
+        if view.image is not None and view.image.shape[:2] == (height, width)
+    }
+    tilts = np.stack(compute_tilts_deg(result), axis=1)
+    chosen = np.argsort(-ratios, kind="stable")[:count]
+    return [_describe(result, int(k), float(ratios[k]), tilts[k], images) for k in chosen]
+
+
+def _compute_rms_px(residuals: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
+def _describe(
+    result: CalibrationResult,
+    index: int,
+    ratio: float,
+    tilt_deg: Array,
+    images: dict[tuple[str, float], AnyImage],
+) -> WorstView:
+    view, residuals = result.views[index], result.fit.residuals_px[index]
+    pixel_m = float(np.mean(result.model.at(view.magnification).pixel_size_m))
+    rms_px = _compute_rms_px(residuals)
+    lengths = np.hypot(residuals[:, 0], residuals[:, 1])
+    worst = int(np.argmax(lengths))
+    x, y = view.image_xy[worst]
+    rms = f"{format_px(rms_px)}, {format_length(rms_px * pixel_m)}"
+    turn_deg = np.degrees(
+        np.arctan2(result.fit.rotations[index, 1, 0], result.fit.rotations[index, 0, 0])
+    )
+    origin = ", ".join(
+        f"{axis} {format_length(value)}"
+        for axis, value in zip("xyz", result.fit.translations_m[index], strict=True)
+    )
+    same = [len(v.image_xy) for v in result.views if v.magnification == view.magnification]
+    reasons = describe_pattern(view.image_xy, residuals, ratio)
+    if len(residuals) < _FEW_CORNERS * float(np.median(same)):
+        reasons.append(
+            f"it has {len(residuals)} corners, other views at this magnification {np.median(same):.0f}"
+        )
+    sigma_px = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
+    facts = (
+        ("RMS", f"{rms}: {ratio:.2f} times the noise of its corners ({format_px(sigma_px)})"),
+        (
+            "Largest residual",
+            f"{format_px(float(lengths[worst]))}, {format_length(float(lengths[worst]) * pixel_m)}, "
+            f"at column {x:.0f}, row {y:.0f}",
+        ),
+        ("Corners", f"{len(residuals)}"),
+        (
+            "Pose",
+            f"tilted by {tilt_deg[0]:.1f}° towards {tilt_deg[1]:.0f}°, turned by {turn_deg:.0f}°",
+        ),
+        ("Origin of the grid", origin),
+        ("Why suspicious", "; ".join(reasons)),
+    )
+    name = remove_control_characters(view.name) or "(no name)"
+    image = images.get((view.name, view.magnification))
+    src, size, factor = _draw_picture(image, result.model.image_size)
+    long = choose_arrow_factor(float(np.quantile(lengths, 0.95)) * factor, _ARROW * size[0])
+    # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
+    xy, moves = (view.image_xy + 0.5) * factor, residuals * factor * long
+    named = np.argsort(-lengths)[:_WITH_VALUES]
+    others = np.setdiff1d(np.arange(len(lengths)), named)
+    return WorstView(
+        name=name,
+        magnification=f"{view.magnification:g}×",
+        corners=len(residuals),
+        rms=rms,
+        ratio=ratio,
+        facts=facts,
+        src=src,
+        width=size[0],
+        height=size[1],
+        dots="".join(f"M{a:.1f} {b:.1f}h0" for a, b in xy),
+        arrows="".join(_draw_arrow(xy[k], moves[k]) for k in others),
+        marks=tuple(
+            Mark(
+                _draw_arrow(xy[k], moves[k]),
+                f"{lengths[k]:.3f} px, {format_length(float(lengths[k]) * pixel_m)}",
+            )
+            for k in named
+        ),
+        alt=f"Residuals of {len(residuals)} corners in {name} at {view.magnification:g}x, drawn {long:g} times as long",
+        caption=f"Residuals (found minus predicted), {long:g} times as long as they are"
+        + ("" if src else "; the picture was not kept")
+        + ".",
+    )
+
+
+def describe_pattern(xy: Array, residuals: Array, ratio: float) -> list[str]:
+    """Describe what the residuals of a view look like.
+
+    Parameters
+    ----------
+    xy
+        (n, 2) corners, px.
+    residuals
+        (n, 2) found minus predicted, px.
+    ratio
+        RMS over what the 1-sigma of the corners predicts.
+    """
+    n = len(xy)
+    # The relative 1-sigma of the RMS of 2n normal numbers is 1 / sqrt(4n).
+    if ratio < 1.0 + _DEVIATIONS / np.sqrt(4.0 * n):
+        return ["it is not: its residuals are no larger than the noise of its corners"]
+    reasons = []
+    squares = np.sum(residuals**2, axis=1)
+    total = float(squares.sum())
+    worst = np.sort(squares)[::-1][: max(1, round(_WORST_PART * n))]
+    if n >= 1.0 / _WORST_PART and float(worst.sum()) > _WORST_SHARE * total:
+        reasons.append(
+            f"{len(worst)} of its corners make {100.0 * float(worst.sum()) / total:.0f} % of the squared error: "
+            "dirt, a damaged square or a wrong corner there"
+        )
+    centred = (xy - xy.mean(axis=0)) / max(float(np.ptp(xy)), 1.0)
+    design = np.column_stack([np.ones(n), centred])
+    left = residuals - design @ np.linalg.lstsq(design, residuals, rcond=None)[0]
+    share = 1.0 - float(np.sum(left**2)) / total
+    if n > 12 and share > _TREND_SHARE:
+        reasons.append(
+            f"a stretch or a shear of the whole view makes {100.0 * share:.0f} % of the squared error: "
+            "drift or charging during the frame, or the magnification did not come back"
+        )
+    if not reasons:
+        reasons.append(
+            "its residuals are larger everywhere than the noise of its corners, without a trend: look for blur, "
+            "vibration or a bent grid"
+        )
+    return reasons
+
+
+def _draw_picture(
+    image: AnyImage | None, image_size: tuple[int, int]
+) -> tuple[str, tuple[int, int], float]:
+    """Return the data URI of a picture, the size of the drawing and its scale."""
+    if image is None:
+        factor = _WIDTH / image_size[0]
+        return "", (_WIDTH, max(1, round(factor * image_size[1]))), factor
+    small, factor = shrink(convert_to_8_bits(image), _WIDTH)
+    src = encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY))
+    return src, (small.shape[1], small.shape[0]), factor
+
+
+def _draw_arrow(at: Array, move: Array) -> str:
+    """Draw an SVG path from a corner along its residual, with a head."""
+    across = _HEAD_SLOPE * np.array([-move[1], move[0]])
+    barbs = (-_HEAD * (move - across), -_HEAD * (move + across))
+    one, other = barbs
+    return (
+        f"M{at[0]:.1f} {at[1]:.1f}l{move[0]:.1f} {move[1]:.1f}l{one[0]:.1f} {one[1]:.1f}"
+        f"m{-one[0]:.1f} {-one[1]:.1f}l{other[0]:.1f} {other[1]:.1f}"
+    )
