@@ -25,6 +25,7 @@ from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.coverage import compute_tilts_deg
 from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.wording import counted
 from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
 from semcal_ros.report.html.style import choose_arrow_factor
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
@@ -158,7 +159,7 @@ def _describe(
     reasons = describe_pattern(view.image_xy, residuals, ratio)
     if len(residuals) < _FEW_CORNERS * float(np.median(same)):
         reasons.append(
-            f"it has {len(residuals)} corners, other views at this magnification {np.median(same):.0f}"
+            f"it has {counted(len(residuals), 'corner')}, other views at this magnification {np.median(same):.0f}"
         )
     sigma_px = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
     facts = (
@@ -203,7 +204,8 @@ def _describe(
             )
             for k in named
         ),
-        alt=f"Residuals of {len(residuals)} corners in {name} at {view.magnification:g}x, drawn {long:g} times as long",
+        alt=f"Residuals of {counted(len(residuals), 'corner')} in {name} at {view.magnification:g}x, "
+        f"drawn {long:g} times as long",
         caption=f"Residuals (found minus predicted), {long:g} times as long as they are"
         + ("" if src else "; the picture was not kept")
         + ".",
