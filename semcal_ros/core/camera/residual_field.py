@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Array32
+from semcal_ros.core.arrays import Array, Array32, Indices
 from semcal_ros.core.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -146,25 +146,30 @@ class FieldSlice:
 
     def displacement(self, q: Array) -> Array:
         """Return (n, 2) displacements at normalised raw positions (n, 2); NaN at NaN positions."""
-        out = np.full_like(q, np.nan)
-        known = np.all(np.isfinite(q), axis=1)
+        known = np.isfinite(q).all(axis=1)
+        if not known.all():
+            out = np.full_like(q, np.nan)
+            out[known] = self.displacement(q[known])
+            return out
         ny, nx, _ = self.coefficients.shape
-        x = _spline_rows(q[known, 0], self.knots_x, _DEGREE)
-        y = _spline_rows(q[known, 1], self.knots_y, _DEGREE)
+        x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
+        y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
         along = (y @ self.coefficients.reshape(ny, -1)).reshape(-1, nx, 2)
-        out[known] = np.einsum("na,nac->nc", x, along)
-        return out
+        return np.einsum("na,nac->nc", x, along)
 
-    def on_lattice(self, x: Array, y: Array) -> Array32:
-        """Return (2, len(y), len(x)) displacements at all pairs of normalised raw coordinates.
+    def on_lattice(self, x: Array, y: Array, picked: Indices | None = None) -> Array32:
+        """Return (len(y), len(x), 2) displacements at all pairs of normalised raw coordinates, or (len(picked),
+        len(x), 2) at some of the rows.
 
         Above and below the outermost knots the field goes on in a straight line: no pixel comes from
         there, and a sudden change of its slope is nothing that can be interpolated.
         """
         columns = _lattice_rows(x.tobytes(), self.knots_x.tobytes())
         rows = _lattice_rows(y.tobytes(), self.knots_y.tobytes(), straight=True)
-        coefficients = np.moveaxis(self.coefficients, 2, 0).astype(np.float32)
-        out: Array32 = rows @ (coefficients @ columns.T)
+        if picked is not None:
+            rows = rows[picked]
+        along = columns @ self.coefficients.astype(np.float32)
+        out: Array32 = (rows @ along.reshape(len(along), -1)).reshape(len(rows), len(columns), 2)
         return out
 
     def gradient(self, q: Array) -> Array:

@@ -279,6 +279,11 @@ class ScanCamera:
         """Return pixels in half image widths from the image centre, as for the residual field."""
         return (xy - self._middle) / self.norm_px
 
+    @cached_property
+    def parametric(self) -> ScanCamera:
+        """The camera without its residual field."""
+        return self if self.residual is None else replace(self, residual=None)
+
     def without_residual(self, xy: ArrayLike) -> Array:
         """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
         points = as_points(xy, 2)

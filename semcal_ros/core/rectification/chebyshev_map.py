@@ -22,9 +22,10 @@ from a table (:mod:`semcal_ros.core.rectification.field_table`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
@@ -60,7 +61,7 @@ _SMALL_RESPONSE_PX = 0.005
 _FIELD_DEGREES = (12, 24, 48)
 # Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
 _BEYOND_STEP = 0.125
-# Tables of residual fields that are kept: two magnifications may take turns.
+# Whole tables of residual fields that are kept: two magnifications may take turns.
 _MAX_TABLES = 2
 # Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
 _MAX_KEPT = 16
@@ -186,6 +187,7 @@ class SmoothMaps:
     def __init__(self) -> None:
         self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
         self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
+        self._seen: tuple[object, float] | None = None
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         # By camera: degree, and drift at the first and last pixel, of the last map that was tested.
         self._tested: LruCache[tuple[object, ...], tuple[int, Array] | None] = LruCache(_MAX_TABLES)
@@ -215,30 +217,43 @@ class SmoothMaps:
     ) -> RawMap | None:
         """The map without the field, and the field from a table; None where that is not accurate."""
         width, height = size
-        plain = replace(camera, residual=None)
+        plain = camera.parametric
         moving = None if drift is None else PixelDrift(size, plain, drift, timing)
         path_px = _drift_path(size, moving)
         step = _BEYOND_STEP * height
         beyond = step * min(np.ceil(_largest(path_px) / step), 1.0 / _BEYOND_STEP)
         key = camera_key(size, camera)
-        table = self._tables.get_or_compute(
-            (key, beyond), lambda: tabulate_field(camera, size, beyond)
-        )
-        smooth = None if table is None else self._map_by_polynomials(size, plain, drift, timing)
-        if table is None or smooth is None or smooth._columns is None:
+        table = self._tables.get((key, beyond), None)
+        if table is None and self._seen == (key, beyond):
+            # A camera that is seen twice is likely to be seen again.
+            table = tabulate_field(camera, size, beyond)
+            self._tables.put((key, beyond), table)
+        self._seen = key, beyond
+        smooth = self._map_by_polynomials(size, plain, drift, timing)
+        if smooth._columns is None:
             return None
         response = _response(size, plain, moving, timing)
         tested = self._tested.get(key, None)
+        smooth_degree = len(smooth._columns) - 3
         for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
-            rows = _make_field_rows(height, len(smooth._columns) - 3, degree)
-            undisplaced = rows.at_nodes @ smooth._columns
-            departure = table.invert(undisplaced[:, :width], undisplaced[:, width:])
+            # The nodes of the field carry the rest, too.
+            rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
+            columns = np.empty((len(rows.places) + 2, 2 * width), dtype=np.float32)
+            columns[-2:] = smooth._columns[-2:]
+            np.matmul(rows.at_nodes, smooth._columns[:-2], out=columns[:-2])
+            column = columns[:-2, :width] + columns[-2, :width]
+            row = columns[:-2, width:] + rows.places
+            used = tabulate_field(camera, size, beyond, row) if table is None else table
+            departure = None if used is None else used.invert(column, row)
             if departure is None:
                 return None
-            x, y = np.tensordot(response, departure, axes=1).astype(np.float32)
-            change = max(_largest(x - departure[0]), _largest(y - departure[1]))
-            # As above, the identity comes last.
-            columns = np.vstack([smooth._columns[:-2], np.hstack([x, y]), smooth._columns[-2:]])
+            for axis, factors in enumerate(response.tolist()):
+                part = columns[:-2, axis * width : (axis + 1) * width]
+                for of, factor in enumerate(factors):
+                    if factor != 0.0:
+                        part += np.float32(factor) * departure[..., of]
+            more = np.abs(response - np.eye(2)).sum(axis=1)
+            change = float(more.max()) * cv2.norm(departure, cv2.NORM_INF)
             found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
             is_small = change <= _SMALL_RESPONSE_PX
             tested_px = (
@@ -246,7 +261,7 @@ class SmoothMaps:
             )
             if tested_px is not None and _largest(path_px - tested_px) <= _TESTED_NEARBY * height:
                 return found
-            if _is_accurate(found, plain, response, degree + 1, None if is_small else moving):
+            if _is_accurate(found, plain, departure, None if is_small else moving):
                 self._field_degrees.put(size, degree)
                 self._tested.put(key, (degree, path_px))
                 return found
@@ -335,9 +350,9 @@ def _largest(values: Array | Array32) -> float:
 
 
 def _is_accurate(
-    found: RawMap, plain: ScanCamera, response: Array, nodes: int, moving: PixelDrift | None
+    found: RawMap, plain: ScanCamera, departure: Array32, moving: PixelDrift | None
 ) -> bool:
-    """Whether some pixels of a map with ``nodes`` rows of a field fulfil the equation of the exact position.
+    """Whether some pixels of a map with a departure by a field at its nodes fulfil the equation of the exact position.
 
     The test takes no iteration: where the field moves a raw position to is where the drift and the rest of the camera
     put it. Without ``moving``, the first order of the response is not tested.
@@ -349,18 +364,15 @@ def _is_accurate(
     assert found._columns is not None
     at = _test_pixels(found.size)
     at = at[0], np.union1d(at[1], _find_frame_edges(found))
-    picked = found._columns[:, np.r_[at[0], width + at[0]]]
-    raw, shift = (
-        np.stack([a.ravel() for a in np.split(band.astype(np.float64), 2, axis=1)], axis=1)
-        for band in (
-            found._rows[at[1]] @ picked,
-            found._rows[at[1], -nodes - 2 : -2] @ picked[-nodes - 2 : -2],
-        )
+    rows, picked = found._rows[at[1]], found._columns[:, np.concatenate([at[0], width + at[0]])]
+    raw = (
+        (rows @ picked).reshape(-1, 2, len(at[0])).swapaxes(1, 2).reshape(-1, 2).astype(np.float64)
     )
     # What lies outside of the raw frame comes out black anyway.
     scanned = np.all((raw > -1.0) & (raw < np.array(found.size)), axis=1)
     if moving is None:
-        undisplaced = raw - np.linalg.solve(response, shift.T).T
+        at_nodes = departure[:, at[0]].reshape(len(departure), -1)
+        undisplaced = raw - (rows[:, :-2] @ at_nodes).reshape(-1, 2)
         largest = _MAX_MAP_ERROR_PX
     else:
         # The response is that of the middle of the image and of the frame.
@@ -403,12 +415,15 @@ class _FieldRows:
 
     Attributes
     ----------
+    places
+        (k, 1) rows of the image at which the field is looked up.
     at_nodes
-        (k, nodes + 2): columns without those of the field, to the rows at which the field is looked up.
+        (k, nodes): columns without those of the field, and without the identity, to these rows.
     at_pixels
-        (h, nodes + k + 2): all of them, to the rows of the image.
+        (h, k + 2): these rows and the identity, to the rows of the image.
     """
 
+    places: Array32
     at_nodes: Array32
     at_pixels: Array32
 
@@ -417,9 +432,8 @@ class _FieldRows:
 def _make_field_rows(height: int, degree: int, field_degree: int) -> _FieldRows:
     pixels = np.arange(height, dtype=np.float64)
     places, field = _make_basis(height, field_degree, pixels)
-    smooth = [_make_basis(height, degree, at)[1] for at in (places, pixels)]
-    nodes = np.column_stack([smooth[0], np.ones(len(places)), places])
     return _FieldRows(
-        nodes.astype(np.float32),
-        np.column_stack([smooth[1], field, np.ones(height), pixels]).astype(np.float32),
+        places[:, None].astype(np.float32),
+        _make_basis(height, degree, places)[1].astype(np.float32),
+        np.column_stack([field, np.ones(height), pixels]).astype(np.float32),
     )

@@ -26,11 +26,12 @@ The table is interpolated linearly at positions that OpenCV rounds to 1/32 of it
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import Array32
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["FieldTable", "tabulate_field"]
@@ -44,6 +45,10 @@ _SETTLED_PX = 0.002
 _MAX_STEPS = 12
 # A larger displacement is none of a microscope, and would make a table much larger than the image.
 _LARGEST_PX = 256.0
+# Part of the rows of a table from which it is made as a whole.
+_FEW_ROWS = 0.7
+# Columns and rows are in one map.
+_NO_MAP = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -52,44 +57,55 @@ class FieldTable:
 
     Attributes
     ----------
-    x_px, y_px
-        (rows, columns) each, of the table.
+    back_px
+        (rows, columns, 2) of the table, by x and by y.
     margin_px
         (left, top) pixels from the first column and row of the table to those of the image.
     step_px
         Distance between columns and between rows.
+    strips
+        (n, 1) rows of the table by which each row of look-ups lies farther down in it, where it holds only what is
+        near these; else (1, 1) zero.
     """
 
-    x_px: Array32
-    y_px: Array32
+    back_px: Array32
     margin_px: tuple[float, float]
     step_px: tuple[float, float]
+    strips: Array32
 
-    def invert(self, column: Array32, row: Array32) -> tuple[Array32, Array32] | None:
-        """Return raw minus undisplaced columns and rows at undisplaced ones, or None where that does not settle."""
-        per_x, per_y = (np.float32(1.0 / step) for step in self.step_px)
-        at_x = (column + np.float32(self.margin_px[0])) * per_x
-        at_y = (row + np.float32(self.margin_px[1])) * per_y
-        x, y = self._look_up(at_x, at_y)
+    def invert(self, column: Array32, row: Array32) -> Array32 | None:
+        """Return raw minus undisplaced positions, (n, k, 2), at undisplaced columns and rows, (n, k) each, or None
+        where that does not settle.
+        """
+        count, width = column.shape
+        at = np.empty((count, width, 2), dtype=np.float32)
+        for axis, values in enumerate((column, row)):
+            at[..., axis] = values
+            at[..., axis] += self.margin_px[axis]
+        # A row at a time: numpy is slow along an axis of two.
+        per_px = np.tile([1.0 / step for step in self.step_px], width).astype(np.float32)
+        at.reshape(count, -1)[...] *= per_px
+        at[..., 1] += self.strips
+        found = self._look_up(at)
         for _ in range(_MAX_STEPS):
-            new = self._look_up(at_x + x * per_x, at_y + y * per_y)
-            change = max(float(np.max(np.abs(new[0] - x))), float(np.max(np.abs(new[1] - y))))
-            x, y = new
-            if change <= _SETTLED_PX:
-                return x, y
+            moved = found.reshape(count, -1) * per_px
+            moved += at.reshape(count, -1)
+            before, found = found, self._look_up(moved.reshape(at.shape))
+            if cv2.norm(found, before, cv2.NORM_INF) <= _SETTLED_PX:
+                return found
         return None
 
-    def _look_up(self, column: Array32, row: Array32) -> tuple[Array32, Array32]:
+    def _look_up(self, at: Array32) -> Array32:
         border = cv2.BORDER_REPLICATE
-        x, y = (
-            cv2.remap(plane, column, row, cv2.INTER_LINEAR, borderMode=border)
-            for plane in (self.x_px, self.y_px)
-        )
-        return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
+        found = cv2.remap(self.back_px, at, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
+        return np.asarray(found, dtype=np.float32)
 
 
 def tabulate_field(
-    camera: ScanCamera, size: tuple[int, int], rows_beyond: float = 0.0
+    camera: ScanCamera,
+    size: tuple[int, int],
+    rows_beyond: float = 0.0,
+    near: Array32 | None = None,
 ) -> FieldTable | None:
     """Tabulate the residual field of a camera; None where it is too large.
 
@@ -101,6 +117,8 @@ def tabulate_field(
         (width, height) of its image.
     rows_beyond
         Rows above and below the image up to which the table goes on, px.
+    near
+        (n, k) rows at which the table will be looked up, once: it then holds little else.
     """
     field, norm = camera.residual, camera.norm_px
     assert field is not None
@@ -117,11 +135,32 @@ def tabulate_field(
     ]
     margins[1] += np.ceil(rows_beyond)
     steps = _COLUMN_PX, max(size[1] / _MOST_ROWS, 1.0)
+    columns, rows = _lattice(size, (margins[0], margins[1]), steps)
+    back_px = replace(field, coefficients=-norm * field.coefficients)
+    picked, strips = None, np.zeros((1, 1), np.float32)
+    if near is not None:
+        # What the field displaces stays that near; where it goes on in a straight line, the slope of a cubic spline
+        # is at most six times its largest coefficient per step of its knots.
+        knots = norm * field.knots_y[[3, 4, -5, -4]]
+        reach = largest * (1.0 + 6.0 * rows_beyond / min(knots[1] - knots[0], knots[3] - knots[2]))
+        first = np.floor((near.min(axis=1) - reach + margins[1]) / steps[1]).astype(np.intp) - 1
+        last = np.ceil((near.max(axis=1) + reach + margins[1]) / steps[1]).astype(np.intp) + 1
+        tall = int(np.max(last - first)) + 1
+        if tall * len(first) < _FEW_ROWS * len(rows):
+            picked = np.clip(first[:, None] + np.arange(tall), 0, len(rows) - 1).ravel()
+            strips = (np.arange(len(first)) * tall - first)[:, None].astype(np.float32)
+    table = back_px.on_lattice(columns / norm, rows / norm, picked)
+    return FieldTable(table, (margins[0], margins[1]), steps, strips)
+
+
+@lru_cache(maxsize=4)
+def _lattice(
+    size: tuple[int, int], margins: tuple[float, float], steps: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Columns and rows of a table, px from the middle of the image."""
     columns, rows = (
         np.arange(int((count + 2.0 * margin) / step) + 1, dtype=np.float64) * step
         - (margin + 0.5 * (count - 1))
         for count, margin, step in zip(size, margins, steps, strict=True)
     )
-    back_px = replace(field, coefficients=-norm * field.coefficients)
-    x, y = back_px.on_lattice(columns / norm, rows / norm)
-    return FieldTable(x, y, (margins[0], margins[1]), steps)
+    return columns, rows
