@@ -108,6 +108,7 @@ def long_words_text() -> str:
             **dict.fromkeys(("overlays", "more_overlays", "rejected_images"), ()),
             **dict.fromkeys(("predicted", "residual_field", "rows", "images"), ()),
             "refused_corners": 0,
+            "blink": None,
             "rejected": [(long_word, "100×", long_word)],
             "rejected_count": 1,
             "facts": [("Priors", long_word)],
@@ -158,7 +159,7 @@ def test_page_fits_the_window_without_console_errors(
 
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-def test_the_slider_shows_the_camera_of_its_magnification(
+def test_the_slider_shows_the_camera_of_its_magnification_and_raw_and_corrected_blink(
     page_path: Path, result: CalibrationResult, tmp_path: Path
 ) -> None:
     rows = tabulate_cameras(result.model)
@@ -176,6 +177,14 @@ def test_the_slider_shows_the_camera_of_its_magnification(
             assert page.text("#camera-value-0") == format_length(
                 camera.pixel_size_m[0], camera.pixel_size_sigma_m[0]
             )
+        # Raw first, then the corrected picture at the same place, without a script.
+        visible = "getComputedStyle(document.querySelector('.blink .corrected')).visibility"
+        assert page.evaluate(visible) == "hidden"
+        page.click("label[for=blink-corrected]")
+        page.wait_for(f"{visible} === 'visible'")
+        page.click("label[for=blink-both]")
+        page.wait_for(f"{visible} === 'hidden'")
+        page.wait_for(f"{visible} === 'visible'")
         assert page.console == []
 
 

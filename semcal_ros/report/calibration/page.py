@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.report.calibration.blink import choose_blink
 from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
     plot_coverage,
@@ -160,6 +161,7 @@ def write_calibration_report(
         ],
         "overlays": [overlay_corners(view) for view in first],
         "more_overlays": [overlay_corners(v) for v in shown if all(v is not f for f in first)],
+        "blink": choose_blink(result, detections),
         "refused_corners": sum(d.detection.rejected for d in detections),
         "rejected_images": show_rejected(rejected, _MAX_THUMBNAILS),
         "rejected": [

@@ -75,6 +75,7 @@ SECTIONS = [
     "distortion",
     "pixel-size",
     "parameters",
+    "blink",
     "coverage",
     "corners",
     "rejected",
@@ -107,9 +108,9 @@ def test_pictures_are_all_there_with_alt_texts_and_valid_data(page: str) -> None
     assert len(pictures) == 29
     assert all(len(p["alt"] or "") > 5 for p in pictures)
     drawings = parsed.named("svg")
-    # 4 examples, 5 views that fit worst.
-    assert len(drawings) == len(parsed.named("image")) == 9
-    assert all("corners" in (o["aria-label"] or "") for o in drawings)
+    # 4 examples, 5 views that fit worst, and one view raw and corrected.
+    assert len(drawings) == 10 and len(parsed.named("image")) == 11
+    assert all(re.search("corners|raw", o["aria-label"] or "") for o in drawings)
     for source in [p["src"] for p in pictures] + [i["href"] for i in parsed.named("image")]:
         match = re.fullmatch(r"data:image/(png|jpeg);base64,(.*)", source or "")
         assert match is not None
