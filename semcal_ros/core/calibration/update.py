@@ -187,7 +187,11 @@ def _steps(revision: Revision) -> tuple[Array, Array]:
 
 
 def _apply(revision: Revision) -> CalibrationModel:
-    """The posterior of the coefficients, and of those of the residual field that go with them."""
+    """The posterior of the coefficients.
+
+    The residual field was taken out of the views as it is, so that they say nothing of it: it keeps its values and its
+    covariance, and loses of its correlation with the coefficients what these lose of their uncertainty.
+    """
     model, theta = revision.model, revision.result.state.theta
     steps, root = _steps(revision)
     size = len(root)
@@ -198,13 +202,10 @@ def _apply(revision: Revision) -> CalibrationModel:
     covariance = model.covariance.copy()
     covariance[:size, :size] = steps @ own @ steps.T
     if len(covariance) > size:
-        # The views say nothing of the field but through the coefficients that it is correlated with.
         cross = np.linalg.pinv(root) @ model.covariance[:size, size:]
         gain = own[:, :size]
         covariance[:size, size:] = steps @ gain @ cross
         covariance[size:, :size] = covariance[:size, size:].T
-        left = np.eye(size) - own[:size, :size]
-        covariance[size:, size:] -= cross.T @ left @ cross
     covariance = 0.5 * (covariance + covariance.T)
     functions, start = {}, 0
     for name in FUNCTION_NAMES:

@@ -17,7 +17,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.calibrate import (
+    CalibrationOptions,
+    CalibrationResult,
+    calibrate_views,
+)
 from semcal_ros.core.calibration.update import CalibrationUpdate, update_calibration
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
@@ -25,6 +29,7 @@ from tests.core.calibration.test_check import (
     AXIS,
     CHECKED,
     SEM,
+    VISITS,
     Camera,
     calibrated,
     changed,
@@ -126,3 +131,26 @@ def test_contradictions_and_impossible_ageing_are_refused(calibrated: Calibratio
         update(calibrated, changed(m=0.25), 62)
     with pytest.raises(InvalidValueError, match=r"an ageing of 0\.5; expected 0 to 0\.1"):
         update(calibrated, SEM.camera_at, 62, ageing=0.5)
+
+
+def test_the_residual_field_keeps_its_values_and_its_uncertainty() -> None:
+    """It is taken out of the views as it is, so that they say nothing of it."""
+    before = calibrate_views(
+        simulated(SEM.camera_at, VISITS, 1),
+        image_size=SEM.image_size,
+        display_width_m=SEM.display_width_m,
+        options=CalibrationOptions(axis=AXIS, residual="on"),
+    ).model
+    assert before.residual is not None
+    done = update_calibration(
+        before, simulated(SEM.camera_at, CHECKED, 60), image_size=SEM.image_size, axis=AXIS
+    ).model
+    field = before.residual.size
+    old, new = before.covariance[-field:, -field:], done.covariance[-field:, -field:]
+    assert np.allclose(new, old, rtol=1e-9, atol=1e-9 * np.max(np.abs(old)))
+    assert np.array_equal(done.residual.coefficients, before.residual.coefficients)
+    # With that of the functions it is still a covariance: no correlation exceeds 1.
+    sigma = np.sqrt(np.diag(done.covariance))
+    known = sigma > 0.0
+    correlation = (done.covariance / np.outer(sigma + ~known, sigma + ~known))[np.ix_(known, known)]
+    assert np.linalg.eigvalsh(correlation).min() > -1e-6
