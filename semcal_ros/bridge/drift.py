@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +25,10 @@ from numpy.typing import ArrayLike
 from semcal_ros.bridge.fields import assign_floats
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.errors import InvalidValueError
+
+if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which most nodes do not
+    from semcal_ros.core.drift.estimates import DriftEstimate
 
 __all__ = [
     "UNKNOWN_VARIANCE",

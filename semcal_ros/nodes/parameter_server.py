@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
 from rclpy.clock import Clock
@@ -39,10 +39,12 @@ from semcal_ros.nodes.common.parameters import (
 )
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
-from semcal_ros.nodes.frames.calibration_monitor import MONITOR_PERIOD, CalibrationMonitor
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
+
+if TYPE_CHECKING:
+    from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
 
 __all__ = ["ParameterServer", "main"]
 
@@ -53,6 +55,16 @@ _SIZE = (
     ParameterDeclaration(
         "image_height", 0, "Height of the live frames; 0: that of the calibration.", "px", 0, 65536
     ),
+)
+_MONITOR_PERIOD = ParameterDeclaration(
+    "monitor_period",
+    0.0,
+    "Time between two frames that are looked at: where one shows the grid, the diagnostics say whether the calibration"
+    " still holds. 0: none is.",
+    "s",
+    0.0,
+    86400.0,
+    fixed=True,
 )
 # Time to discover other publishers of a calibration, and to receive a calibration once one is discovered.
 _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
@@ -69,7 +81,7 @@ class ParameterServer(SemNode):
     def __init__(self) -> None:
         super().__init__(
             "parameter_server",
-            (CALIBRATION, REPLAYED_CALIBRATION, OUT_OF_RANGE, *_SIZE, MONITOR_PERIOD),
+            (CALIBRATION, REPLAYED_CALIBRATION, OUT_OF_RANGE, *_SIZE, _MONITOR_PERIOD),
         )
         self._reading: MagnificationReading | None = None
         self._published_g: float | None = None
@@ -95,15 +107,18 @@ class ParameterServer(SemNode):
         self._magnification = MagnificationInput(
             self.config, self.endpoints, self.reporter, self._on_reading
         )
-        self._monitor = None
-        if self.parameters[MONITOR_PERIOD.name] > 0.0:
+        self._monitor: CalibrationMonitor | None = None
+        if self.parameters[_MONITOR_PERIOD.name] > 0.0:
+            # What finds grids and checks calibrations is twice as large as the rest of the node.
+            from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
+
             self._monitor = CalibrationMonitor(
                 self.config,
                 self.endpoints,
                 self.reporter,
                 self._magnification,
                 lambda: (self._calibration.current, self._calibration.config),
-                self.parameters[MONITOR_PERIOD.name],
+                self.parameters[_MONITOR_PERIOD.name],
             )
         self._reload = self.endpoints.trigger_service("~/reload", self._on_reload)
         # A restarted server must not set all nodes back to its file while another node, such as calibration_server,

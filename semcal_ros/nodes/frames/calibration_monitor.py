@@ -38,25 +38,14 @@ from semcal_ros.core.errors import Rejection, SemcalError
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import glimpse_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.workflows.check_and_update import check_found
 
-__all__ = ["MONITOR_PERIOD", "CalibrationMonitor"]
+__all__ = ["CalibrationMonitor"]
 
-MONITOR_PERIOD = ParameterDeclaration(
-    "monitor_period",
-    0.0,
-    "Time between two frames that are looked at: where one shows the grid, the diagnostics say whether the calibration"
-    " still holds. 0: none is.",
-    "s",
-    0.0,
-    86400.0,
-    fixed=True,
-)
 # One check of a hundred calls a valid calibration degraded, and there are thousands of them: so many in a row have to.
 _IN_A_ROW = 2
 # What numerics raise where a view cannot be solved for.

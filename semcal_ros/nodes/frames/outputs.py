@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
@@ -35,14 +35,15 @@ from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import Parameters
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.frames.compressed import CompressedOutput
-from semcal_ros.nodes.frames.live_drift import FrameDrift
 from semcal_ros.nodes.frames.stream import StreamFrame
+
+if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node without drift does not
+    from semcal_ros.nodes.frames.live_drift import FrameDrift
 
 __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 
@@ -181,6 +182,9 @@ class RectifiedOutput:
     def _fill_raw(
         self, message: Any, camera: ScanCamera | None, header: Any, width: int, height: int
     ) -> None:
+        # For a subscriber that most streams do not have: scipy.optimize takes 20 MB and tenths of a second.
+        from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
+
         model = None if camera is None else fit_plumb_bob(camera, width, height)
         if model is not None:
             self._reporter.note("raw_camera_info_error_px", model.worst_px)
