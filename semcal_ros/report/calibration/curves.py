@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -23,11 +25,14 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.report.html.encode import Readings
 from semcal_ros.report.html.style import SECOND
+from semcal_ros.report.html.text import format_magnification
 
 __all__ = [
     "draw_curve",
     "mark_magnifications",
+    "read_curve",
     "sample_cameras",
     "sample_cameras_around",
     "set_limits_with_room",
@@ -98,6 +103,13 @@ def draw_curve(
     low, high = values - half_widths, values + half_widths
     axes.fill_between(g, low, high, color=color, alpha=0.25, linewidth=0)
     axes.plot(g, values, style, color=color, linewidth=1.4, label=label or None)
+
+
+def read_curve(axes: Axes, g: Array, texts: Sequence[str]) -> Readings:
+    """Tell what curves say at every second sample, behind the magnification."""
+    step = 2 if len(g) > _SAMPLES // 2 else 1
+    told = [f"{format_magnification(float(x))}: {text}" for x, text in zip(g, texts, strict=True)]
+    return Readings([axes], g[::step], told[::step])
 
 
 def set_limits_with_room(axes: Axes, values: Array, half_widths: Array) -> None:

@@ -31,6 +31,7 @@ from semcal_ros.core.wording import counted
 from semcal_ros.report.calibration.geometry import compute_displacements, remove_residual_field
 from semcal_ros.report.html.encode import Picture, encode_figure
 from semcal_ros.report.html.style import (
+    INK,
     OURS,
     SECOND,
     choose_arrow_factor,
@@ -38,7 +39,7 @@ from semcal_ros.report.html.style import (
     draw_contours,
     style_field_axes,
 )
-from semcal_ros.report.html.text import format_magnification
+from semcal_ros.report.html.text import format_length, format_magnification
 
 __all__ = [
     "plot_distortion",
@@ -134,6 +135,7 @@ def plot_distortion(camera: ScanCamera) -> Picture:
     xy, moved = compute_displacements(camera)
     g = format_magnification(camera.magnification)
     figure, factor, largest = _draw_displacements(camera, xy, moved)
+    largest_nm = _format_length(camera, largest)
     figure.axes[0].plot(
         [camera.ex], [camera.ey], "+", color=SECOND, markersize=12, markeredgewidth=2
     )
@@ -141,7 +143,7 @@ def plot_distortion(camera: ScanCamera) -> Picture:
         figure,
         f"Displacement of pixels by the distortion at {g}, at most {largest:.3g} px, arrows "
         f"{factor:g} times as long.",
-        f"{g}: at most {largest:.3g} px (numbers on the lines: px); arrows {factor:g} times as "
+        f"{g}: at most {largest:.3g} px, {largest_nm} (numbers on the lines: px); arrows {factor:g} times as "
         "long, + is the centre of the distortion.",
     )
 
@@ -161,11 +163,27 @@ def plot_residual_field(model: CalibrationModel, cameras: Sequence[ScanCamera]) 
                 figure,
                 f"Displacement of pixels by the residual field at {g}, at most {largest:.3g} px, "
                 f"arrows {factor:g} times as long.",
-                f"{g}: at most {largest:.3g} px (numbers on the lines: px); arrows {factor:g} "
+                f"{g}: at most {largest:.3g} px, {_format_length(camera, largest)} (numbers on the lines: px); "
+                f"arrows {factor:g} "
                 "times as long.",
             )
         )
     return pictures
+
+
+def _format_length(camera: ScanCamera, px: float) -> str:
+    """A displacement as a length on the specimen."""
+    return format_length(px * float(np.mean(camera.pixel_size_m)))
+
+
+def _add_length_axis(axes: Axes, camera: ScanCamera) -> None:
+    """Add an axis at the top that has the columns as lengths on the specimen."""
+    pixel_m = camera.pixel_size_m[0]
+    unit, size_m = ("µm", 1e-6) if pixel_m * camera.width >= 1e-6 else ("nm", 1e-9)
+    factor = pixel_m / size_m
+    top = axes.secondary_xaxis("top", functions=(lambda x: factor * x, lambda x: x / factor))
+    top.set_xlabel(f"column ({unit})", fontsize=9, color=INK)
+    top.tick_params(labelsize=8, colors=INK)
 
 
 def _draw_displacements(camera: ScanCamera, xy: Array, moved: Array) -> tuple[Figure, float, float]:
@@ -178,6 +196,7 @@ def _draw_displacements(camera: ScanCamera, xy: Array, moved: Array) -> tuple[Fi
     axes = figure.add_subplot()
     style_field_axes(axes, camera.width, camera.height)
     axes.grid(False)
+    _add_length_axis(axes, camera)
     across = int(np.sum(xy[:, 1] == xy[0, 1]))
     draw_contours(
         axes, xy[:across, 0], xy[::across, 1], lengths.reshape(-1, across), largest, lines=4

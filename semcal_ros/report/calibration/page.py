@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.files.images.scale_bar import format_length as format_rounded
 from semcal_ros.report.calibration.blink import choose_blink
 from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
@@ -224,12 +225,17 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
         (
             "Held-out error",
             format_px(held_out),
-            "RMS of images left out, without the outermost magnifications; "
+            f"{_span_nm(result, {g: px for g, px in result.held_out_rms_px.items() if low < g < high})}; RMS of "
+            "images left out, without the outermost magnifications; "
             f"fitted: {format_px(compute_fitted_inner_px(result))}"
             if held_out is not None
             else "needs 3 magnifications",
         ),
-        ("Error of all views", format_px(result.fit.rms_px()), "RMS of all corners"),
+        (
+            "Error of all views",
+            format_px(result.fit.rms_px()),
+            f"{_span_nm(result, rms_by_magnification(result.fit))}; RMS of all corners",
+        ),
         (
             "Magnification",
             span,
@@ -241,3 +247,15 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
         ("Views", f"{len(result.views)} used", f"{rejected} rejected"),
         ("Corners", f"{corners}", f"{corners / len(result.views):.0f} per view"),
     ]
+
+
+def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:
+    """Errors at some magnifications as lengths, from the least to the largest."""
+    lengths = [
+        px * float(np.mean(result.model.at(g).pixel_size_m))
+        for g, px in rms_px.items()
+        if np.isfinite(px)
+    ]
+    if not lengths:
+        return "no length known"
+    return " to ".join(dict.fromkeys(format_rounded(x, 2) for x in (min(lengths), max(lengths))))

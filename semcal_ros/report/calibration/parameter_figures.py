@@ -29,6 +29,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     draw_curve,
     mark_magnifications,
+    read_curve,
     sample_cameras,
     set_limits_with_room,
 )
@@ -172,7 +173,8 @@ def _plot_panel(
     model: CalibrationModel, panel: _Panel, g: Array, values: Array, sigmas: Array
 ) -> Picture:
     figure = create_figure(4.0, 2.4)
-    _draw_panel(figure.add_subplot(), model, panel, g, values, sigmas)
+    axes = figure.add_subplot()
+    _draw_panel(axes, model, panel, g, values, sigmas)
     first, last = (format_with_sigma(values[k], sigmas[k]) for k in (0, -1))
     # A constant may have a different uncertainty at each end.
     if len(g) > 1 and first == last and np.ptp(values) <= 1e-9 * np.abs(values).max():
@@ -186,6 +188,14 @@ def _plot_panel(
         f"{panel.title} against magnification: {ends}, in {panel.unit}; "
         f"largest 1-sigma {sigmas.max():.2g}.",
         f"{panel.title} ({panel.unit}): {ends}.",
+        read_curve(
+            axes,
+            g,
+            [
+                f"{format_with_sigma(value, sigma)} {panel.unit}"
+                for value, sigma in zip(values, sigmas, strict=True)
+            ],
+        ),
     )
 
 

@@ -24,6 +24,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     draw_curve,
     mark_magnifications,
+    read_curve,
     sample_cameras,
     set_limits_with_room,
 )
@@ -37,7 +38,7 @@ from semcal_ros.report.html.style import (
     set_magnification_axis,
     style_axes,
 )
-from semcal_ros.report.html.text import format_length
+from semcal_ros.report.html.text import format_length, format_with_sigma
 
 __all__ = ["plot_pixel_sizes"]
 
@@ -50,7 +51,7 @@ def plot_pixel_sizes(model: CalibrationModel) -> list[Picture]:
     sigmas = np.array([_get_size_sigma(c) for c in cameras])
     nominal = np.array([1.0 / model.nominal_px_per_m(float(x)) for x in g])
     return [
-        _plot_size(model, g, sizes),
+        _plot_size(model, g, sizes, sigmas),
         _plot_size_interval(model, g, sizes / nominal[:, None], sigmas / nominal[:, None]),
     ]
 
@@ -58,7 +59,7 @@ def plot_pixel_sizes(model: CalibrationModel) -> list[Picture]:
 _DIRECTIONS = (("x (horizontal)", OURS, "-"), ("y (vertical)", SECOND, "--"))
 
 
-def _plot_size(model: CalibrationModel, g: Array, sizes: Array) -> Picture:
+def _plot_size(model: CalibrationModel, g: Array, sizes: Array, sigmas: Array) -> Picture:
     figure = create_figure(4.6, 3.2)
     axes = figure.add_subplot()
     style_axes(axes, xlabel="magnification", ylabel="nm per pixel")
@@ -72,7 +73,17 @@ def _plot_size(model: CalibrationModel, g: Array, sizes: Array) -> Picture:
     ends = [f"{format_length(sizes[k, 0])} at {g[k]:g}×" for k in (0, -1)]
     span = f"from {ends[0]} to {ends[1]}" if len(g) > 1 else ends[0]
     return encode_figure(
-        figure, f"Pixel size against magnification, in x {span}.", f"Size of a pixel; in x {span}."
+        figure,
+        f"Pixel size against magnification, in x {span}.",
+        f"Size of a pixel; in x {span}.",
+        read_curve(
+            axes,
+            g,
+            [
+                f"x {format_length(x, s)}, y {format_length(y, t)}"
+                for (x, y), (s, t) in zip(sizes, sigmas, strict=True)
+            ],
+        ),
     )
 
 
@@ -94,6 +105,14 @@ def _plot_size_interval(model: CalibrationModel, g: Array, ratio: Array, sigma: 
         "to either side.",
         "Deviation from the nominal size, with the 95 % interval, which is at most "
         f"±{worst:.2g} %. Errors of the grid itself are not included.",
+        read_curve(
+            axes,
+            g,
+            [
+                f"x {format_with_sigma(x, s)} %, y {format_with_sigma(y, t)} % (± is 1-sigma)"
+                for (x, y), (s, t) in zip(percent, 100.0 * sigma, strict=True)
+            ],
+        ),
     )
 
 

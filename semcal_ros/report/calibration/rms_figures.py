@@ -26,7 +26,7 @@ from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.residual_pattern import normalise_residuals
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
-from semcal_ros.report.html.encode import Picture, encode_figure
+from semcal_ros.report.html.encode import Picture, Readings, encode_figure
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
@@ -40,6 +40,7 @@ from semcal_ros.report.html.style import (
     set_magnification_axis,
     style_axes,
 )
+from semcal_ros.report.html.text import format_length, format_magnification, format_px
 
 __all__ = ["plot_residual_histogram", "plot_rms"]
 
@@ -61,9 +62,11 @@ def plot_rms(
     held = np.array([result.held_out_rms_px.get(float(x), np.nan) for x in g])
     uncorrected = np.array([straight.get(float(x), np.nan) for x in g])
     noise = _predict_rms(result, g)
-    figure = create_figure(4.6, 3.9)
-    axes = figure.add_subplot()
-    style_axes(axes, xlabel="magnification", ylabel="RMS error (px)")
+    pixel_nm = np.array([1e9 * np.mean(result.model.at(float(x)).pixel_size_m) for x in g])
+    figure = create_figure(4.6, 5.4)
+    axes, lengths = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    style_axes(axes, xlabel="", ylabel="RMS error (px)")
+    style_axes(lengths, xlabel="magnification", ylabel="RMS error (nm)")
     beside = PAPER_RMS_PX if paper else ()
     for value, style in zip(beside, ("--", "-."), strict=False):
         axes.axhline(
@@ -75,11 +78,17 @@ def plot_rms(
     axes.plot(g, values, "o-", color=OURS, markersize=4, linewidth=1.2, label="all views fitted")
     axes.plot(g, noise, "_", color=ACCENT, markersize=9, markeredgewidth=1.6, label="corner noise")
     _plot_held_out(axes, g, held)
-    set_magnification_axis(axes, g[0], g[-1])
+    lengths.plot(g, values * pixel_nm, "o-", color=OURS, markersize=4, linewidth=1.2)
+    _plot_held_out(lengths, g, held * pixel_nm)
+    set_magnification_axis(lengths, g[0], g[-1])
+    in_nm = np.concatenate([values, held]) * np.concatenate([pixel_nm, pixel_nm])
+    in_nm = in_nm[np.isfinite(in_nm) & (in_nm > 0.0)]
+    set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
     shown = np.concatenate([values, held, uncorrected, noise, beside])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     set_log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
     add_legend(axes, loc="upper center", ncols=2)
+    figure.align_ylabels([axes, lengths])
     return encode_figure(
         figure,
         f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px"
@@ -88,7 +97,25 @@ def plot_rms(
         "calibration from all other magnifications. Hollow: the lowest and highest one, which are "
         "extrapolated in this test. Corner noise: what the uncertainty of the corners alone "
         "explains.",
+        Readings(
+            [axes, lengths],
+            g,
+            [
+                f"{format_magnification(x)}: fitted {_format_error(fitted, nm)}; "
+                f"held out {_format_error(left_out, nm)}; distortion left in {_format_error(left_in, nm)}"
+                for x, nm, fitted, left_out, left_in in zip(
+                    g, pixel_nm, values, held, uncorrected, strict=True
+                )
+            ],
+        ),
     )
+
+
+def _format_error(px: float, pixel_nm: float) -> str:
+    """An error in px and as a length; a dash where it is not known."""
+    if not np.isfinite(px):
+        return format_px(px)
+    return f"{format_px(px)}, {format_length(1e-9 * px * pixel_nm)}"
 
 
 def _predict_rms(result: CalibrationResult, g: Array) -> Array:

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -29,6 +31,7 @@ from semcal_ros.core.camera.predicted_error import (
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     mark_magnifications,
+    read_curve,
     sample_cameras,
     sample_cameras_around,
 )
@@ -47,7 +50,7 @@ from semcal_ros.report.html.style import (
     style_axes,
     style_field_axes,
 )
-from semcal_ros.report.html.text import format_magnification
+from semcal_ros.report.html.text import format_length, format_magnification
 
 __all__ = ["plot_predicted_errors"]
 
@@ -187,7 +190,8 @@ def _plot_fields(model: CalibrationModel, worst: ScanCamera) -> Picture:
         if k < len(cameras) - columns:
             axes.set_xlabel("")
     peaks = ", ".join(
-        f"{np.nanmax(t):.2g} px at {format_magnification(c.magnification)}"
+        f"{np.nanmax(t):.2g} px ({format_length(float(np.nanmax(t) * np.mean(c.pixel_size_m)))}) at "
+        f"{format_magnification(c.magnification)}"
         for c, t in zip(cameras, tables, strict=True)
         if _has_finite(t)
     )
@@ -220,9 +224,11 @@ def _plot_curves(
     g = np.array([c.magnification for c in cameras])
     aligned = np.stack([predict_aligned_sigma_px(c, lattice) for c in cameras])
     total = max(float(np.nanmax(c.project_sigma(c.sem_from_ideal(lattice)))) for c in cameras)
-    figure = create_figure(4.6, 3.6)
-    axes = figure.add_subplot()
-    style_axes(axes, xlabel="magnification", ylabel="predicted 1-sigma (px)")
+    pixel_nm = np.array([1e9 * np.mean(c.pixel_size_m) for c in cameras])
+    figure = create_figure(4.6, 5.0)
+    axes, lengths = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    style_axes(axes, xlabel="", ylabel="predicted 1-sigma (px)")
+    style_axes(lengths, xlabel="magnification", ylabel="predicted 1-sigma (nm)")
     mark = "o" if len(g) == 1 else ""
     shown = []
     for values, color, line, label in (
@@ -232,14 +238,19 @@ def _plot_curves(
         (np.sqrt(np.nanmean(aligned**2, axis=1)), INK, ":", "pose fitted, RMS"),
     ):
         axes.plot(g, values, mark + line, color=color, linewidth=1.5, label=label)
+        lengths.plot(g, values * pixel_nm, mark + line, color=color, linewidth=1.5)
         shown.append(values)
     positive = np.concatenate(shown)
     positive = positive[np.isfinite(positive) & (positive > 0.0)]
-    set_magnification_axis(axes, g[0], g[-1])
+    set_magnification_axis(lengths, g[0], g[-1])
     if positive.size:
         set_log_axis_y(axes, 0.6 * float(positive.min()), 8.0 * float(positive.max()))
-    mark_magnifications(axes, model)
+        in_nm = np.concatenate([values * pixel_nm for values in shown])
+        in_nm = in_nm[np.isfinite(in_nm) & (in_nm > 0.0)]
+        set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
+    mark_magnifications(lengths, model)
     add_legend(axes, loc="upper center", ncols=1)
+    figure.align_ylabels([axes, lengths])
     worst, left = float(np.nanmax(shape)), float(np.nanmax(aligned))
     return encode_figure(
         figure,
@@ -249,4 +260,16 @@ def _plot_curves(
         "errors of the fit do not show, because a wrong scale and a wrong height of the grid look "
         f"alike. With shift, turn and scale fitted, {left:.2g} px are left. A shift that is common "
         f"to the whole image brings the error of an absolute position to {total:.2g} px.",
+        replace(
+            read_curve(
+                axes,
+                g,
+                [
+                    f"relative to the centre at most {a:.2g} px, {format_length(1e-9 * a * nm)}; pose fitted at most "
+                    f"{b:.2g} px, {format_length(1e-9 * b * nm)}"
+                    for a, b, nm in zip(shown[0], shown[2], pixel_nm, strict=True)
+                ],
+            ),
+            axes=[axes, lengths],
+        ),
     )

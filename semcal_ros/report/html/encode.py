@@ -24,16 +24,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib writes its PNG files with it
 
-from semcal_ros.core.arrays import check_image
+from semcal_ros.core.arrays import Array, check_image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.html.text import remove_control_characters
 
 __all__ = [
     "Picture",
+    "Readings",
+    "Strip",
     "convert_to_8_bits",
     "encode_data_uri",
     "encode_figure",
@@ -48,6 +51,8 @@ __all__ = [
 _FIGURE_DPI = 192.0
 # By the definition of CSS.
 _CSS_PX_PER_INCH = 96.0
+# How far from a point of a curve its value is told, CSS px: about the width of a finger.
+_REACH_PX = 16.0
 # Antialiased line drawings need no more colours; the file is three times smaller than in RGB.
 _COLORS = 128
 # Quality of JPEG files. Images given by the caller are the subject of a page, and get more.
@@ -56,6 +61,36 @@ _JPEG_QUALITY = 82
 _CALLER_QUALITY = 88
 # Width of images given by the caller, px: that of a column of the page.
 _CALLER_WIDTH = 640
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Values of curves at some places along their common horizontal axis.
+
+    Attributes
+    ----------
+    axes
+        The plots, above each other.
+    x
+        (n,) places, ascending, in data.
+    texts
+        What is told at each.
+    """
+
+    axes: Sequence[Axes]
+    x: Array
+    texts: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A rectangle of an image, CSS px from its upper left corner, and what it tells."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    text: str
 
 
 @dataclass(frozen=True)
@@ -72,6 +107,8 @@ class Picture:
         Sentence below the image; may be empty.
     width, height
         Size in CSS px at which the text in the image has its normal size.
+    strips
+        Parts of the image that tell values when one points at them.
     """
 
     src: str
@@ -79,6 +116,7 @@ class Picture:
     caption: str
     width: int
     height: int
+    strips: tuple[Strip, ...] = ()
 
 
 def encode_data_uri(kind: str, data: bytes) -> str:
@@ -86,12 +124,37 @@ def encode_data_uri(kind: str, data: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def encode_figure(figure: Figure, alt: str, caption: str = "") -> Picture:
+def encode_figure(
+    figure: Figure, alt: str, caption: str = "", readings: Readings | None = None
+) -> Picture:
     """Encode a figure for a page, and clear it to free its memory."""
     width, height = figure.get_size_inches() * _CSS_PX_PER_INCH
     source = encode_data_uri("png", encode_png(figure, _FIGURE_DPI))
+    # The layout is known once the figure has been drawn.
+    strips = () if readings is None else _place(figure, readings)
     figure.clear()
-    return Picture(source, alt, caption, round(float(width)), round(float(height)))
+    return Picture(source, alt, caption, round(float(width)), round(float(height)), strips)
+
+
+def _place(figure: Figure, readings: Readings) -> tuple[Strip, ...]:
+    """Divide the plots into strips, one around each place."""
+    scale = _CSS_PX_PER_INCH / figure.dpi
+    boxes = [axes.get_window_extent() for axes in readings.axes]
+    low, high = min(box.y0 for box in boxes), max(box.y1 for box in boxes)
+    bottom = readings.axes[-1].get_ylim()[0]
+    at = np.array([(float(x), bottom) for x in readings.x])
+    px = readings.axes[-1].transData.transform(at)[:, 0]
+    middles = 0.5 * (px[1:] + px[:-1])
+    left = np.maximum(np.concatenate([[boxes[0].x0], middles]), px - _REACH_PX / scale)
+    right = np.minimum(np.concatenate([middles, [boxes[0].x1]]), px + _REACH_PX / scale)
+    top = figure.bbox.y1 - high
+    return tuple(
+        Strip(
+            *(round(float(scale * v), 1) for v in (first, top, last - first, high - low)),
+            text=text,
+        )
+        for first, last, text in zip(left, right, readings.texts, strict=True)
+    )
 
 
 def encode_png(figure: Figure, dpi: float, *, keep_rare_colors: bool = False) -> bytes:

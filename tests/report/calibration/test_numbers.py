@@ -313,8 +313,10 @@ def test_predictions_need_a_covariance(result: CalibrationResult) -> None:
     lattice = make_field_lattice(SIZE, SIZE, 17)
     low, high = result.model.magnification_range
     for g in (low, high):
-        peak = f"{np.max(predict_shape_sigma_px(result.model.at(g), lattice)):.2g} px at {g:g}×"
-        assert peak in pictures[1].caption
+        camera = result.model.at(g)
+        px = float(np.max(predict_shape_sigma_px(camera, lattice)))
+        length = format_length(px * float(np.mean(camera.pixel_size_m)))
+        assert f"{px:.2g} px ({length}) at {g:g}×" in pictures[1].caption
     bare: Any = SimpleNamespace(
         magnification_range=(low, low), image_size=(SIZE, SIZE), at=lambda _: camera_at(low)
     )
