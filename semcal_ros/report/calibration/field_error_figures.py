@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -181,7 +182,9 @@ def _add_length_axis(axes: Axes, camera: ScanCamera) -> None:
     pixel_m = camera.pixel_size_m[0]
     unit, size_m = ("µm", 1e-6) if pixel_m * camera.width >= 1e-6 else ("nm", 1e-9)
     factor = pixel_m / size_m
-    top = axes.secondary_xaxis("top", functions=(lambda x: factor * x, lambda x: x / factor))
+    top = axes.secondary_xaxis(
+        "top", functions=(partial(np.multiply, factor), partial(np.multiply, 1.0 / factor))
+    )
     top.set_xlabel(f"column ({unit})", fontsize=9, color=INK)
     top.tick_params(labelsize=8, colors=INK)
 

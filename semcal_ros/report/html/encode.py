@@ -148,11 +148,12 @@ def _place(figure: Figure, readings: Readings) -> tuple[Strip, ...]:
     left = np.maximum(np.concatenate([[boxes[0].x0], middles]), px - _REACH_PX / scale)
     right = np.minimum(np.concatenate([middles, [boxes[0].x1]]), px + _REACH_PX / scale)
     top = figure.bbox.y1 - high
+
+    def to_css(dots: float) -> float:
+        return round(float(scale * dots), 1)
+
     return tuple(
-        Strip(
-            *(round(float(scale * v), 1) for v in (first, top, last - first, high - low)),
-            text=text,
-        )
+        Strip(to_css(first), to_css(top), to_css(last - first), to_css(high - low), text)
         for first, last, text in zip(left, right, readings.texts, strict=True)
     )
 
