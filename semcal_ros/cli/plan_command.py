@@ -32,6 +32,7 @@ from semcal_ros.cli.options import (
 )
 from semcal_ros.cli.output import echo_json, echo_table
 from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, ViewPlan, plan_views
+from semcal_ros.core.calibration.update import DEFAULT_AGEING
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
 
@@ -54,6 +55,14 @@ __all__ = ["command"]
     show_default=True,
     help="Propose at most so many visits.",
 )
+@click.option(
+    "--ageing",
+    default=f"{100.0 * DEFAULT_AGEING:g}%",
+    show_default=True,
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="1-sigma of a relative change of the scale until the views are recorded, as of `semcal update`.",
+)
 @squares_option(
     "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
 )
@@ -63,6 +72,7 @@ def command(
     calibration: Path,
     target: float,
     visits: int,
+    ageing: float,
     squares: tuple[float, ...] | None,
     config: str,
     as_json: bool,
@@ -77,7 +87,13 @@ def command(
     """
     model = Calibration.load(calibration)
     microscope = resolve_config(config, model)
-    plan = plan_views(model, target, squares_m=squares or microscope.squares_m, most_visits=visits)
+    plan = plan_views(
+        model,
+        target,
+        squares_m=squares or microscope.squares_m,
+        most_visits=visits,
+        ageing=ageing,
+    )
     if as_json:
         echo_json(asdict(plan))
     else:

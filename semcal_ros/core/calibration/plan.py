@@ -32,7 +32,8 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.calibration.bundle_adjustment import refine
 from semcal_ros.core.calibration.normal_equations import Effects, State, make_problem
 from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors
-from semcal_ros.core.calibration.revision import positive_number
+from semcal_ros.core.calibration.revision import CHANGING, positive_number
+from semcal_ros.core.calibration.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
     FUNCTION_NAMES,
@@ -110,6 +111,7 @@ def plan_views(
     squares_m: Sequence[float],
     most_visits: int = 10,
     single_setting: bool = True,
+    ageing: float = 0.0,
 ) -> ViewPlan:
     """Choose visits until the relative 1-sigma of nm per pixel is below a target in the whole calibrated range.
 
@@ -126,6 +128,9 @@ def plan_views(
     single_setting
         Whether the sigmas are those of a user who sets the magnification once, with the part that no view lowers
         (:attr:`ViewPlan.floor`); otherwise those of the calibration itself, which views can make as small as wanted.
+    ageing
+        1-sigma of a relative change of the scale until the views are recorded, as that of
+        :func:`~semcal_ros.core.calibration.update.update_calibration`; 0 for views of the same session.
 
     Raises
     ------
@@ -140,7 +145,7 @@ def plan_views(
     low, high = model.magnification_range
     judged = np.geomspace(low, high, _JUDGED) if high > low else np.array([low])
     candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
-    root = _root(model)
+    root = np.concatenate([_root(model), _aged(model, ageing)], axis=1)
     rows = np.stack([_pixel_rows(model, float(g)) @ root for g in judged])  # (G, 2, K)
     floor = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
     fixed = floor if single_setting else np.zeros_like(floor)
@@ -160,7 +165,11 @@ def plan_views(
         worst = int(np.argmax(total))
         return float(total[worst]), worst
 
-    largest, worst = judge(precision)
+    present = precision.copy()
+    # Until views are used, the calibration is taken as it was when it was made.
+    size = len(root)
+    present[size:, size:] *= 1e12
+    largest, worst = judge(present)
     start = worst_pixel_size(model) if single_setting else (largest, float(judged[worst]))
     visits: list[PlannedVisit] = []
     while largest > target and len(visits) < most_visits:
@@ -185,6 +194,15 @@ def _root(model: CalibrationModel) -> Array:
     size = sum(model.functions[name].size for name in FUNCTION_NAMES)
     variances, directions = np.linalg.eigh(model.covariance[:size, :size])
     return directions * np.sqrt(np.maximum(variances, 0.0))
+
+
+def _aged(model: CalibrationModel, ageing: float) -> Array:
+    """(K, P) what may have changed since the calibration, one sigma of each; nothing without ageing."""
+    changes = change_directions(model, model.image_width)
+    if ageing == 0.0:
+        return changes[:, :0]
+    sigmas = ageing_sigmas(ageing, model.image_width)
+    return changes * [sigmas[name] for name in CHANGING]
 
 
 def _design(model: CalibrationModel, g: float) -> Array:

@@ -48,7 +48,13 @@ from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-__all__ = ["DEFAULT_AGEING", "CalibrationUpdate", "update_calibration"]
+__all__ = [
+    "DEFAULT_AGEING",
+    "CalibrationUpdate",
+    "ageing_sigmas",
+    "change_directions",
+    "update_calibration",
+]
 
 #: 1-sigma of a relative change of the scale since the calibration that the views need not prove: half of the 1 %
 #: that makers promise of the stability of a magnification.
@@ -132,11 +138,7 @@ def update_calibration(
     setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
     free = free_sigmas(setup)
     proven = {name for change in check.changes for name in CHANGES[change.name]}
-    # The scale displaces the edge by ageing x half a width; so do xi_r and xi_t there, at a distance of 1. The
-    # centre of the distortion moves by that displacement itself.
-    part = _SHAPE_PART * ageing
-    aged = dict.fromkeys(CHANGING, part) | dict.fromkeys(("ex", "ey"), part * 0.5 * image_size[0])
-    aged["scale"] = ageing
+    aged = ageing_sigmas(ageing, image_size[0])
     sigmas = {name: free[name] if name in proven else aged[name] for name in CHANGING}
     revision = revise(model, setup, sigmas)
     rms_px = float(np.sqrt(np.mean(np.sum(revision.result.residuals_px**2, axis=1))))
@@ -154,6 +156,50 @@ def update_calibration(
     return CalibrationUpdate(replace(renewed, statistics=statistics), check, ageing, rms_px)
 
 
+def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:
+    """Return the prior 1-sigma of each of :data:`~semcal_ros.core.calibration.revision.CHANGING`.
+
+    Parameters
+    ----------
+    ageing
+        That of the scale, relative.
+    image_width
+        Of the images in whose pixels a centre moves.
+    """
+    # The scale displaces the edge by ageing x half a width; so do xi_r and xi_t there, at a distance of 1. The
+    # centre of the distortion moves by that displacement itself.
+    part = _SHAPE_PART * ageing
+    sigmas = dict.fromkeys(CHANGING, part) | dict.fromkeys(("ex", "ey"), part * 0.5 * image_width)
+    return sigmas | {"scale": ageing}
+
+
+def change_directions(model: CalibrationModel, image_width: int) -> Array:
+    """Return the change (K, P) of a calibration's coefficients per unit of each of the things that may change.
+
+    Parameters
+    ----------
+    model
+        The calibration.
+    image_width
+        Of the images in whose pixels a centre moves.
+    """
+    functions = [model.functions[name] for name in FUNCTION_NAMES]
+    starts = np.cumsum([0, *(own.size for own in functions)])
+    # Images of another size have their centre at another pixel, in other units.
+    per_px = model.image_width / image_width
+    changes = np.zeros((int(starts[-1]), len(CHANGING)))
+    for column, name in enumerate(CHANGING):
+        k = FUNCTION_NAMES.index(name)
+        own = slice(int(starts[k]), int(starts[k + 1]))
+        if name == "scale":
+            changes[own, column] = functions[k].coefficients
+        else:
+            changes[own, column] = _constant(functions[k]) * (
+                per_px if name in ("ex", "ey") else 1.0
+            )
+    return changes
+
+
 def _constant(function: ContinuousFunction) -> Array:
     """Coefficients with which a function is 1 at all magnifications."""
     grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
@@ -166,23 +212,10 @@ def _steps(revision: Revision) -> tuple[Array, Array]:
     former alone.
     """
     model = revision.model
-    functions = [model.functions[name] for name in FUNCTION_NAMES]
-    starts = np.cumsum([0, *(own.size for own in functions)])
-    size = int(starts[-1])
+    size = sum(model.functions[name].size for name in FUNCTION_NAMES)
     variances, directions = np.linalg.eigh(model.covariance[:size, :size])
     root = directions * np.sqrt(np.maximum(variances, 0.0))
-    # Images of another size have their centre at another pixel, in other units.
-    per_px = model.image_width / revision.setup.image_size[0]
-    changes = np.zeros((size, len(CHANGING)))
-    for column, name in enumerate(CHANGING):
-        k = FUNCTION_NAMES.index(name)
-        own = slice(int(starts[k]), int(starts[k + 1]))
-        if name == "scale":
-            changes[own, column] = functions[k].coefficients
-        else:
-            changes[own, column] = _constant(functions[k]) * (
-                per_px if name in ("ex", "ey") else 1.0
-            )
+    changes = change_directions(model, revision.setup.image_size[0])
     return np.concatenate([root, changes], axis=1), root
 
 

@@ -73,6 +73,22 @@ def test_the_plan_predicts_what_its_views_bring(poor: CalibrationModel) -> None:
     assert worst(after) < 0.7 * np.median(others)
 
 
+def test_the_plan_allows_for_what_may_change_until_then(poor: CalibrationModel) -> None:
+    """As `semcal update` does, whose prior of the ageing is the same."""
+    ageing = 5e-3
+    planned = plan_views(poor, 1e-6, squares_m=SQUARES_M, most_visits=4, ageing=ageing)
+    # Until it is used, the calibration is what it is.
+    assert planned.largest == pytest.approx(worst(poor), rel=1e-6)
+    visits = tuple(visit.magnification for visit in planned.visits)
+    for count in (1, 4):
+        views = simulated(SEM.camera_at, visits[:count], 77)
+        size = SEM.image_size
+        after = update_calibration(poor, views, image_size=size, axis=AXIS, ageing=ageing).model
+        assert worst(after) == pytest.approx(planned.visits[count - 1].largest, rel=0.15)
+    # One visit tells less if the scale may have changed.
+    assert planned.visits[0].largest > plan(poor, 1e-6, 1).visits[0].largest
+
+
 def test_a_target_that_is_met_needs_nothing(poor: CalibrationModel) -> None:
     planned = plan(poor, 0.05, 4)
     assert planned.reached and planned.visits == ()
