@@ -167,7 +167,7 @@ def command(
     click.echo(f"calibration: {output}")
     if report is not None:
         with show_progress("writing the report"):
-            _write_report(done, report, f"Calibration from {recording.name}", paper)
+            _write_report(done, report, f"Calibration from {recording.name}", paper, output)
         click.echo(f"report: {report}")
 
 
@@ -285,7 +285,9 @@ def _format_values(values: Sequence[float]) -> list[str]:
     return [f"{value:.8g}" for value in values]
 
 
-def _write_report(done: RecordingCalibration, path: Path, title: str, paper: bool) -> None:
+def _write_report(
+    done: RecordingCalibration, path: Path, title: str, paper: bool, calibration: Path
+) -> None:
     from semcal_ros.report import write_calibration_report
 
     write_calibration_report(
@@ -295,4 +297,5 @@ def _write_report(done: RecordingCalibration, path: Path, title: str, paper: boo
         rejected=done.collected.rejected,
         title=title,
         paper=paper,
+        calibration=str(calibration),
     )

@@ -99,6 +99,7 @@ def long_words_text() -> str:
             ],
             "slider": "",
             "verdict": [long_word],
+            "commands": [(long_word, f"semcal plan {long_word}.yaml --target 0.1%")],
             "warnings": [long_word],
             "paper": [row],
             "worst_views": [view],

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import os
+import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
@@ -54,6 +55,7 @@ from semcal_ros.report.calibration.field_error_figures import (
     plot_residuals,
 )
 from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
+from semcal_ros.report.calibration.next_step import suggest_commands
 from semcal_ros.report.calibration.numbers import (
     collect_facts,
     collect_warnings,
@@ -94,6 +96,7 @@ def write_calibration_report(
     images: Sequence[tuple[str, NDArray[Any]]] = (),
     title: str = "SEM calibration",
     paper: bool = False,
+    calibration: str = "",
 ) -> Path:
     """Write one self-contained HTML file about a calibration.
 
@@ -113,6 +116,8 @@ def write_calibration_report(
         Heading of the page.
     paper
         Whether an appendix compares the errors with those that the paper prints.
+    calibration
+        File of the calibration, for the commands of what to do next; without it they are left out.
 
     Returns
     -------
@@ -137,6 +142,10 @@ def write_calibration_report(
     values = {
         "title": remove_control_characters(title),
         "verdict": [_sentence(text) for text in (verdict.describe(), verdict.advise()) if text],
+        "commands": [
+            (what, remove_control_characters(command))
+            for what, command in suggest_commands(verdict, calibration)
+        ],
         "summary": _summarise(result, len(rejected)),
         "warnings": collect_warnings(result, rejected),
         "cameras": tabulate_cameras(model),
@@ -185,7 +194,8 @@ def write_calibration_report(
 def _sentence(text: str) -> str:
     """What the terminal says, as a page says it; Nm would be newton metres."""
     text = text.replace("nm per px is known", "The scale (nm per px) is known", 1)
-    return text[:1].upper() + text[1:].replace("+-", "±") + "."
+    text = re.sub(r"(\d)x\b", r"\1×", text.replace("+-", "±").replace(" um ", " µm "))
+    return text[:1].upper() + text[1:] + "."
 
 
 def _slider_script() -> str:
