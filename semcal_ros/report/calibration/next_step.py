@@ -24,6 +24,9 @@ from semcal_ros.core.calibration.verdict import Verdict
 
 __all__ = ["suggest_commands"]
 
+# The verdict's figure is without ageing; a little leaves room for what an hour changes.
+_SAME_SESSION = ("--ageing", "0.01%")
+
 
 def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]]:
     """Suggest what to run next.
@@ -47,7 +50,7 @@ def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]
     if visit is None:
         if not math.isfinite(verdict.floor):
             return []
-        budget = ["semcal", "at", calibration, f"{verdict.at:.4g}", "--budget"]
+        budget = ["semcal", "at", calibration, f"{float(f'{verdict.at:.4g}'):g}", "--budget"]
         return [("What the uncertainty consists of:", shlex.join(budget))]
     # No lower than what the visit reaches, so that the plan ends with it.
     percent = 100.0 * visit.largest
@@ -58,10 +61,10 @@ def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]
     return [
         (
             "What to set and how to tilt:",
-            shlex.join(["semcal", "plan", calibration, "--target", target]),
+            shlex.join(["semcal", "plan", calibration, "--target", target, *_SAME_SESSION]),
         ),
         (
-            f"With these views in the folder or bag {views}:",
-            shlex.join(["semcal", "update", calibration, views, "-o", renewed]),
+            f"With these views, of the same session, in the folder or bag {views}:",
+            shlex.join(["semcal", "update", calibration, views, "-o", renewed, *_SAME_SESSION]),
         ),
     ]

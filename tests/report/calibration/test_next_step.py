@@ -42,16 +42,18 @@ def test_a_visit_is_planned_and_used() -> None:
     visit = PlannedVisit(139.2, 25e-6, 0.001161, 5000.0)
     (_, plan), (_, update) = suggest_commands(replace(GOOD, next_visit=visit), "to day/cal.yaml")
     # Not below 0.1161 %, so that one visit meets it.
-    assert plan == "semcal plan 'to day/cal.yaml' --target 0.12%"
+    assert plan == "semcal plan 'to day/cal.yaml' --target 0.12% --ageing 0.01%"
     assert shlex.split(update) == [
         *("semcal", "update", "to day/cal.yaml", "views_139x"),
-        *("-o", "to day/cal_improved.yaml"),
+        *("-o", "to day/cal_improved.yaml", "--ageing", "0.01%"),
     ]
 
 
 def test_where_nothing_helps_the_budget_is_shown() -> None:
     ((_, command),) = suggest_commands(GOOD, "cal.yaml")
     assert command == "semcal at cal.yaml 147 --budget"
+    ((_, command),) = suggest_commands(replace(GOOD, at=10000.0), "cal.yaml")
+    assert command == "semcal at cal.yaml 10000 --budget"
     assert suggest_commands(replace(GOOD, floor=math.nan), "cal.yaml") == []
     assert suggest_commands(GOOD, "") == []
 
