@@ -70,6 +70,8 @@ _HESSIAN_BANDS = 3
 # Windows for which what does not depend on the image is kept: an image that is shifted by little to either side
 # along both axes loses a row or a column of tiles at either end, or none.
 _KEPT_WINDOWS = 9
+# The same of second derivatives, which are those of all columns: three of them take 1.7 MB at 512 px, 6.4 at 1536.
+_KEPT_CURVATURES = 3
 # Images that are smooth by less have structure beyond the band of the shorter filters.
 _SHARP_PX = 0.3
 
@@ -110,7 +112,7 @@ class PyramidLevel:
         default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
     )
     _curvatures: LruCache[tuple[object, ...], _Curvature] = field(
-        default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
+        default_factory=lambda: LruCache(_KEPT_CURVATURES), repr=False, compare=False
     )
 
     @property
