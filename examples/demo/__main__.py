@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.demo.correction_page import DemoRow, write_correction_report
+from examples.demo.correction_page import DemoRow, overlay_change, write_correction_report
 from examples.demo.live_suite import LiveSuite, Received
 from examples.demo.overview import overview
 from semcal_ros import Calibration
@@ -48,6 +48,7 @@ from semcal_ros.core.calibration.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection
+from semcal_ros.files.images.scale_bar import format_length
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,12 @@ def reprojection_rms(
     return float(np.sqrt(np.mean(np.concatenate(errors))))
 
 
+def scale_of(cal: Calibration, g: float) -> tuple[float, float]:
+    """Pixel size of corrected images, m, and its 1-sigma."""
+    camera = cal.at(g).rectified
+    return float(camera.pixel_size_m[0]), float(camera.pixel_size_sigma_m[0])
+
+
 def frames_at(plan: Plan, g: float) -> list[dict[str, Any]]:
     """What truth.json says of the frames at a magnification."""
     truth = json.loads((plan.output / "replay" / "truth.json").read_text())
@@ -220,7 +227,11 @@ def main() -> int:
     rows = []
     for topic, (label, paper) in STAGES.items():
         total = float(np.sqrt(np.mean(np.square(rms[topic]))))
-        rows.append(DemoRow(label, total, paper))
+        at = [
+            (float(g), error, scale_of(cal, g)[0])
+            for g, error in zip(plan.replayed, rms[topic], strict=True)
+        ]
+        rows.append(DemoRow(label, total, paper, tuple(at)))
         printed = f"{paper:g}" if isinstance(paper, float) else "-".join(f"{p:g}" for p in paper)
         print(
             f"{label:40}" + "".join(f"{v:9.3f}" for v in rms[topic]) + f"{total:9.3f}   {printed}"
@@ -228,12 +239,18 @@ def main() -> int:
 
     print(describe_visits(plan))
     through = set.intersection(*(set(received.images[topic]) for topic in STAGES))
-    last = max(through)
-    pictures = [
-        (f"{label}: last frame", received.images[topic][last])
-        for topic, (label, _) in STAGES.items()
-    ]
-    stamps = sorted(through & set(stamps_at(plan, plan.replayed[-1], received)))
+    g = plan.replayed[-1]
+    stamps = sorted(through & set(stamps_at(plan, g, received)))
+    pictures = []
+    for topic, (label, _) in STAGES.items():
+        first, last = (received.images[topic][stamp] for stamp in (stamps[0], stamps[-1]))
+        error = f"{rms[topic][-1]:.2g} px, {format_length(rms[topic][-1] * scale_of(cal, g)[0])}"
+        pictures.append(
+            (
+                f"{label}, {g}x: corners off by {error} RMS",
+                overlay_change(first, last, *scale_of(cal, g)),
+            )
+        )
     overview(plan.output / "overview.png", received.images, stamps, rms, plan.replayed, cal)
     write_correction_report(
         rows,
@@ -242,6 +259,9 @@ def main() -> int:
         title="Live correction of the virtual SEM",
         notes=[
             f"{plan.frames} frames each at {', '.join(f'{g}x' for g in plan.replayed)}, replayed to the nodes.",
+            f"Pictures: the first frame at {g}x in red, the last one in cyan, "
+            f"{(stamps[-1] - stamps[0]) / 1e9:.0f} s apart; grey where they agree. "
+            "What the distortion does is seen in report.html, raw and corrected.",
             "The grid's pose is fitted once per magnification, to the first corrected frame.",
             describe_visits(plan),
         ],

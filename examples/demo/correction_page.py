@@ -22,18 +22,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.images.scale_bar import choose_scale_bar, draw_scale_bar, format_length
 from semcal_ros.report.html.encode import Picture, encode_figure, encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.style import INK, OURS, REFERENCE, add_legend, create_figure, style_axes
 from semcal_ros.report.html.text import format_px, remove_control_characters
 
-__all__ = ["DemoRow", "write_correction_report"]
+__all__ = ["DemoRow", "overlay_change", "write_correction_report"]
 
+# Of both frames, px: small enough to see single squares, and enlarged to so many.
+_MIDDLE_PX, _SHOWN_PX = 160, 640
 _HERE = Path(__file__).resolve().parent
 
 
@@ -47,6 +51,8 @@ class DemoRow:
         Such as "with drift correction".
     rms_px
         RMS error measured here, px.
+    at
+        The same at single magnifications: (magnification, RMS error in px, pixel size in m).
     paper_px
         What the paper reports for this stage, px: a number, a (low, high) pair, or None.
     """
@@ -54,6 +60,7 @@ class DemoRow:
     label: str
     rms_px: float
     paper_px: float | tuple[float, float] | None = None
+    at: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def paper_range_px(self) -> tuple[float, float] | None:
@@ -106,14 +113,67 @@ def write_correction_report(
     values = {
         "title": remove_control_characters(title),
         "rows": [
-            (remove_control_characters(row.label), format_px(row.rms_px), row.paper_text)
+            (
+                remove_control_characters(row.label),
+                format_px(row.rms_px),
+                [f"{format_px(px)}, {_format_nm(px * pixel_m)}" for _, px, pixel_m in row.at],
+                row.paper_text,
+            )
             for row in rows
         ],
+        "magnifications": [f"{g:g}×" for g, _, _ in rows[0].at],
         "chart": [_plot_errors(rows)],
         "notes": [remove_control_characters(note) for note in notes],
         "images": encode_pictures(images),
     }
     return write_page(path, render("correction.html.j2", values, folder=_HERE))
+
+
+def overlay_change(
+    first: NDArray[Any], last: NDArray[Any], pixel_size_m: float, sigma_m: float | None = None
+) -> NDArray[np.uint8]:
+    """Lay the middle of two frames over each other, enlarged, with a scale bar.
+
+    Parameters
+    ----------
+    first, last
+        (h, w) grey levels of two frames; the first is shown in red, the last in cyan: grey where they agree.
+    pixel_size_m, sigma_m
+        Pixel size on the specimen, and its 1-sigma if it is known.
+
+    Returns
+    -------
+    ndarray
+        (640, 640, 3) RGB.
+    """
+    height, width = first.shape
+    side = min(_MIDDLE_PX, height, width)
+    middle = (
+        slice((height - side) // 2, (height + side) // 2),
+        slice((width - side) // 2, (width + side) // 2),
+    )
+    cut = [image[middle].astype(np.float64) for image in (first, last)]
+    low, high = np.percentile(cut, (1.0, 99.0))
+    grey = [np.clip(255.0 * (c - low) / max(high - low, 1e-9), 0.0, 255.0) for c in cut]
+    factor = _SHOWN_PX / side
+    large = [
+        cv2.resize(g.astype(np.uint8), (_SHOWN_PX, _SHOWN_PX), interpolation=cv2.INTER_CUBIC)
+        for g in grey
+    ]
+    bar = choose_scale_bar(
+        _SHOWN_PX, pixel_size_m / factor, None if sigma_m is None else sigma_m / factor
+    )
+    channels = []
+    for number in (0, 1, 1):
+        channel = np.array(large[number], dtype=np.uint8)
+        draw_scale_bar(channel, bar)
+        channels.append(channel)
+    return np.stack(channels, axis=2)
+
+
+def _format_nm(length_m: float) -> str:
+    """Format a length with three digits; a dash where it is not known."""
+    return format_length(length_m) if np.isfinite(length_m) else "–"
 
 
 def _plot_errors(rows: Sequence[DemoRow]) -> Picture:
@@ -143,7 +203,8 @@ def _plot_errors(rows: Sequence[DemoRow]) -> Picture:
     # numbers.
     axes.set_yticks(places, [f"{k + 1}" for k in places], color=INK)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    add_legend(axes, loc="best")
+    # Above the plot, where no bar or mark can be.
+    add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
     stages = "; ".join(
         f"{row.label}: {format_px(row.rms_px)}, paper {row.paper_text}" for row in rows
     )

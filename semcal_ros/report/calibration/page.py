@@ -34,7 +34,6 @@ from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.files.images.scale_bar import format_length as format_rounded
 from semcal_ros.report.calibration.blink import choose_blink
 from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
@@ -268,4 +267,5 @@ def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:
     ]
     if not lengths:
         return "no length known"
-    return " to ".join(dict.fromkeys(format_rounded(x, 2) for x in (min(lengths), max(lengths))))
+    rounded = (f"{float(f'{1e9 * x:.2g}'):g}" for x in (min(lengths), max(lengths)))
+    return " to ".join(dict.fromkeys(rounded)) + " nm"

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.demo.correction_page import DemoRow, write_correction_report
+from examples.demo.correction_page import DemoRow, overlay_change, write_correction_report
 from semcal_ros.core.errors import InvalidValueError
 
 ROWS = (
@@ -93,3 +93,28 @@ def test_wide_images_are_shrunk(tmp_path: Path) -> None:
     text = page_of(tmp_path, ROWS, [("large", noise)])
     assert 'width="640" height="640"' in text
     assert len(text) < 1_500_000
+
+
+def test_errors_are_lengths_at_each_magnification(tmp_path: Path) -> None:
+    rows = [DemoRow("raw", 2.0, 7.0, ((400.0, 1.5, 450e-9), (7000.0, 2.1, 33e-9)))]
+    text = page_of(tmp_path, rows, [])
+    assert re.findall(r"<td>(.*?)</td>", text) == [
+        "2.000 px",
+        "1.500 px, 675 nm",
+        "2.100 px, 69.3 nm",
+        "7 px",
+    ]
+    assert "at 400×" in text and "at 7000×" in text
+
+
+def test_what_moved_between_two_frames_is_coloured() -> None:
+    rng = np.random.default_rng(0)
+    first = np.kron(rng.integers(0, 2, (32, 32)), np.full((16, 16), 150)).astype(np.uint8) + 40
+    same, moved = (overlay_change(first, np.roll(first, k, axis=1), 33e-9) for k in (0, 3))
+    assert same.shape == moved.shape == (640, 640, 3)
+    assert np.array_equal(same[:, :, 0], same[:, :, 1])
+    colour = np.abs(moved[:, :, 0].astype(int) - moved[:, :, 1])
+    # Half of the edges of squares of 16 px are crossed; each gives 3 px of colour.
+    assert 0.04 < np.mean(colour > 100) < 0.16
+    # Above the scale bar; it is the same in all channels, so it has no colour.
+    assert np.ptp(same[600:, 400:, 0]) == 255
