@@ -99,9 +99,9 @@ def plot_tilt_directions(result: CalibrationResult) -> Picture:
     step = choose_arrow_factor(1.0, limit / 2.0)
     for radius in np.arange(step, limit * 1.001, step):
         axes.plot(radius * np.cos(circle), radius * np.sin(circle), color="#c8ced6", linewidth=0.8)
-        axes.annotate(
-            f"{radius:g}°", (0.0, -radius), fontsize=8, color=MUTED, ha="center", va="bottom"
-        )
+        # Towards a corner: most views are tilted along one of the axes.
+        at = (radius * np.sqrt(0.5), -radius * np.sqrt(0.5))
+        axes.annotate(f"{radius:g}°", at, fontsize=8, color=MUTED, ha="left", va="bottom")
     low, high = result.model.magnification_range
     angle = np.radians(azimuth)
     dots = axes.scatter(
@@ -122,8 +122,8 @@ def plot_tilt_directions(result: CalibrationResult) -> Picture:
     axes.set_xlim(-limit, limit)
     axes.set_ylim(limit, -limit)
     axes.set_aspect("equal")
-    bar = _add_color_bar(axes, dots, "magnification")
     if high > low:
+        bar = _add_color_bar(axes, dots, "magnification")
         bar.ax.yaxis.set_major_locator(FixedLocator(choose_log_ticks(low, high)))
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda g, _: f"{g:g}×"))
         bar.ax.yaxis.set_minor_locator(NullLocator())

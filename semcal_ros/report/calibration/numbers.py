@@ -82,7 +82,7 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
                 corners=sum(len(v.image_xy) for v in own),
                 rms=_format_error(value, x, y),
                 held_out=_format_error(result.held_out_rms_px.get(g), x, y),
-                extrapolated=g in model.magnification_range,
+                extrapolated=g in result.held_out_rms_px and g in model.magnification_range,
                 pixel_x=format_length(x, sigma[0]),
                 pixel_y=format_length(y, sigma[1]),
                 field=" × ".join(

@@ -164,9 +164,9 @@ def write_calibration_report(
         "parameters": plot_parameters(model) if curves else [],
         "coverage": [
             plot_coverage(result),
-            plot_reached_shares(result),
+            *([plot_reached_shares(result)] if curves else []),
             plot_tilt_directions(result),
-            plot_tilts(result),
+            *([plot_tilts(result)] if curves else []),
         ],
         "overlays": [overlay_corners(view) for view in first],
         "more_overlays": [overlay_corners(v) for v in shown if all(v is not f for f in first)],

@@ -210,11 +210,12 @@ def test_single_magnification_without_the_optional_parts(
     one = replace(one, warnings=("fewer than 3 views at magnification 800",))
     parsed = Page(write_calibration_report(one, tmp_path / "r.html").read_text(encoding="utf-8"))
     assert "needs 3 magnifications" in parsed.text
+    assert "– *" not in parsed.text and "A star" not in parsed.text
     assert "No images were kept" in parsed.text and "No view was rejected" in parsed.text
     assert "What to watch" in parsed.text
     assert "Fewer than 3 views at magnification 800." in parsed.text
     # One distortion picture instead of three, two predictions, no curves, none of a rejected view or the caller.
-    assert len(parsed.named("img")) == 9
+    assert len(parsed.named("img")) == 7
     assert not {"pixel-size", "parameters", "paper"} & {s["id"] for s in parsed.named("section")}
     assert parsed.named("script") == [] and parsed.named("input") == []
     assert "The camera at 800×" in parsed.text
