@@ -28,7 +28,7 @@ from tests.helpers.ros_process import Peer
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Let what needs several processes at once be tried once more: a busy machine may stop one of them for seconds.
 
-    A run may try two tests again (Makefile), and shows why.
+    A run may try four tests again (Makefile), and shows why.
     """
     for item in items:
         if item.path.parent == Path(__file__).parent:

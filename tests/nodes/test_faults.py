@@ -171,6 +171,7 @@ def test_a_magnification_out_of_the_calibrated_range_is_answered_and_said(bench:
     assert state["in_calibrated_range"] == "False"
     assert int(state["level"]) >= 1
     # Whoever takes the camera sees it too, as image_geometry and others look at K.
+    bench.peer.wait_for(lambda: bench.infos, "its camera")
     assert not any(bench.infos[-1].k) and not any(bench.infos[-1].p)
 
 
