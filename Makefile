@@ -47,9 +47,12 @@ format: setup ## bring the source into the form that lint wants
 # Tests of several processes are tried once more, but no more than four in a run: the fifth one fails. Measured on
 # two cores: none to two in a run of 3800.
 PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal --rerun-show-tracebacks --max-suite-reruns=4
+# No test may take longer than 400 s. One that waits within the middleware for ever does not hear its time limit: its
+# process is ended.
+END_STUCK := -o faulthandler_timeout=500 -o faulthandler_exit_on_timeout=true
 
 test: lint ## everything that is checked: style, types, tests
-	@$(PYTEST) $(PYTEST_ARGS) tests
+	@$(PYTEST) $(END_STUCK) $(PYTEST_ARGS) tests
 
 test-fast: setup ## the quick tests: no running nodes, no whole experiments, no fuzzing
 	@$(PYTEST) -m "not slow" --ignore tests/nodes --ignore tests/fuzz $(PYTEST_ARGS) tests

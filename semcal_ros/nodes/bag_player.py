@@ -402,15 +402,11 @@ class BagPlayer(SemNode):
         except SemcalError as error:
             self.exit_status = 2
             self.get_logger().error(str(error))
-        except RuntimeError:
-            # Publishing fails once a signal has shut the middleware down.
-            if self.context.ok():
-                raise
         finally:
             with self._changed:
                 self._steps = 0
                 self._changed.notify_all()
-            if not self._ended and self.context.ok():
+            if not self._ended:
                 self._end.trigger()
 
     def _leave(self) -> None:

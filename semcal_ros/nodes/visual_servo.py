@@ -41,7 +41,7 @@ from semcal_ros.applications.servoing import (
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
-from semcal_ros.nodes.common.run import DeferredSignals, run_node
+from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
 from semcal_ros.nodes.servo.output import ErrorOutput, StageOutput
@@ -74,7 +74,6 @@ class VisualServo(SemNode):
 
     def __init__(self) -> None:
         super().__init__("visual_servo", SERVO_PARAMETERS)
-        self._end = DeferredSignals()
         values = self.parameters
         self._target = NestedTarget(values["target_cell_m"])
         centre = values["rotation_centre_x_m"], values["rotation_centre_y_m"]
@@ -96,7 +95,7 @@ class VisualServo(SemNode):
         self._resets = 0
         self._reset_s = -_RESET_AGAIN_S
         self._stage = StageOutput(self.endpoints, values["stage"])
-        self.closing.callback(self._stop_stage)
+        self.closing.callback(self._stage.close)
         self._errors = ErrorOutput(self.endpoints)
         self._reset = None
         if values["reset_service"] and values["goal_frame"] == "instrument":
@@ -125,11 +124,6 @@ class VisualServo(SemNode):
         # A simulated clock may stand still; the stage must not keep moving because of it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog = self.create_timer(_TICK_S, self._watch, alone, clock=steady)
-        self._signals = self.create_timer(_TICK_S, self._end.follow, clock=steady)
-
-    def _stop_stage(self) -> None:
-        if self.context.ok():
-            self._stage.close()
 
     # -- control -----------------------------------------------------------------------------------
 

@@ -47,6 +47,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 30.0
 # Tests wait for what nodes report; once a second, as in earnest, they would do little else.
 REPORT_PERIOD_S = 0.1
+_CRASHES = {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL}
 # Fast DDS reads it when a process creates its first participant.
 _PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
@@ -114,11 +115,13 @@ class NodeProcess:
         return self.process.wait(timeout_s)
 
     def stop(self, with_signal: int = signal.SIGINT, timeout_s: float = TIMEOUT_S) -> int:
-        """Exit status after a signal."""
+        """Exit status after a signal; a node that crashes, even at its end, holds others up in shared memory."""
         if self.process.poll() is None:
             self.process.send_signal(with_signal)
         try:
-            return self.process.wait(timeout_s)
+            status = self.process.wait(timeout_s)
+            assert -status not in _CRASHES, f"{self.name} crashed: {status}, {self.output}"
+            return status
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -150,8 +153,10 @@ def running(
     try:
         yield process
     finally:
-        process.stop()
-        process.close()
+        try:
+            process.stop()
+        finally:
+            process.close()
 
 
 @contextmanager

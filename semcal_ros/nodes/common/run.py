@@ -17,10 +17,12 @@
 from __future__ import annotations
 
 import signal
+import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import rclpy.utilities
@@ -39,7 +41,7 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
-from rclpy.signals import uninstall_signal_handlers
+from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.core.errors import ConfigError, SemcalError
 from semcal_ros.middleware.ament_prefix import add_environment_prefix
@@ -48,30 +50,58 @@ from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.command_line import CommandLine, HelpWanted, starting_with
 from semcal_ros.nodes.common.help import format_help
 
-__all__ = ["DeferredSignals", "run_node"]
+__all__ = ["run_node"]
 
 
-class DeferredSignals:
-    """Notes SIGINT and SIGTERM from its creation on; :meth:`follow` acts on them.
+class _EndRequest:
+    """Notes SIGINT and SIGTERM, from its creation until it is closed.
 
-    ROS itself would shut the middleware down at once, and ``destroy_node`` could no longer publish anything. Create it
-    in the main thread after ROS has been initialised.
+    The handlers of rclpy 7.1 would shut the middleware down in a thread of their own, beside the threads that use it.
+    If the executor is destroyed at that moment, the process crashes in ``rcl_trigger_guard_condition``: two or three
+    processes did in a run of all tests. A process that crashes can leave a lock in shared memory that holds up every
+    other node of the machine. Nothing could be published at the end, either. Here, the main thread alone ends a node.
     """
 
     def __init__(self) -> None:
-        self._asked = False
-        uninstall_signal_handlers()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._note)
+        self.asked = False
+        self._spinning = False
+        signals = (signal.SIGINT, signal.SIGTERM)
+        self._before = {number: signal.signal(number, self._note) for number in signals}
 
     def _note(self, _number: int, _frame: Any) -> None:
-        # An exception raised here would surface at an arbitrary place, where other code may swallow it.
-        self._asked = True
+        self.asked = True
+        # A node that starts may wait for something. Later, an exception would surface in the middle of a callback.
+        if not self._spinning:
+            raise KeyboardInterrupt
 
-    def follow(self) -> None:
-        """Stop spinning if a signal asked for it. A timer calls this, which also lets Python handle signals."""
-        if self._asked:
-            raise ExternalShutdownException
+    @contextmanager
+    def waking(self, executor: Executor) -> Iterator[None]:
+        """From now on only note a signal, and let ``executor.spin_once`` return on one."""
+        self._spinning = True
+        # Python runs a handler between two steps of the main thread, which may wait for a message for ever. What the
+        # system itself does at once is to write to this socket.
+        reader, writer = socket.socketpair()
+        writer.setblocking(False)
+
+        def wake() -> None:
+            while reader.recv(1):
+                executor.create_task(lambda: None)
+
+        waker = threading.Thread(target=wake, daemon=True)
+        waker.start()
+        signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(-1)
+            writer.close()
+            waker.join()
+            reader.close()
+
+    def close(self) -> None:
+        """Leave signals to whom they belonged before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
 
 # A thread that computes beside the stream must not hold the interpreter for long when a frame arrives.
@@ -116,6 +146,7 @@ def run_node(
 def _run(factory: Callable[[], Node], line: CommandLine, threads: int) -> int:
     sys.setswitchinterval(_SWITCH_S)
     add_environment_prefix()
+    end = _EndRequest()
     try:
         try:
             if line.wants_help:
@@ -123,54 +154,39 @@ def _run(factory: Callable[[], Node], line: CommandLine, threads: int) -> int:
             line.refuse_foreign()
             check_security()
             with _refusals():
-                rclpy.init(args=[sys.argv[0], *line.arguments])
-            node = _make(factory)
+                rclpy.init(
+                    args=[sys.argv[0], *line.arguments],
+                    signal_handler_options=SignalHandlerOptions.NO,
+                )
+                node = _make(factory)
         except _START_ERRORS as error:
             print(" ".join(str(error).split()), file=sys.stderr)
             return 2
         # Errors from here on are not caused by the node's arguments.
-        return 0 if node is None else _spin(node, threads)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        return _spin(node, threads, end)
+    except KeyboardInterrupt:
         return 0
     finally:
-        _shut_down()
-
-
-def _shut_down() -> None:
-    """Shut the middleware down, which a signal may do at the same moment."""
-    try:
         rclpy.utilities.try_shutdown()
-    except RuntimeError:
-        # It asks whether the middleware is up before it shuts it down, and the signal's thread comes between.
-        if rclpy.utilities.ok():
-            raise
+        end.close()
 
 
 @contextmanager
 def _refusals() -> Iterator[None]:
     """Turn what ROS refuses at start, such as a process without its enclave, into an error of the suite."""
-    was_up = rclpy.utilities.ok()
     try:
         yield
     except RuntimeError as error:
-        if was_up and not rclpy.utilities.ok():
-            raise  # a signal has shut the middleware down
         raise ConfigError(f"ROS refuses to start: {error}") from error
 
 
-def _make(factory: Callable[[], Node]) -> Node | None:
-    """Make the node; return None if a signal shut the middleware down meanwhile."""
-    try:
-        with _refusals():
-            node = factory()
-            if isinstance(node, SemNode):
-                with _destroyed_if_refused(node):
-                    node.refuse_unknown_topics()
-                node.introduce()
-            return node
-    except RuntimeError:
-        # All others have become errors of the suite.
-        return None
+def _make(factory: Callable[[], Node]) -> Node:
+    node = factory()
+    if isinstance(node, SemNode):
+        with _destroyed_if_refused(node):
+            node.refuse_unknown_topics()
+        node.introduce()
+    return node
 
 
 @contextmanager
@@ -191,20 +207,8 @@ def _print_help(factory: Callable[[], Node]) -> int:
     raise AssertionError("a node that starts in spite of --help")
 
 
-class _Thread(SingleThreadedExecutor):
-    """The executor of rclpy, which may fail while it is made.
-
-    A signal can shut the middleware down at that moment. The destructor of what is half made then
-    misses an attribute, and prints a traceback.
-    """
-
-    _sigint_gc: Any = None
-
-
 class _Threads(MultiThreadedExecutor):
-    """The same with several threads."""
-
-    _sigint_gc: Any = None
+    """An executor that can be waited for."""
 
     def wait_for_callbacks(self, limit_s: float) -> None:
         """Wait for those that are running: what they use is about to be destroyed."""
@@ -213,25 +217,19 @@ class _Threads(MultiThreadedExecutor):
             time.sleep(0.01)
 
 
-def _spin(node: Node, threads: int) -> int:
-    executor: Executor | None = None
+def _spin(node: Node, threads: int, end: _EndRequest) -> int:
+    executor = _Threads(num_threads=threads) if threads > 1 else SingleThreadedExecutor()
     try:
-        executor = _Threads(num_threads=threads) if threads > 1 else _Thread()
         executor.add_node(node)
-        executor.spin()
-    except ExternalShutdownException:
-        pass
-    except (RuntimeError, TypeError):
-        # A signal can shut the middleware down at any moment; rclpy then raises one or the other.
-        if rclpy.utilities.ok():
-            raise
+        with end.waking(executor), suppress(ExternalShutdownException):
+            while rclpy.utilities.ok() and not end.asked:
+                executor.spin_once()
     finally:
         if isinstance(executor, _Threads):
             if isinstance(node, SemNode):
                 # Ends what a callback may be waiting for.
                 node.closing.close()
             executor.wait_for_callbacks(_CALLBACKS_S)
-        if executor is not None:
-            executor.shutdown(timeout_sec=1.0)
+        executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
     return int(getattr(node, "exit_status", 0))

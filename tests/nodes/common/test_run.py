@@ -19,51 +19,76 @@ from __future__ import annotations
 import subprocess
 import sys
 
-# A signal that comes while the executor is made: the middleware is down, and its constructor fails.
-SCRIPT = """
+import pytest
+
+# A node that says whether it could still publish when it was destroyed, and asks its own process to end:
+# while it is made, in a callback, or from a thread while it waits for a message that never comes.
+NODE = """
+import os, signal, sys, threading, time
 import rclpy
-from semcal_ros.nodes.common import run
-rclpy.init()
-node = rclpy.create_node("short")
-rclpy.utilities.try_shutdown()
-for threads in (1, 2):
-    print(run._spin(node, threads))
+from rclpy.node import Node
+from semcal_ros.nodes.common.run import run_node
+
+moment, number, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+
+def ask():
+    os.kill(os.getpid(), number)
+
+def ask_later():
+    time.sleep(0.5)
+    print("waited", flush=True)
+    ask()
+
+class Ending(Node):
+    def __init__(self):
+        super().__init__("ending")
+        if moment == "making":
+            ask()
+            time.sleep(60.0)
+        self._timer = self.create_timer(0.01, self._begin)
+
+    def _begin(self):
+        self._timer.cancel()
+        if moment == "callback":
+            ask()
+            time.sleep(0.1)
+            print("finished", flush=True)
+        else:
+            threading.Thread(target=ask_later).start()
+
+    def destroy_node(self):
+        print("destroyed, ROS up:", rclpy.ok(), flush=True)
+        super().destroy_node()
+
+status = run_node(Ending, ["--ros-args", "--log-level", "error"], threads=threads)
+print("ROS up:", rclpy.ok())
+for number in (signal.SIGINT, signal.SIGTERM):
+    print(signal.getsignal(number).__class__.__name__)
+sys.exit(status)
 """
+AFTER = ["ROS up: False", "builtin_function_or_method", "Handlers"]
 
 
-def test_an_executor_that_cannot_be_made_any_more_leaves_no_traceback() -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("number", [2, 15])
+@pytest.mark.parametrize(
+    ("moment", "printed"),
+    [
+        ("making", []),
+        ("callback", ["finished", "destroyed, ROS up: True"]),
+        ("waiting", ["waited", "destroyed, ROS up: True"]),
+    ],
+)
+def test_a_signal_ends_the_node_in_order(
+    moment: str, printed: list[str], number: int, threads: int
+) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", NODE, moment, str(number), str(threads)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
-    assert done.stdout.split() == ["0", "0"], done.stderr
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [*printed, *AFTER]
     assert done.returncode == 0
-    assert "Traceback" not in done.stderr
-
-
-# A signal that comes between the question whether the middleware is up and its end.
-BETWEEN = """
-import rclpy
-from semcal_ros.nodes.common import run
-rclpy.init()
-really = rclpy.utilities.try_shutdown
-def fail():
-    raise RuntimeError("out of order")
-rclpy.utilities.try_shutdown = fail
-try:
-    run._shut_down()
-except RuntimeError as error:
-    print(error)
-def shut_down_late():
-    really()
-    raise RuntimeError("rcl_shutdown already called")
-rclpy.utilities.try_shutdown = shut_down_late
-run._shut_down()
-"""
-
-
-def test_a_signal_that_shuts_down_at_the_same_moment_leaves_no_traceback() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", BETWEEN], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "out of order"
