@@ -124,8 +124,7 @@ def start_nodes(context):
 
 def make_player(context, executables):
     values = suite.given(context, ARGUMENTS, ["config", *PLAYER])
-    # What is played and what is waited for are not the defaults of the node.
-    values.setdefault("topics", "inputs")
+    # What is waited for is not the default of the node.
     if "wait_for_subscribers" not in values:
         values["wait_for"] = awaited(executables)
     parameters = {name: convert(text, TYPES.get(name, str)) for name, text in values.items()}

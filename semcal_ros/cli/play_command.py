@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
 import click
 
+from semcal_ros.cli.options import config_option
 from semcal_ros.core.errors import BagError, SemcalError
 
 __all__ = ["command"]
@@ -41,14 +43,33 @@ __all__ = ["command"]
     help="Wait until images and magnification have this many subscribers each.",
 )
 @click.option("--no-clock", is_flag=True, help="Do not publish /clock.")
+@click.option(
+    "--topics",
+    default="inputs",
+    show_default=True,
+    metavar="inputs|all|NAME,...",
+    help="What is played. inputs: images, magnification and stage by the configuration, and conditions; all: also what"
+    " nodes published while it was recorded.",
+)
+@click.option("--exclude", default="", metavar="NAME,...", help="Topics that are not played.")
+@config_option
 def command(
-    recording: Path, rate: float, loop: bool, paused: bool, wait: int, no_clock: bool
+    recording: Path,
+    rate: float,
+    loop: bool,
+    paused: bool,
+    wait: int,
+    no_clock: bool,
+    topics: str,
+    exclude: str,
+    config: str,
 ) -> None:
     """Replay RECORDING as ROS topics, as `ros2 run semcal_ros bag_player` does.
 
     \b
-    Example:
+    Examples:
       semcal play recordings/zoom --rate 2
+      semcal play recordings/session --topics all --exclude calibration
     """
     _require_bag(recording)
     try:
@@ -59,17 +80,21 @@ def command(
             expected="rclpy",
             do="source a ROS 2 workspace or run `make setup`",
         ) from error
-    parameters = {
+    parameters: dict[str, bool | int | float | str] = {
         "bag": str(recording.absolute()),
-        "rate": f"{rate}",
-        "loop": str(loop).lower(),
-        "start_paused": str(paused).lower(),
-        "wait_for_subscribers": str(wait),
-        "clock": str(not no_clock).lower(),
+        "rate": rate,
+        "loop": loop,
+        "start_paused": paused,
+        "wait_for_subscribers": wait,
+        "clock": not no_clock,
+        "topics": topics,
+        "exclude": exclude,
+        "config": config,
     }
     arguments = ["--ros-args"]
     for name, value in parameters.items():
-        arguments += ["-p", f"{name}:={value}"]
+        # ROS reads a value as YAML, which holds JSON: a name such as 2024 stays a text in its quotes.
+        arguments += ["-p", f"{name}:={json.dumps(value, ensure_ascii=False)}"]
     sys.exit(play(arguments) or 0)
 
 

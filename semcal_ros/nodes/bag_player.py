@@ -88,9 +88,10 @@ _PARAMETERS = (
     ),
     ParameterDeclaration(
         "topics",
-        "all",
-        "What is played: all; inputs (images, magnification and stage by the configuration, and conditions); or names"
-        " of topics, with commas between them. A name without a leading / stands for every topic that ends with it.",
+        "inputs",
+        "What is played: inputs (images, magnification and stage by the configuration, and conditions); all, also what"
+        " nodes of the suite published while it was recorded; or names of topics, with commas between them. A name"
+        " without a leading / stands for every topic that ends with it.",
         fixed=True,
     ),
     ParameterDeclaration(
@@ -213,7 +214,7 @@ class BagPlayer(SemNode):
             if not any(self._role(topic) == "image" for topic in chosen):
                 raise self._not_found(
                     f"images on {self.config.image.topic} of type {self.config.image.type}",
-                    "give the configuration of the recording, or topics:=all",
+                    "set config to that of the recording, or topics to all",
                 )
         elif asked != ["all"]:
             for name in asked:
@@ -306,7 +307,7 @@ class BagPlayer(SemNode):
         if outputs:
             self.reporter.warn(
                 f"the recording holds what nodes of the suite publish: {', '.join(outputs)}. If they run, it comes"
-                " twice, and a recorded calibration is used where none is in force; topics:=inputs leaves it out"
+                " twice, and a recorded calibration is used where none is in force; the default of topics, inputs, leaves it out"
             )
 
     # -- control -----------------------------------------------------------------------------------

@@ -16,15 +16,19 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
+from semcal_ros.cli import main
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from tests.helpers.project import ROOT
@@ -63,10 +67,10 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 PLAYED = [
-    ({}, {"image_raw", "magnification", "image_rect", "calibration"}),
-    ({"topics": "inputs"}, {"image_raw", "magnification"}),
+    ({}, {"image_raw", "magnification"}),
+    ({"topics": "all"}, {"image_raw", "magnification", "image_rect", "calibration"}),
     ({"topics": "image_raw,/sem/calibration"}, {"image_raw", "calibration"}),
-    ({"exclude": "calibration image_rect"}, {"image_raw", "magnification"}),
+    ({"topics": "all", "exclude": "calibration image_rect"}, {"image_raw", "magnification"}),
 ]
 
 
@@ -86,7 +90,7 @@ def test_the_topics_that_are_asked_for_are_played(
         assert "2.5 s at rate 1, paused" in line
         assert "/sem/image_raw (6)" in line
         assert ("not played" in line) is (len(wanted) < 4)
-        warns = "topics:=inputs leaves it out" in player.output
+        warns = "nodes of the suite publish" in player.output
         assert warns is ("calibration" in wanted)
 
 
@@ -97,7 +101,7 @@ def test_the_topics_that_are_asked_for_are_played(
         ({"topics": "calibration", "exclude": "calibration"}, "topics and exclude"),
         ({"wait_for": "magnification"}, "magnification:2"),
         # It names other topics, and would be replayed to nobody.
-        ({"topics": "inputs", "config": "other"}, "topics:=all"),
+        ({"config": "other"}, "topics to all"),
     ],
 )
 def test_what_cannot_be_played_is_refused(
@@ -114,11 +118,39 @@ def test_what_cannot_be_played_is_refused(
     assert "Traceback" not in output
 
 
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        ([], {"topics": "inputs", "exclude": "", "config": "generic", "clock": True, "rate": 1.0}),
+        (
+            ["--topics", "2024", "--exclude", "a,b", "--config", "jsm820", "--rate", "2"],
+            {"topics": "2024", "exclude": "a,b", "config": "jsm820", "rate": 2.0},
+        ),
+    ],
+)
+def test_the_command_hands_its_options_to_the_node(
+    session: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], wanted: dict[str, Any]
+) -> None:
+    """As ROS reads them, each with the type of its parameter, whatever the recording is called."""
+    handed: list[str] = []
+    monkeypatch.setattr("semcal_ros.nodes.bag_player.main", handed.extend)
+    recording = session.with_name('2024: a "b" #1')
+    if not recording.exists():
+        shutil.copytree(session, recording)
+    with pytest.raises(SystemExit, match="^0$"):
+        main(["play", str(recording), *options])
+    read = dict(text.split(":=", 1) for text in handed[2::2])
+    values = {name: yaml.safe_load(text) for name, text in read.items()}
+    for name, value in {"bag": str(recording), **wanted}.items():
+        assert values[name] == value
+        assert type(values[name]) is type(value)
+
+
 def test_a_paused_replay_is_stepped_and_sought(peer: Peer, session: Path) -> None:
     images = peer.collect(Image, "image_raw")
     magnifications = peer.collect(Float64, "magnification", LATCHED)
     seek = peer.node.create_publisher(Float64, f"{PLAYER}/seek", 1)
-    given = {"bag": session, "topics": "inputs", "start_paused": True, "wait_for": "image:1"}
+    given = {"bag": session, "start_paused": True, "wait_for": "image:1"}
 
     def shown() -> list[int]:
         return [message.data[0] for message in images]
@@ -203,7 +235,7 @@ def test_a_replay_begins_when_every_topic_has_its_subscribers(peer: Peer, sessio
 
 def test_nothing_is_expected_of_a_topic_that_is_not_in_the_recording(session: Path) -> None:
     """The suite may listen to a stage that no recording has."""
-    given = {"bag": session, "rate": 1000, "wait_for": "stage:1", "topics": "inputs"}
+    given = {"bag": session, "rate": 1000, "wait_for": "stage:1"}
     status, output = ended("bag_player", given)
     assert status == 0
     assert "played 6 frames" in output

@@ -669,7 +669,6 @@ def test_a_replay_waits_for_the_suite(run: Run) -> None:
     assert [node.executable for node in context.nodes][-1] == "bag_player"
     assert context.node("bag_player").parameters == {
         "bag": "recording",
-        "topics": "inputs",
         "wait_for": "magnification:2 image:1",
     }
 
