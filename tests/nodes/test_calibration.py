@@ -25,7 +25,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist
 from rclpy.event_handler import PublisherEventCallbacks
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Image, JointState
 
 from semcal_ros.calibration import Calibration
 from tests.helpers.calibration_session import (
@@ -39,7 +39,7 @@ from tests.helpers.calibration_session import (
     text_value,
 )
 from tests.helpers.node_scenes import make_calibration
-from tests.helpers.ros_process import LATCHED, running
+from tests.helpers.ros_process import LATCHED, RELIABLE, Peer, running
 
 PARAMETERS = "/sem/parameter_server"
 
@@ -74,6 +74,17 @@ def test_there_is_nothing_to_add_calibrate_save_or_cancel_at_first(session: Sess
         answer = session.call(service)
         assert not answer.success
         assert reason in answer.message
+
+
+def test_the_server_introduces_itself_in_one_line(session: Session) -> None:
+    (line,) = [text for text in session.node.output.splitlines() if "subscribes to" in text]
+    for part in (
+        "[INFO]",
+        "Collects views of the grid from the live stream",
+        "; subscribes to /sem/conditions, /sem/image_raw, /sem/magnification, ",
+        "; publishes /sem/calibration, /sem/calibration_server/overlay, ",
+    ):
+        assert part in line
 
 
 def test_an_image_without_a_grid_is_refused_with_a_reason_and_shown(session: Session) -> None:
@@ -129,6 +140,30 @@ def test_a_stage_of_another_type_is_named_and_views_are_taken_without_it(session
     assert answer.success
     assert "tilted" not in answer.message
     session.peer.node.destroy_publisher(publisher)
+
+
+def test_nothing_is_done_with_two_streams_on_one_topic(session: Session) -> None:
+    """A driver that was left on during a replay: its images would get the magnification of the other."""
+    peer, rivals = session.peer, "2 publishers on /sem/image_raw: /sem/peer, /sem/replay"
+    picture, replay = PLAN.render(3), Peer("replay")
+    try:
+        replay.node.create_publisher(Image, "image_raw", RELIABLE)
+
+        def warned() -> bool:
+            session.show(picture, PLAN.frames[3].magnification)
+            state = peer.state(SERVER)
+            return state["level"] == "1" and rivals in state["message"]
+
+        peer.wait_for(warned, "the condition")
+        for service in ("add_view", "calibrate", "calibrate_start", "check", "update", "acquire"):
+            answer = session.call(service)
+            assert not answer.success, service
+            assert answer.message.startswith(rivals), service
+    finally:
+        replay.close()
+    peer.wait_for(lambda: rivals not in peer.state(SERVER)["message"], "one publisher")
+    session.show(picture, PLAN.frames[3].magnification)
+    assert session.call("add_view").success
 
 
 def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path: Path) -> None:

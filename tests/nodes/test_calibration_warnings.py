@@ -92,6 +92,8 @@ def test_they_are_told_as_long_as_the_calibration_is_in_force(peer: Peer, tmp_pa
             assert told.endswith("x...")
             assert len(told) < 500
         for node in nodes:
+            (line,) = [text for text in node.output.splitlines() if "subscribes to" in text]
+            assert f"config generic; calibration {tmp_path}/cal.yaml; " in line
             lines = [line for line in node.output.splitlines() if SUMMARY in line]
             assert len(lines) == 1, node.output
             assert "[WARN]" in lines[0]
