@@ -54,6 +54,9 @@ def peer() -> Iterator[Peer]:
 
 def test_they_are_told_as_long_as_the_calibration_is_in_force(peer: Peer, tmp_path: Path) -> None:
     DOUBTED.save(tmp_path / "cal.yaml")
+    # One section for all nodes, with a name that none of them has.
+    (tmp_path / "all.yaml").write_text("/**: {ros__parameters: {calibraton: cal.yaml}}")
+    further = ("--params-file", str(tmp_path / "all.yaml"))
     image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
     magnification = peer.node.create_publisher(Float64, "magnification", LATCHED)
     magnification.publish(magnification_message(1000.0))
@@ -71,7 +74,7 @@ def test_they_are_told_as_long_as_the_calibration_is_in_force(peer: Peer, tmp_pa
     with ExitStack() as stack:
         nodes = [
             stack.enter_context(
-                running(name.rpartition("/")[2], {"calibration": tmp_path / "cal.yaml"})
+                running(name.rpartition("/")[2], {"calibration": tmp_path / "cal.yaml"}, *further)
             )
             for name in (*STREAMS, SERVER)
         ]
@@ -92,11 +95,12 @@ def test_they_are_told_as_long_as_the_calibration_is_in_force(peer: Peer, tmp_pa
             assert told.endswith("x...")
             assert len(told) < 500
         for node in nodes:
-            (line,) = [text for text in node.output.splitlines() if "subscribes to" in text]
+            (line,) = [said for said in node.output.splitlines() if "subscribes to" in said]
             assert f"config generic; calibration {tmp_path}/cal.yaml; " in line
-            lines = [line for line in node.output.splitlines() if SUMMARY in line]
-            assert len(lines) == 1, node.output
-            assert "[WARN]" in lines[0]
+            for text in (SUMMARY, "not parameters of this node, and ignored: calibraton"):
+                lines = [line for line in node.output.splitlines() if text in line]
+                assert len(lines) == 1, node.output
+                assert "[WARN]" in lines[0]
         text = peer.node.create_publisher(String, "calibration", LATCHED)
         text.publish(String(data=SOUND.dumps()))
         peer.wait_for(

@@ -94,7 +94,7 @@ class SemNode(Node):
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
         if unused:
-            self.reporter.info(f"not parameters of this node, and ignored: {', '.join(unused)}")
+            self.reporter.warn(f"not parameters of this node, and ignored: {', '.join(unused)}")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._report_timer = self.create_timer(
             self.parameters["diagnostics_period"],

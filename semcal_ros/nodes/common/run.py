@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import sys
@@ -202,7 +203,11 @@ def _print_help(factory: Callable[[], Node]) -> int:
     try:
         factory()
     except HelpWanted as wanted:
-        print(format_help(wanted.name, wanted.declarations))
+        try:
+            print(format_help(wanted.name, wanted.declarations), flush=True)
+        except BrokenPipeError:
+            # `--help | head` has read enough. What is left in the buffer must not fail at the exit either.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     raise AssertionError("a node that starts in spite of --help")
 

@@ -120,3 +120,17 @@ for name in EXECUTABLES:
         assert f"example: ros2 run semcal_ros {name} --ros-args {about.example}" in text
         for parameter in re.findall(r"-p (\w+):=", about.example):
             assert re.search(rf"^ [ *]{parameter} = ", text, re.MULTILINE), parameter
+
+
+def test_help_may_be_cut_short() -> None:
+    """As by `--help | head -1`, which leaves."""
+    script = "import sys; from semcal_ros.nodes.rectifier import main; sys.exit(main(['--help']))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(timeout=60) == 0
+    assert process.stderr is not None
+    assert process.stderr.read() == ""
+    process.stderr.close()
