@@ -109,14 +109,13 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
             expected=f"at most {MAX_SIDE_PX} a side and {MAX_PIXELS} in all",
             do="check that the file is complete",
         )
-    bits = page.bitspersample
-    if bits not in (8, 16) or page.imagedepth != 1:
+    bits, samples = page.bitspersample, int(page.samplesperpixel)
+    if (bits not in (8, 16) and not _is_float(page)) or page.imagedepth != 1:
         raise TiffError(
             f"{path.name} has {bits} bits per sample",
-            expected="8 or 16",
+            expected="8 or 16, or grey levels of 32 bits with a decimal point",
             do="save it with 16 bits, in ImageJ by Image > Type > 16-bit",
         )
-    samples = int(page.samplesperpixel)
     if not 1 <= samples <= _MAX_SAMPLES:
         raise TiffError(
             f"{path.name} has {samples} samples per pixel", expected=f"1 to {_MAX_SAMPLES}"
@@ -129,6 +128,11 @@ def page_size(path: Path, page: tifffile.TiffPage) -> tuple[int, int]:
             do="copy it again from the microscope",
         )
     return width, height
+
+
+def _is_float(page: tifffile.TiffPage) -> bool:
+    """Whether the page has the grey levels with a decimal point that ImageJ writes as 32-bit."""
+    return page.dtype == np.float32 and int(page.samplesperpixel) == 1
 
 
 def _lookup(image: NDArray[Any], colormap: NDArray[Any]) -> NDArray[Any]:
@@ -149,7 +153,9 @@ def _to_grey(image: NDArray[Any], page: tifffile.TiffPage) -> NDArray[Any]:
         mixed = image[..., :3].astype(np.float64) @ _LUMA
         return np.asarray(np.rint(mixed).astype(image.dtype))
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
-        return np.asarray(np.iinfo(image.dtype).max - image)
+        # Grey levels with a decimal point have no largest value.
+        white = 0 if image.dtype.kind == "f" else np.iinfo(image.dtype).max
+        return np.asarray(white - image)
     return image
 
 
@@ -167,7 +173,7 @@ def _decode_by_opencv(path: Path, index: int) -> NDArray[Any]:
 
 
 def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
-    """Decode the (h, w) uint8 or uint16 image of a page whose size was checked.
+    """Decode the (h, w) uint8, uint16 or float32 image of a page whose size was checked.
 
     Raises
     ------
@@ -179,6 +185,6 @@ def grey_image(path: Path, page: tifffile.TiffPage) -> NDArray[Any]:
         image = _to_grey(np.asarray(page.asarray()), page)
     else:
         image = _decode_by_opencv(path, page.index)
-    if image.shape != size or image.dtype not in (np.uint8, np.uint16):
+    if image.shape != size or image.dtype not in (np.uint8, np.uint16, np.float32):
         raise ValueError(f"the decoded image is {image.dtype} {image.shape}")
     return np.ascontiguousarray(image)

@@ -119,6 +119,29 @@ def test_conditions_from_the_text_that_imagej_kept(
     assert any("the pixel size is ImageJ's, 2e-06 m" in note for note in other.notes)
 
 
+@pytest.mark.parametrize("white_is_zero", [False, True])
+def test_copy_of_32_bits_has_scale_and_conditions(tmp_path: Path, white_is_zero: bool) -> None:
+    """What ImageJ saves after a filter; RosettaSciIO reads such copies, too."""
+    levels = PIXELS.astype(np.float32) / 7.0
+    path = write(tmp_path / "f.tif", "nm", 0.25, np.stack([levels, 2.0 * levels]), Info=jeol_text())
+    if white_is_zero:
+        data = bytearray(path.read_bytes())
+        with tifffile.TiffFile(path) as file:
+            order, tag = file.byteorder, file.pages.first.tags["PhotometricInterpretation"]
+        data[tag.valueoffset : tag.valueoffset + 2] = struct.pack(order + "H", 0)
+        path.write_bytes(data)
+    first, second = read_sem_pages(path)
+    assert first.image.dtype == np.float32 and first.image.flags.c_contiguous
+    assert np.array_equal(first.image, -levels if white_is_zero else levels)
+    assert np.array_equal(second.image, 2.0 * levels)
+    assert (first.maker, first.pixel_size_m) == ("jeol", pytest.approx(4e-9))
+    assert first.metadata()["bits"] == 32
+    # Whole numbers of 32 bits are no grey levels of a known range.
+    tifffile.imwrite(tmp_path / "u.tif", PIXELS.astype(np.uint32), description="ImageJ=1.54f")
+    with pytest.raises(TiffError, match=r"32 bits per sample.*Type > 16-bit"):
+        read_sem_settings(tmp_path / "u.tif")
+
+
 def test_text_that_does_not_fit_a_cropped_copy_is_left_out(tmp_path: Path) -> None:
     text = fei_text(columns=64).decode().rstrip("\x00")
     sem = read_sem_tiff(write(tmp_path / "i.tif", "um", 4.0, Info=text))
