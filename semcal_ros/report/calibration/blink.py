@@ -25,8 +25,8 @@ from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.files.images.scale_bar import ScaleBar, choose_scale_bar
 from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
+from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.text import format_length, remove_control_characters
 
 __all__ = ["Blink", "choose_blink"]
@@ -34,14 +34,12 @@ __all__ = ["Blink", "choose_blink"]
 # Width of the pictures, px: distortions of some pixels are still seen.
 _WIDTH = 640
 _JPEG_QUALITY = 74
-# Size of the type and of the marks, as parts of the width: legible at 390 px.
-_TYPE, _MARK = 0.042, 0.012
+# Size of the marks as a part of the width: legible at 390 px.
+_MARK = 0.012
 # Crosses across the picture: a mark at every corner would hide a fine grid.
 _CROSSES = 6
 # Views whose corners move nearly as far as those of the best one: of them the coarsest grid is easiest to see.
 _NEARLY = 0.8
-# Distance of the scale bar from the edges, as a part of the width.
-_EDGE = 0.03
 
 
 @dataclass(frozen=True)
@@ -56,10 +54,8 @@ class Blink:
         Of both.
     marks
         SVG path of crosses where the corners belong in the corrected picture.
-    bar_path, bar_label, bar_x, bar_y
-        Scale bar of the corrected picture, and the right lower end of its label.
-    type_px
-        Size of the type.
+    bar
+        Scale bar of the corrected picture.
     alt, caption
         Texts.
     """
@@ -69,11 +65,7 @@ class Blink:
     width: int
     height: int
     marks: str
-    bar_path: str
-    bar_label: str
-    bar_x: float
-    bar_y: float
-    type_px: float
+    bar: DrawnScaleBar
     alt: str
     caption: str
 
@@ -115,11 +107,7 @@ def _make(result: CalibrationResult, moved_px: float, index: int, image: AnyImag
     # Pixel centres are at integers, the coordinates of SVG start at the edge of the first pixel.
     at = (camera.rectified.project(points) + 0.5) * factor
     square_m = camera.rectified.pixel_size_m[0]
-    sigma_m = None if camera.covariance is None else camera.rectified.pixel_size_sigma_m[0]
-    bar = choose_scale_bar(
-        width, square_m / factor, None if sigma_m is None else float(sigma_m) / factor
-    )
-    right, low = width * (1.0 - _EDGE), height - width * _EDGE
+    bar = draw_scale_bar(camera.rectified, image.shape[1], (width, height))
     name = remove_control_characters(view.name)
     nm = format_length(moved_px * square_m)
     return Blink(
@@ -128,17 +116,13 @@ def _make(result: CalibrationResult, moved_px: float, index: int, image: AnyImag
         width=width,
         height=height,
         marks=_draw_crosses(_spread(at, width, height), _MARK * width),
-        bar_path=f"M{right - bar.length_px:.1f} {low:.1f}H{right:.1f}",
-        bar_label=bar.label,
-        bar_x=round(right, 1),
-        bar_y=round(low - _EDGE * width / 2.0, 1),
-        type_px=round(_TYPE * width, 1),
+        bar=bar,
         alt=f"The view {name} at {view.magnification:g}x, raw and corrected",
         caption=_describe(bar, f"{name}, {view.magnification:g}×", moved_px, nm),
     )
 
 
-def _describe(bar: ScaleBar, name: str, moved_px: float, moved: str) -> str:
+def _describe(bar: DrawnScaleBar, name: str, moved_px: float, moved: str) -> str:
     return (
         f"{name}: the correction moves its corners by up to {moved_px:.2g} px, {moved}. The crosses stay: there, "
         f"corners of a flat, regular grid in this pose belong. {bar.pixel_size} in the corrected picture, to which "

@@ -22,16 +22,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.calibration.views import FoundView, RejectedView
+from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.wording import counted
-from semcal_ros.report.html.encode import (
-    Picture,
-    convert_to_8_bits,
-    encode_data_uri,
-    encode_jpeg,
-    shrink,
-)
+from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
+from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.text import remove_control_characters
 
 __all__ = [
@@ -67,6 +63,8 @@ class Overlay:
         edge.
     marks, refused
         SVG paths of all crosses, and of squares where corners were refused.
+    bar
+        Scale bar, right at the centre.
     alt, caption
         Texts.
     """
@@ -76,6 +74,7 @@ class Overlay:
     height: int
     marks: str
     refused: str
+    bar: DrawnScaleBar
     alt: str
     caption: str
 
@@ -104,7 +103,7 @@ def _draw_crosses(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
 
 
-def overlay_corners(view: FoundView) -> Overlay:
+def overlay_corners(view: FoundView, model: CalibrationModel) -> Overlay:
     """Shrink a view, with a cross at each corner and a square at each refused one."""
     assert view.image is not None
     small, factor = shrink(convert_to_8_bits(view.image), _OVERLAY_WIDTH)
@@ -124,6 +123,7 @@ def overlay_corners(view: FoundView) -> Overlay:
         height=small.shape[0],
         marks=_draw_crosses(xy, size),
         refused=_draw_squares(refused_xy, size),
+        bar=_draw_bar(model, view, small),
         alt=f"Image at {view.magnification:g}x with {counted(count, 'corner')} of the grid marked by crosses",
         caption=remove_control_characters(
             f"{view.magnification:g}×: {counted(count, 'corner')}{dropped}{precision} ({view.name})"
@@ -131,7 +131,17 @@ def overlay_corners(view: FoundView) -> Overlay:
     )
 
 
-def show_rejected(views: Sequence[RejectedView], count: int) -> list[Picture]:
+def _draw_bar(
+    model: CalibrationModel, view: FoundView | RejectedView, small: AnyImage
+) -> DrawnScaleBar:
+    assert view.image is not None
+    camera, drawn = model.at(view.magnification), (small.shape[1], small.shape[0])
+    return draw_scale_bar(camera, view.image.shape[1], drawn, thumbnail=True)
+
+
+def show_rejected(
+    views: Sequence[RejectedView], count: int, model: CalibrationModel
+) -> list[Overlay]:
     """Make thumbnails of rejected images that have pixels, different reasons first."""
     ranked: list[tuple[int, int]] = []
     seen: Counter[str] = Counter()
@@ -145,7 +155,16 @@ def show_rejected(views: Sequence[RejectedView], count: int) -> list[Picture]:
         assert view.image is not None
         small, _ = shrink(convert_to_8_bits(view.image), _REJECTED_WIDTH)
         text = remove_control_characters(f"{view.magnification:g}×: {view.reason} ({view.name})")
-        src = encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY))
-        alt = f"Rejected image, {text}"
-        pictures.append(Picture(src, alt, text, small.shape[1], small.shape[0]))
+        pictures.append(
+            Overlay(
+                src=encode_data_uri("jpeg", encode_jpeg(small, _JPEG_QUALITY)),
+                width=small.shape[1],
+                height=small.shape[0],
+                marks="",
+                refused="",
+                bar=_draw_bar(model, view, small),
+                alt=f"Rejected image, {text}",
+                caption=text,
+            )
+        )
     return pictures

@@ -168,11 +168,13 @@ def write_calibration_report(
             plot_tilt_directions(result),
             *([plot_tilts(result)] if curves else []),
         ],
-        "overlays": [overlay_corners(view) for view in first],
-        "more_overlays": [overlay_corners(v) for v in shown if all(v is not f for f in first)],
+        "overlays": [overlay_corners(view, model) for view in first],
+        "more_overlays": [
+            overlay_corners(v, model) for v in shown if all(v is not f for f in first)
+        ],
         "blink": choose_blink(result, detections),
         "refused_corners": sum(d.detection.rejected for d in detections),
-        "rejected_images": show_rejected(rejected, _MAX_THUMBNAILS),
+        "rejected_images": show_rejected(rejected, _MAX_THUMBNAILS, model),
         "rejected": [
             (
                 remove_control_characters(r.name),

@@ -27,6 +27,7 @@ from semcal_ros.core.calibration.coverage import compute_tilts_deg
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.wording import counted
 from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
+from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.style import choose_arrow_factor
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
@@ -75,6 +76,8 @@ class WorstView:
         Data URI of the picture; empty where it is not at hand.
     width, height
         Of the drawing, in its units.
+    bar
+        Scale bar, right at the centre.
     dots
         SVG path of the corners.
     arrows
@@ -92,6 +95,7 @@ class WorstView:
     src: str
     width: int
     height: int
+    bar: DrawnScaleBar
     dots: str
     arrows: str
     marks: tuple[Mark, ...]
@@ -142,7 +146,8 @@ def _describe(
     images: dict[tuple[str, float], AnyImage],
 ) -> WorstView:
     view, residuals = result.views[index], result.fit.residuals_px[index]
-    pixel_m = float(np.mean(result.model.at(view.magnification).pixel_size_m))
+    camera = result.model.at(view.magnification)
+    pixel_m = float(np.mean(camera.pixel_size_m))
     rms_px = _compute_rms_px(residuals)
     lengths = np.hypot(residuals[:, 0], residuals[:, 1])
     worst = int(np.argmax(lengths))
@@ -195,6 +200,7 @@ def _describe(
         src=src,
         width=size[0],
         height=size[1],
+        bar=draw_scale_bar(camera, camera.width, size),
         dots="".join(f"M{a:.1f} {b:.1f}h0" for a, b in xy),
         arrows="".join(_draw_arrow(xy[k], moves[k]) for k in others),
         marks=tuple(

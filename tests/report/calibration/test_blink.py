@@ -64,8 +64,8 @@ def test_the_corrected_picture_is_corrected_and_the_bar_has_its_length(
     left_over = np.abs(shown.astype(float) - expected)[inner].mean()
     assert left_over < 3.0
     assert left_over < 0.5 * np.abs(shown.astype(float) - image)[inner].mean()
-    left, _, right = (float(x) for x in re.findall(r"[\d.]+", blink.bar_path))
-    length = re.match(r"([\d.]+) µm ±", blink.bar_label)
+    left, _, right = (float(x) for x in re.findall(r"[\d.]+", blink.bar.path))
+    length = re.match(r"([\d.]+) µm ±", blink.bar.label)
     assert length is not None
     pixel_m = camera.rectified.pixel_size_m[0]
     # The path has one decimal at either end.

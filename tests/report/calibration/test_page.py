@@ -36,6 +36,7 @@ from semcal_ros.core.calibration.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.files.tiff.values import quantity
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration.examples import (
     choose_examples,
@@ -104,13 +105,16 @@ def test_pictures_are_all_there_with_alt_texts_and_valid_data(page: str) -> None
     parsed = Page(page)
     pictures = parsed.named("img")
     # 1 errors, 3 predicted, 3 residuals, 3 distortion, 2 pixel size, 11 parameters, 4 coverage,
-    # 1 rejected, 1 of the caller.
-    assert len(pictures) == 29
+    # 1 of the caller.
+    assert len(pictures) == 28
     assert all(len(p["alt"] or "") > 5 for p in pictures)
     drawings = [d for d in parsed.named("svg") if "role" in d]
-    # 4 examples, 5 views that fit worst, and one view raw and corrected.
-    assert len(drawings) == 10 and len(parsed.named("image")) == 11
-    assert all(re.search("corners|raw", o["aria-label"] or "") for o in drawings)
+    # 4 examples, 5 views that fit worst, one rejected, and one view raw and corrected.
+    assert len(drawings) == 11 and len(parsed.named("image")) == 12
+    assert all(re.search("corners|raw|Rejected", o["aria-label"] or "") for o in drawings)
+    # Each has a scale bar with the length and its 1-sigma.
+    assert sum(p.get("class") == "bar" for p in parsed.named("path")) == len(drawings)
+    assert len(re.findall(r">[\d.]+ [µnm]m ± [\d.]+ [µnp]m</text>", page)) == len(drawings)
     for source in [p["src"] for p in pictures] + [i["href"] for i in parsed.named("image")]:
         match = re.fullmatch(r"data:image/(png|jpeg);base64,(.*)", source or "")
         assert match is not None
@@ -221,7 +225,7 @@ def test_single_magnification_without_the_optional_parts(
     assert "The camera at 800×" in parsed.text
 
 
-def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
+def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image(result: CalibrationResult) -> None:
     image = np.zeros((1280, 1280), dtype=np.uint16)
     xy = np.array([[0.0, 0.0], [639.5, 639.5], [1279.0, 1279.0]])
     detection = LatticeDetection(
@@ -232,7 +236,7 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
         (1280, 1280),
         rejected_xy=np.array([[99.5, 199.5]]),
     )
-    overlay = overlay_corners(FoundView("a", 100.0, image, detection))
+    overlay = overlay_corners(FoundView("a", 100.0, image, detection), result.model)
     assert (overlay.width, overlay.height) == (320, 320)
     starts = re.findall(r"M([-\d.]+) ([\d.]+)h([\d.]+)", overlay.marks)
     centres = np.array([[float(x) + 0.5 * float(h), float(y)] for x, y, h in starts])
@@ -241,6 +245,16 @@ def test_overlay_marks_lie_on_the_corners_of_a_shrunk_image() -> None:
     ((x, y, side),) = re.findall(r"M([-\d.]+) ([\d.]+)h([\d.]+)v", overlay.refused)
     middle = np.array([float(x), float(y)]) + 0.5 * float(side)
     assert np.allclose(middle, [25.0, 50.0], atol=0.11)
+    # The image has five times the pixels of the calibration's, over the same field, and is shown at a quarter.
+    camera = result.model.at(100.0)
+    left, _, right = (float(x) for x in re.findall(r"[\d.]+", overlay.bar.path))
+    shown_m = camera.pixel_size_m[0] * SIZE / 320.0
+    length_m, sigma_m = (quantity(part, "m") for part in overlay.bar.label.split(" ± "))
+    assert length_m is not None and sigma_m is not None
+    assert (right - left) * shown_m == pytest.approx(length_m, abs=0.11 * shown_m)
+    # Two digits are printed.
+    relative = camera.pixel_size_sigma_m[0] / camera.pixel_size_m[0]
+    assert sigma_m / length_m == pytest.approx(relative, rel=0.05)
 
 
 def test_examples_are_the_richest_views(result: CalibrationResult) -> None:
@@ -283,9 +297,9 @@ def test_fast_and_small_enough_with_many_views(result: CalibrationResult, tmp_pa
     assert "lost 199." in text and "lost 200." not in text
 
 
-def test_rejected_images_are_shown_different_reasons_first() -> None:
+def test_rejected_images_are_shown_different_reasons_first(result: CalibrationResult) -> None:
     image = np.zeros((600, 600), dtype=np.uint8)
     views = [unused(f"f{k}", 100.0, "blurred" if k < 3 else "blank", image) for k in range(4)]
-    shown = show_rejected([unused("none", 100.0, "blank"), *views], 2)
+    shown = show_rejected([unused("none", 100.0, "blank"), *views], 2, result.model)
     assert [p.caption for p in shown] == ["100×: blurred (f0)", "100×: blank (f3)"]
     assert shown[0].width == shown[0].height == 200
