@@ -32,7 +32,7 @@ from semcal_ros.files.tiff.read import (
     read_sem_tiff,
 )
 from tests.files.tiff.test_hitachi import hitachi_text
-from tests.files.tiff.test_tiff import fei_text, jeol_text, zeiss_text
+from tests.files.tiff.test_tiff import fei_text, jeol_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 

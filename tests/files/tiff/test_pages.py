@@ -31,7 +31,7 @@ from semcal_ros.files.tiff.read import (
     read_sem_settings,
     read_sem_tiff,
 )
-from tests.files.tiff.test_tiff import zeiss_text
+from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 TIMES = ("22:42:02", "22:45:19", "22:48:40")

@@ -30,45 +30,9 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.read import read_sem_settings, read_sem_tiff
+from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
-
-
-def zeiss_text(
-    pixel: str = "593.3 nm",
-    mag: str = "188 X",
-    head: tuple[str, str] = ("1.854025625e-08", "188.19"),
-    tilt: str = "2.0 \u00b0",
-    changes: dict[str, str] | None = None,
-) -> bytes:
-    """CZ_SEM tag: unnamed numbers, then keys in capitals, each followed by name = value unit.
-
-    The image has 32 columns and the screen 1024, so a pixel of the screen is 1/32 of one of the image.
-    """
-    lines = ["0", "0", "0", *head, "6", "5.0e+03", "2.27", "2.0e-10", "5.243416e-03", "829"]
-    named = {
-        "AP_PIXEL_SIZE": "Pixel Size = 18.54 nm",
-        "AP_IMAGE_PIXEL_SIZE": f"Image Pixel Size = {pixel}",
-        "AP_MAG": f"Mag = {mag}",
-        "AP_WD": "WD = 5.2 mm",
-        "AP_SCANROTATION": "Scan Rotation = 30.0 \u00b0",
-        "DP_SCAN_ROT": "Scan Rot = On",
-        "AP_STAGE_AT_T": f"Stage at T = {tilt}",
-        "AP_STAGE_AT_R": "Stage at R = 233.5 \u00b0",
-        "DP_DWELL_TIME": "Dwell Time = 50 ns",
-        "DP_SCANRATE": "Scan Speed = 4",
-        "AP_LINE_TIME": "Line Time = 949 \u00b5s",
-        "AP_FRAME_TIME": "Cycle Time = 752.76 ms",
-        "AP_ACTUALKV": "EHT = 5.00 kV",
-        "DP_SEM": "Sem = Auriga 60",
-        "SV_SERIAL_NUMBER": "Serial No. = Auriga 60-46-17",
-        "DP_DETECTOR_CHANNEL": "Signal A = InLens",
-        "AP_DATE": "Date :11 Apr 2023",
-        "AP_TIME": "Time :8:40:47",
-    }
-    for key, value in {**named, **(changes or {})}.items():
-        lines += [key, value] if value else []
-    return "\r\n".join(lines).encode("cp1252") + b"\x00"
 
 
 def fei_text(pixel: str = "2.69792e-07", rows: int = 16, columns: int = 32) -> bytes:
