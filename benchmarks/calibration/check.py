@@ -15,11 +15,16 @@
 """How often `semcal check` is wrong: of calibrations that hold, and after one thing has changed.
 
     python -m benchmarks.calibration.check [--quick]
+    python -m benchmarks.calibration.check --reference FOLDER [--quick]
 
 Calibrations and views come from `semcal_ros.synthetic.stage`, as in `benchmarks.calibration.coverage`: a stage with one
 tilt axis that misses the specimen, visits that scatter by 0.15 %, lines that jitter. The check has 3 views at each of 4
 magnifications, or of 12. A verdict is wrong if a calibration that holds is called
 degraded, one that does not is called valid, or the change is not named.
+
+With the folder of the reference recordings, the calibration is that of `grid_calibration`, which another simulator
+made, and the images are drawn by the virtual SEM from the truth beside it: 200 sweeps of the flat grid over the
+magnifications of `grid_zoom_sweep`, and 200 checks of three views at each of four magnifications.
 """
 
 from __future__ import annotations
@@ -28,18 +33,31 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import argparse
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from joblib import Parallel, delayed
 
 from benchmarks.calibration.coverage import PRESETS, VISITS
-from benchmarks.table import quick_from_command_line, show
+from benchmarks.calibration.reference import (
+    CHANGED,
+    change,
+    load_microscope,
+    sweep_magnifications,
+    sweep_of,
+    visits_of,
+)
+from benchmarks.table import show
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.check import Verdict, check_calibration
+from semcal_ros.core.calibration.check import CalibrationCheck, Verdict, check_calibration
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import SimulatedStage, stage_views
+from semcal_ros.workflows.calibrate import calibrate
+from semcal_ros.workflows.check_and_update import check
 
 STAGE = SimulatedStage(
     miss_m=(1.0e-4, 0.0),
@@ -59,6 +77,8 @@ KINDS = {
     "centre of distortion +15 px": ("ex", 15.0, "centre of distortion"),
 }
 CHECKS = 8
+# Known to the truth of the reference recordings, over their range.
+FEW_OF_REFERENCE = (326.0, 943.0, 2424.0, 6000.0)
 
 
 def _changed(camera_at, parameter, by):
@@ -93,31 +113,72 @@ def outcomes(seed: int, visited: tuple[float, ...]) -> list[tuple[str, str]]:
                 readings=True,
             )
             done = check_calibration(model, own, image_size=microscope.image_size, axis=axis)
-            named = [change.name for change in done.changes]
-            if done.verdict is Verdict.VALID:
-                outcome = "valid"
-            else:
-                outcome = "named" if named == [name] else f"named {', '.join(named) or 'a pattern'}"
-            out.append((kind, outcome))
+            out.append((kind, _outcome(done, name)))
     return out
 
 
-def main() -> None:
-    """Print the table."""
-    count = 2 if quick_from_command_line(__doc__) else 5
-    for title, visited in (("4", FEW), ("12", MANY)):
-        runs = Parallel(n_jobs=-1)(delayed(outcomes)(seed, visited) for seed in range(count))
-        results = [row for rows in runs for row in rows]
-        table: list[list[object]] = []
-        for kind, (_, _, name) in KINDS.items():
-            found = Counter(outcome for own, outcome in results if own == kind)
-            right = found["named"] if name else found["valid"]
-            others = "; ".join(f"{n} x {text}" for text, n in found.most_common())
-            part = 100.0 * right / found.total()
-            table.append([kind, found.total(), f"{part:.0f}", others])
-        show(
-            f"Verdicts, {title} magnifications", ["changed", "checks", "right %", "outcomes"], table
+def _outcome(done: CalibrationCheck, name: str) -> str:
+    if done.verdict is Verdict.VALID:
+        return "valid"
+    named = [found.name for found in done.changes]
+    return "named" if named == [name] else f"named {', '.join(named) or 'a pattern'}"
+
+
+def _drawn(calibration, microscope, draw, magnifications, kind: str, seed: int) -> tuple[str, str]:
+    """(kind, outcome) of one check of images of the reference microscope."""
+    frames = draw(change(microscope, kind), magnifications, seed)
+    return kind, _outcome(check(calibration, frames).result, CHANGED[kind][2])
+
+
+def _show(title: str, names: dict[str, str], results: Sequence[tuple[str, str]]) -> None:
+    table: list[list[object]] = []
+    wrong = 0
+    for kind, name in names.items():
+        found = Counter(outcome for own, outcome in results if own == kind)
+        right = found["named"] if name else found["valid"]
+        wrong += found.total() - right
+        others = "; ".join(f"{n} x {text}" for text, n in found.most_common())
+        table.append([kind, found.total(), f"{100.0 * right / found.total():.0f}", others])
+    part = f"{wrong} of {len(results)} verdicts are wrong: {100.0 * wrong / len(results):.1f} %"
+    show(title, ["changed", "checks", "right %", "outcomes"], table, part)
+
+
+def check_reference(folder: Path, count: int) -> None:
+    """Print the verdict on `grid_zoom_sweep`, and the tables of images that are drawn."""
+    calibration = calibrate(folder / "grid_calibration")
+    print(f"grid_zoom_sweep: {check(calibration, folder / 'grid_zoom_sweep').result.summary}")
+    microscope = load_microscope(folder)
+    names = {kind: name for kind, (_, _, name) in CHANGED.items()}
+    for title, draw, magnifications in (
+        ("a sweep of 36 magnifications", sweep_of, sweep_magnifications(folder)),
+        ("three views at each of 4 magnifications", visits_of, list(FEW_OF_REFERENCE)),
+    ):
+        results = Parallel(n_jobs=-1)(
+            delayed(_drawn)(calibration, microscope, draw, magnifications, kind, seed)
+            for seed in range(count)
+            for kind in CHANGED
         )
+        _show(f"Verdicts, reference microscope, {title}", names, results)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="less of everything")
+    parser.add_argument(
+        "--reference", type=Path, metavar="FOLDER", help="folder of the reference recordings"
+    )
+    given = parser.parse_args()
+    if given.reference is not None:
+        check_reference(given.reference, 2 if given.quick else 50)
+        return
+    names = {kind: name for kind, (_, _, name) in KINDS.items()}
+    for title, visited in (("4", FEW), ("12", MANY)):
+        runs = Parallel(n_jobs=-1)(
+            delayed(outcomes)(seed, visited) for seed in range(2 if given.quick else 5)
+        )
+        results = [row for rows in runs for row in rows]
+        _show(f"Verdicts, {title} magnifications", names, results)
 
 
 if __name__ == "__main__":

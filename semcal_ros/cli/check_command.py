@@ -20,6 +20,7 @@ import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -95,8 +96,8 @@ def command(
     if as_json:
         echo_json(
             {
-                **asdict(done.result),
-                "verdict": done.result.verdict.value,
+                **describe_check(done.result),
+                "notes": list(done.notes),
                 "rejections": list_rejections(done.rejections),
             }
         )
@@ -149,36 +150,64 @@ def _check_specimen(
 
 def echo_check(result: CalibrationCheck) -> None:
     """Print what has changed, and how much of nm per pixel that is."""
-    changed = {change.name: change for change in result.changes}
-    rows = []
-    for alone in result.tested:
-        change = changed.get(alone.name, alone)
-        rows.append(
-            [
-                change.name,
-                _format_values(change),
-                f"{change.largest_px:.2f}",
-                f"{change.p_value:.2g}",
-                "changed" if alone.name in changed else "",
-            ]
-        )
+    changed = {change.name for change in result.changes}
+    rows = [
+        [
+            change.name,
+            _format_values(change),
+            ", ".join(f"{z:+.1f}" for z in change.z_scores),
+            f"{change.largest_px:.2f}",
+            f"{1e9 * change.largest_m:.3g}",
+            f"{change.p_value:.2g}",
+            "changed" if change.name in changed else "",
+        ]
+        for change in result.tested
+    ]
     pattern = result.shape
     known = math.isfinite(pattern.p_value)
     rows.append(
         [
             "other distortion",
             f"{pattern.rms_px:.4f} px RMS" if known else "too few views",
+            f"{pattern.z_score:.1f}" if known else "-",
+            "",
             "",
             f"{pattern.p_value:.2g}" if known else "-",
             "changed" if known and pattern.significant else "",
         ]
     )
-    echo_table(["", "images against calibration", "px at most", "probability", ""], rows)
+    rows.append(
+        [
+            "residuals",
+            f"{result.misfit:.2f} times those expected",
+            f"{result.misfit_z:+.1f}",
+            *("", "", "", ""),
+        ]
+    )
+    echo_table(
+        ["", "images against calibration", "z", "px at most", "nm at most", "probability", ""], rows
+    )
     click.echo(
         f"nm per px is off by {-100.0 * result.scale_change:+.3f} +- {100.0 * result.scale_sigma:.3f} %; "
         f"{counted(result.views, 'view')}, RMS {result.rms_px:.4f} px"
         + (f", {result.out_of_range} outside the calibrated range" if result.out_of_range else "")
     )
+
+
+def describe_check(result: CalibrationCheck) -> dict[str, Any]:
+    """Return a check as plain data, with its z-scores."""
+
+    def plain(change: Change) -> dict[str, Any]:
+        return {**asdict(change), "z_scores": list(change.z_scores)}
+
+    return {
+        **asdict(result),
+        "verdict": result.verdict.value,
+        "changes": [plain(change) for change in result.changes],
+        "tested": [plain(change) for change in result.tested],
+        "shape": {**asdict(result.shape), "z_score": result.shape.z_score},
+        "misfit_z": result.misfit_z,
+    }
 
 
 _ADVICE = {

@@ -30,7 +30,8 @@ from semcal_ros.core.calibration.calibrate import (
     MethodOptions,
     calibrate_views,
 )
-from semcal_ros.core.calibration.findings import find_weaknesses
+from semcal_ros.core.calibration.finding import Finding
+from semcal_ros.core.calibration.findings import find_all
 from semcal_ros.core.calibration.nominal_scale import (
     check_nominal_scale,
     check_square_sides,
@@ -146,16 +147,18 @@ class _FirstViews:
             _check_scale(assignment, self._views, self._display_width_m)
 
 
-def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[str]:
-    """Return a warning if the calibration refused the tilts of most views that have one, else nothing."""
+def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[Finding]:
+    """Return a finding if the calibration refused the tilts of most views that have one, else nothing."""
     told = {v.name for v in views if v.stage is not None and v.stage.tilt_rad is not None}
     refused = sum(v.name in told and v.stage is None for v in result.views)
     if refused <= _MOST_REFUSED * len(told):
         return []
     # The tilts that were not refused are wrong too, by less; they have pulled the scale with them.
     return [
-        f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not used; "
-        "check the unit of its angles, and its stamps"
+        Finding(
+            f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not "
+            "used; check the unit of its angles, and its stamps"
+        )
     ]
 
 
@@ -262,20 +265,25 @@ def calibrate_found(
         result = calibrated([replace(view, stage=None) for view in collected.views])
     on_stage("summary", 0.95)
     collected = _remove_outliers(collected, result)
-    warnings = [*contradiction, *result.warnings]
+    known = [*contradiction, *result.findings]
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
-        warnings.append(
-            f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "
-            "predicts: check --display-width and --squares (display_width_m and squares_m of the configuration)"
+        known.append(
+            Finding(
+                f"the images show {factor:.3g} times the scale that the display width of {display_width_m:g} m "
+                "predicts: check --display-width and --squares (display_width_m and squares_m of the configuration)",
+                # If it is the squares that are wrong, nm per pixel is by as much.
+                cost_relative=1.0 - 1.0 / factor,
+            )
         )
-    warnings += find_weaknesses(result, collected.rejected)
+    result = replace(result, findings=tuple(known))
+    result = replace(result, findings=find_all(result, collected.rejected))
     statistics = {
         **result.model.statistics,
         "rejected_views": len(collected.rejected),
         "squares_m": sorted({float(s) for s in collected.assignment.square_m}),
         "scale_over_nominal": factor,
         **({"grid_certificate": grid_certificate} if grid_certificate else {}),
-        "warnings": warnings,
+        "warnings": list(result.warnings),
     }
     taken = conditions or {}
     seen = {view.name: (taken.get(view.name), view.stage) for view in result.views}
@@ -285,7 +293,7 @@ def calibrate_found(
         conditions=sum_up_conditions(seen.values()),
     )
     model = replace(result.model, statistics=statistics, provenance=origin)
-    result = replace(result, model=model, warnings=tuple(warnings))
+    result = replace(result, model=model)
     return RecordingCalibration(Calibration.from_model(model), result, collected)
 
 

@@ -50,7 +50,7 @@ def result() -> CalibrationResult:
     # The calibration's only warning of its own: no magnification was visited twice.
     (own,) = made.warnings
     assert "comes back" in own
-    return replace(made, warnings=())
+    return replace(made, findings=())
 
 
 @pytest.fixture(scope="session")

@@ -332,10 +332,11 @@ def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
     # Small angles in degrees could be radians: only the views tell.
     tilted = _recorded(tmp_path / "small", lambda _: {"tilt": 1.0}, only=1000.0)
     small = calibrate_recording(tilted, options=off)
-    (told, *others) = small.result.warnings
+    (told,) = (w for w in small.result.warnings if "contradict the tilt of the stage" in w)
     count = sum(frame.magnification == 1000.0 for frame in PLAN.frames)
     assert told.startswith(f"scale: {count} of {count} views contradict the tilt of the stage")
-    assert tuple(others) == plain.result.warnings
+    others = tuple(w for w in small.result.warnings if w != told)
+    assert others == plain.result.warnings
     np.testing.assert_array_equal(small.calibration.at(1000.0).P, plain.calibration.at(1000.0).P)
     assert small.calibration.statistics["warnings"] == list(small.result.warnings)
 

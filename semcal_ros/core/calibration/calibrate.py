@@ -26,6 +26,7 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
 from semcal_ros.core.calibration.evaluate import ViewPose, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.finding import Finding, rank_findings
 from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.joint import (
     RESIDUAL_MODES,
@@ -55,7 +56,11 @@ from semcal_ros.core.calibration.pda_step import (
 )
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
-from semcal_ros.core.calibration.scale_checks import estimate_repeatability, scale_warnings
+from semcal_ros.core.calibration.scale_checks import (
+    estimate_repeatability,
+    find_scale_weaknesses,
+    measure_excess,
+)
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.summary import (
     collect_statistics,
@@ -222,8 +227,8 @@ class CalibrationResult:
     held_out_rms_px
         RMS reprojection error of each magnification's views under a calibration from all others;
         the two outermost ones are extrapolated.
-    warnings
-        Plain sentences about quantities that the data could not determine.
+    findings
+        What the data could not determine, or do not agree on.
     outliers
         Views that were left out because they disagree with the others (``"joint"``).
     """
@@ -232,8 +237,13 @@ class CalibrationResult:
     views: tuple[GridView, ...]
     fit: ViewPose
     held_out_rms_px: Mapping[float, float]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     outliers: tuple[RejectedView, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as plain sentences, the most costly in nm first."""
+        return tuple(own.tell(self.model) for own in rank_findings(self.findings, self.model))
 
 
 @dataclass(frozen=True)
@@ -249,7 +259,7 @@ class _MethodFit:
     height_sigma_m: Array
     poses: tuple[Array, Array] | None
     details: dict[str, Any]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     residual: ResidualField | None = None
     repeatability: float = 0.0
     failure: str = ""
@@ -335,7 +345,7 @@ def calibrate_views(
     if options.method == "joint":
         joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
         fit = _fit_joint(setup, joint)
-        fit = replace(fit, warnings=(*notes, *fit.warnings))
+        fit = replace(fit, findings=(*notes, *fit.findings))
     else:
         on_stage("one magnification after the other", 0.0)
         fit = _fit_discrete(setup, options.method, options.method_options)
@@ -346,15 +356,14 @@ def calibrate_views(
     model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
     poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
     held_out = _predict_held_out(setup, fit, options.method)
-    warnings = (*fit.warnings, *list_undetermined(setup, model))
+    findings = (*fit.findings, *list_undetermined(setup, model))
     if options.method == "joint":
-        warnings = (*warnings, *scale_warnings(setup, joint, model))
+        findings = (*findings, *find_scale_weaknesses(setup, joint, model))
+    result = CalibrationResult(model, setup.views, poses, held_out, findings, outliers)
     statistics = collect_statistics(
-        setup, fit.details, fit.height_sigma_m, poses, held_out, warnings
+        setup, fit.details, fit.height_sigma_m, poses, held_out, result.warnings
     )
-    return CalibrationResult(
-        replace(model, statistics=statistics), setup.views, poses, held_out, warnings, outliers
-    )
+    return replace(result, model=replace(model, statistics=statistics))
 
 
 def _units(setup: Setup) -> dict[str, Any]:
@@ -427,13 +436,13 @@ def _make_model(
 
 def _fit_without_outliers(
     setup: Setup, residual: str, on_stage: Callable[[str, float], None]
-) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[str]]:
+) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[Finding]]:
     """Fit without the views, and the readings of tilts, that disagree with the others.
 
-    Also returns those views, and a warning for each reading.
+    Also returns those views, and a finding for each reading.
     """
     outliers: list[RejectedView] = []
-    notes: list[str] = []
+    notes: list[Finding] = []
     while True:
         fit = fit_joint(setup, residual, on_stage)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
@@ -490,15 +499,17 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
     return {best: deviations.reject(best)}
 
 
-def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[str]]:
-    """Return the setup without the tilts of some views, and a warning for each of them."""
+def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[Finding]]:
+    """Return the setup without the tilts of some views, and a finding for each of them."""
     views, notes = list(setup.views), []
     for index, sigmas in wrong.items():
         view = views[index]
         told = "the tilt of the stage" if view.stage is not None else "untilted"
         notes.append(
-            f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
-            f"{sigmas:.0f} sigma; its tilt is not used"
+            Finding(
+                f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
+                f"{sigmas:.0f} sigma; its tilt is not used"
+            )
         )
         views[index] = replace(view, stage=None, untilted=False)
     return add_shared_unknowns(replace(setup, views=tuple(views))), notes
@@ -507,24 +518,34 @@ def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, lis
 def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
     adjustment, result = fit.adjustment, fit.adjustment.result
     factor = variance_factor(adjustment.problem, result)
-    warnings = []
+    findings = []
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     if misfit > _MISFIT:
-        warnings.append(
-            f"scale: residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "
-            "do not follow the microscope everywhere, or the grid is not regular"
-            + ("; record more magnifications" if len(setup.magnifications) > 1 else "")
+        excess_px, excess_at = measure_excess(setup, fit)
+        findings.append(
+            Finding(
+                f"scale: residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "
+                "do not follow the microscope everywhere, or the grid is not regular"
+                + ("; record more magnifications" if len(setup.magnifications) > 1 else ""),
+                excess_px,
+                magnification=excess_at,
+            )
         )
     change = find_change_point(setup, adjustment.problem, result)
     if change is not None:
-        warnings.append(
-            f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
-            f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range there, "
-            "calibrate with this breakpoint"
+        findings.append(
+            Finding(
+                f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
+                f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range "
+                "there, calibrate with this breakpoint",
+                # A smooth curve through a jump is off by half of it on either side.
+                cost_relative=0.5 * change.relative,
+                magnification=change.below,
+            )
         )
     if not adjustment.converged:
-        warnings.append("the choice of the number of coefficients did not converge")
+        findings.append(Finding("the choice of the number of coefficients did not converge"))
     details = {
         "iterations": result.iterations,
         "converged": result.converged,
@@ -544,7 +565,7 @@ def _fit_joint(setup: Setup, fit: JointFit) -> _MethodFit:
         adjustment.problem.height_sigma_m,
         (result.state.rotations, result.state.translations_m),
         details,
-        tuple(warnings),
+        tuple(findings),
         None if fit.field is None else fit.field.field,
         estimate_repeatability(setup, fit),
         "" if result.converged else result.status.value,

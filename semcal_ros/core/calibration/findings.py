@@ -12,13 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a reader should know before trusting a calibration, in plain sentences, the most costly first."""
+"""What a reader should know before trusting a calibration."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,13 +28,14 @@ from semcal_ros.core.calibration.coverage import (
     compute_tilts_deg,
 )
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.finding import Finding, rank_findings
 from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Finding", "find_weaknesses"]
+__all__ = ["find_all", "find_weaknesses"]
 
 # Part of the field without a corner that is worth a warning: about 5 of 108 cells of a 4:3 image.
 _EMPTY_SHARE = 0.05
@@ -61,41 +61,19 @@ _SIGMA_PX = 2.0
 _NAMED = 5
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Something that makes a calibration worse than it could be.
-
-    Attributes
-    ----------
-    text
-        What was found, and what to do, in a sentence without capital and full stop.
-    cost_px
-        By how much positions in the image are off for it, px; NaN where that is not known.
-    magnification
-        Where that is.
-    """
-
-    text: str
-    cost_px: float = float("nan")
-    magnification: float = float("nan")
-
-    def tell(self, result: CalibrationResult) -> str:
-        """Return the sentence, with what it costs in nm."""
-        if not np.isfinite(self.cost_px):
-            return self.text
-        pixel_m = float(np.mean(result.model.at(self.magnification).pixel_size_m))
-        # Two digits, and no exponent.
-        cost_nm = float(f"{1e9 * self.cost_px * pixel_m:.2g}")
-        return f"{self.text} (costs {cost_nm:.6g} nm at {self.magnification:.0f}x)"
+def find_all(
+    result: CalibrationResult, rejected: Sequence[RejectedView] = ()
+) -> tuple[Finding, ...]:
+    """All that a user is told: what the adjustment found, and what an expert sees in the figures, ranked by cost."""
+    return rank_findings((*result.findings, *find_weaknesses(result, rejected)), result.model)
 
 
 def find_weaknesses(
     result: CalibrationResult, rejected: Sequence[RejectedView] = ()
-) -> tuple[str, ...]:
+) -> list[Finding]:
     """Find what an expert would see in the figures of a calibration.
 
-    Those whose cost is known come first, the most costly in px before the others: nm are compared at equal
-    magnification only. Warnings of the adjustment itself are in ``result.warnings``.
+    What the adjustment itself found is in ``result.findings``.
     """
     found = [
         *_check_views(result, rejected),
@@ -108,8 +86,7 @@ def find_weaknesses(
         found.append(
             Finding("the poses of some views did not converge; their residuals may be too large")
         )
-    found.sort(key=lambda f: -f.cost_px if np.isfinite(f.cost_px) else np.inf)
-    return tuple(finding.tell(result) for finding in found)
+    return found
 
 
 def _join_names(items: Sequence[str]) -> str:
@@ -143,7 +120,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
                 f"the corners of {names} fit more than {_VIEW_RATIO:g} times worse than their own uncertainty: "
                 "look at these images, and leave them out if something is wrong",
                 worst_px,
-                float(worst.magnification),
+                magnification=float(worst.magnification),
             )
         )
     return found
@@ -199,7 +176,7 @@ def _check_held_out(result: CalibrationResult) -> list[Finding]:
             f"the images at {', '.join(f'{g:g}x' for g in worse)} are predicted badly from the other magnifications: "
             "take images at more magnifications around there",
             float(np.sqrt(max(values[worst] ** 2 - fitted[worst] ** 2, 0.0))),
-            float(worst),
+            magnification=float(worst),
         )
     ]
 
@@ -213,7 +190,7 @@ def _check_pattern(result: CalibrationResult) -> list[Finding]:
                 f"the residuals have a pattern over the field of {size:.2f} px RMS, more than chance "
                 "explains: the scan has a distortion that the model does not describe",
                 size,
-                float(np.sqrt(low * high)),
+                magnification=float(np.sqrt(low * high)),
             )
         ]
     return []
@@ -238,7 +215,7 @@ def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
                 f"around {float(f'{g:.2g}'):.10g}x positions at the edge of the image are uncertain "
                 f"by {worst[g]:.1f} px relative to its centre: take more images there, tilted in different directions",
                 worst[g],
-                g,
+                magnification=g,
             )
         ]
     return []

@@ -34,7 +34,12 @@ from semcal_ros.core.calibration.joint import add_shared_unknowns
 from semcal_ros.core.calibration.line_jitter import estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.normal_equations import Problem, State
 from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors, Setup
-from semcal_ros.core.calibration.problem import adjust, build_problem, with_shared
+from semcal_ros.core.calibration.problem import (
+    adjust,
+    build_problem,
+    variance_factor,
+    with_shared,
+)
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.untilted import mark_untilted
 from semcal_ros.core.calibration.variance_components import (
@@ -85,6 +90,8 @@ class Revision:
         the height of the grid and the size of its squares, :data:`CHANGING`, and what all views share.
     covariance
         (K, K) of the unknowns, with what the jitter of lines adds.
+    misfit
+        RMS of the residuals over what the uncertainty of the corners explains.
     """
 
     model: CalibrationModel
@@ -92,6 +99,7 @@ class Revision:
     problem: Problem
     result: BundleResult
     covariance: Array
+    misfit: float
 
     @property
     def components(self) -> slice:
@@ -262,6 +270,7 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
         problem = _build(model, setup, spread, sigmas)
         result = refine(problem, result.state)
+    misfit = float(np.sqrt(variance_factor(problem, result)))
     freedom = problem.pose_columns * len(setup.views) + len(theta)
     excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
     if excess > 0.0:
@@ -269,7 +278,9 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         problem = _build(model, setup, spread, sigmas)
         result = refine(problem, result.state)
     jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
-    return Revision(model, setup, problem, result, result.covariance + jitter)
+    # As in a calibration: what is left of a misfit makes everything less certain, and never more.
+    factor = max(variance_factor(problem, result), 1.0)
+    return Revision(model, setup, problem, result, factor * result.covariance + jitter, misfit)
 
 
 def _build(

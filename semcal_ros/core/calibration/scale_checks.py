@@ -12,10 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What makes nanometres per pixel uncertain, in words: warnings that begin with ``scale:``."""
+"""What makes nanometres per pixel uncertain, in words that begin with ``scale:``, with what it costs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -23,11 +24,18 @@ import numpy as np
 from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.finding import Finding
 from semcal_ros.core.calibration.joint import JointFit
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = ["Hysteresis", "estimate_hysteresis", "estimate_repeatability", "scale_warnings"]
+__all__ = [
+    "Hysteresis",
+    "estimate_hysteresis",
+    "estimate_repeatability",
+    "find_scale_weaknesses",
+    "measure_excess",
+]
 
 # Ratio of the smaller to the larger spread of the tilts: tilts of 30 degrees about one axis, with 3
 # degrees about the other.
@@ -114,9 +122,12 @@ def _tilts_span_one_direction(rotations: Array) -> bool:
     return bool(values[0] < _ONE_DIRECTION * values[1])
 
 
-def _stage_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
-    """List what the readings of the stage and the images do not agree on."""
-    out: list[str] = []
+def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[Finding]:
+    """List what the readings of the stage and the images do not agree on.
+
+    A constant error is estimated and so costs nothing by itself; what a configuration that is wrong costs is not known.
+    """
+    out: list[Finding] = []
     if not any(v.has_stage_tilt for v in setup.views):
         return out
     errors = (
@@ -128,60 +139,108 @@ def _stage_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> lis
         (value,) = adjustment.problem.shared_values(adjustment.result.state.theta, [name])
         if abs(value) > _SURPRISING * sigma:
             out.append(
-                f"scale: the {label} of the stage is {np.degrees(value):+.1f} degrees off from what "
-                "the configuration says: check stage.tilt_axis_deg and the unit of the readings"
+                Finding(
+                    f"scale: the {label} of the stage is {np.degrees(value):+.1f} degrees off from what "
+                    "the configuration says: check stage.tilt_axis_deg and the unit of the readings"
+                )
             )
     camera = model.at(float(setup.magnifications[0]))
     assert camera.covariance is not None
     if camera.rho < -_SURPRISING * np.sqrt(camera.covariance[5, 5]):
         out.append(
-            "scale: the images look as if the beam diverged upwards, so the tilts of the stage have "
-            "the wrong sign: add 180 to stage.tilt_axis_deg"
+            Finding(
+                "scale: the images look as if the beam diverged upwards, so the tilts of the stage have "
+                "the wrong sign: add 180 to stage.tilt_axis_deg"
+            )
         )
     return out
 
 
-def scale_warnings(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[str]:
+def measure_excess(setup: Setup, fit: JointFit) -> tuple[float, float]:
+    """RMS in px by which corners are off beyond their own noise, where that is most nm, and the magnification there."""
+    problem, result = fit.adjustment.problem, fit.adjustment.result
+    square = np.sum(result.residuals_px**2, axis=1)
+    expected = np.concatenate([2.0 * v.sigma_px**2 for v in setup.views])
+    own = np.array([v.magnification for v in setup.views])[problem.view_of_point]
+    inlier = result.huber_weight >= 1.0
+    excess = {}
+    for g in setup.magnifications:
+        mine = inlier & (own == g)
+        beyond = float(np.mean((square - expected)[mine])) if np.any(mine) else 0.0
+        excess[float(g)] = float(np.sqrt(max(beyond, 0.0)))
+    return _worst(excess)
+
+
+def _worst(sigmas: Mapping[float, float]) -> tuple[float, float]:
+    """The error in px, or relative, that costs most nm of those at some magnifications, and where it is."""
+    g = max(sigmas, key=lambda own: sigmas[own] / own)
+    return sigmas[g], g
+
+
+def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[Finding]:
     """List what makes the scale less certain than the residuals suggest, with the remedy."""
-    out: list[str] = []
+    out: list[Finding] = []
     rotations = fit.adjustment.result.state.rotations
     known = any(v.has_stage_tilt for v in setup.views)
-    if not known and _tilts_span_one_direction(rotations):
-        out.append(
-            "scale: all tilts are about one axis, so the images alone do not tell the aspect ratio "
-            "from the tilt; record the stage's tilt, or some views with the scan rotated by 90 degrees"
-        )
-    out += _stage_warnings(setup, fit, model)
-    weak: dict[str, list[float]] = {}
+    sigmas: dict[str, dict[float, float]] = {"aspect": {}, "skew": {}}
     for g in setup.magnifications:
-        camera = model.at(float(g))
-        assert camera.covariance is not None
-        sigma = np.sqrt(np.diag(camera.covariance))
-        for index, name, label in ((1, "aspect", "aspect ratio"), (2, "skew", "skew")):
-            if sigma[index] > _UNDETERMINED * setup.change_prior_of(name):
-                weak.setdefault(label, []).append(float(g))
-    for label, where in weak.items():
+        covariance = model.at(float(g)).covariance
+        assert covariance is not None
+        for index, name in ((1, "aspect"), (2, "skew")):
+            sigmas[name][float(g)] = float(np.sqrt(covariance[index, index]))
+    if not known and _tilts_span_one_direction(rotations):
+        cost, where = _worst(sigmas["aspect"])
         out.append(
-            f"scale: the views do not determine the {label} at magnification "
-            f"{', '.join(f'{g:g}' for g in where)}, where it is held by its prior; record also with "
-            "the scan rotated by 90 degrees, or give the stage's tilt"
+            Finding(
+                "scale: all tilts are about one axis, so the images alone do not tell the aspect ratio "
+                "from the tilt; record the stage's tilt, or some views with the scan rotated by 90 degrees",
+                cost_relative=cost,
+                magnification=where,
+            )
+        )
+    out += _find_stage_errors(setup, fit, model)
+    for name, label in (("aspect", "aspect ratio"), ("skew", "skew")):
+        limit = _UNDETERMINED * setup.change_prior_of(name)
+        weak = {g: sigma for g, sigma in sigmas[name].items() if sigma > limit}
+        if not weak:
+            continue
+        cost, where = _worst(weak)
+        out.append(
+            Finding(
+                f"scale: the views do not determine the {label} at magnification "
+                f"{', '.join(f'{g:g}' for g in weak)}, where it is held by its prior; record also with "
+                "the scan rotated by 90 degrees, or give the stage's tilt",
+                cost_relative=cost,
+                magnification=where,
+            )
         )
     if setup.shared and not _is_repeatability_known(fit):
+        presumed = estimate_repeatability(setup, fit)
         out.append(
-            "scale: the views do not tell how well the magnification comes back; "
-            f"{100.0 * estimate_repeatability(setup, fit):.2g} % is presumed. Visit some "
-            "magnifications twice"
+            Finding(
+                "scale: the views do not tell how well the magnification comes back; "
+                f"{100.0 * presumed:.2g} % is presumed. Visit some magnifications twice",
+                cost_relative=presumed,
+            )
         )
     if fit.pattern is not None:
+        excess_px, excess_at = measure_excess(setup, fit)
         out.append(
-            "scale: the corners are displaced in a pattern that turns with the grid: the grid is not "
-            "regular. No residual field is added for it; use another part of the grid, or another one"
+            Finding(
+                "scale: the corners are displaced in a pattern that turns with the grid: the grid is not "
+                "regular. No residual field is added for it; use another part of the grid, or another one",
+                excess_px,
+                magnification=excess_at,
+            )
         )
     hysteresis = estimate_hysteresis(setup, fit)
     if hysteresis and hysteresis.is_significant:
         out.append(
-            f"scale: magnifications reached from below show {100.0 * hysteresis.relative:+.2g} +- "
-            f"{100.0 * hysteresis.sigma:.1g} % of the scale of those reached from above (hysteresis); "
-            "always approach a magnification from the same side"
+            Finding(
+                f"scale: magnifications reached from below show {100.0 * hysteresis.relative:+.2g} +- "
+                f"{100.0 * hysteresis.sigma:.1g} % of the scale of those reached from above (hysteresis); "
+                "always approach a magnification from the same side",
+                cost_relative=hysteresis.relative,
+            )
         )
     return out

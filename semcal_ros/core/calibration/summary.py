@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Statistics of a calibration for its file, and warnings about undetermined parameters."""
+"""Statistics of a calibration for its file, and what its views do not determine."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
+from semcal_ros.core.calibration.finding import Finding
 from semcal_ros.core.calibration.joint import FittedField, JointFit
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel
@@ -75,23 +76,26 @@ def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def list_undetermined(setup: Setup, model: CalibrationModel) -> list[str]:
-    """List warnings about parameters that the views do not determine beyond their priors."""
-    warnings: list[str] = []
+def list_undetermined(setup: Setup, model: CalibrationModel) -> list[Finding]:
+    """List parameters that the views do not determine beyond their priors."""
+    found: list[Finding] = []
     covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
     assert covariance is not None
     sigma = np.sqrt(np.diag(covariance))
+    # A fitted pose takes up an error of the principal point; a pivot at another distance makes a height count differently.
+    costs = {"px": np.nan, "rho": float(sigma[5]) * model.scale_sigma.height_m}
     for index, name, label in (
         (3, "px", "principal point"),
         (5, "rho", "distance of the scan pivot"),
     ):
         if sigma[index] > 0.8 * setup.prior_of(name)[1]:
-            warnings.append(f"the views do not determine the {label}; it is held by its prior")
+            text = f"the views do not determine the {label}; it is held by its prior"
+            found.append(Finding(text, cost_relative=costs[name]))
     counts = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
     few = [f"{g:g}" for g, n in counts.items() if n < 3]
     if few:
-        warnings.append(f"fewer than 3 views at magnification {', '.join(few)}")
-    return warnings
+        found.append(Finding(f"fewer than 3 views at magnification {', '.join(few)}"))
+    return found
 
 
 def collect_statistics(

@@ -48,6 +48,8 @@ class Verdict:
         The part of ``largest`` that no number of views removes: repeatability, squares, height; NaN if unknown.
     next_visit
         The visit that lowers it most; None where none is worth it, or the grid is not known.
+    conditions
+        What it holds for: voltage, working distance and date.
     """
 
     low: float
@@ -57,6 +59,7 @@ class Verdict:
     pixel_size_m: float
     floor: float
     next_visit: PlannedVisit | None
+    conditions: str = ""
 
     @property
     def pixel_sigma_m(self) -> float:
@@ -64,7 +67,7 @@ class Verdict:
         return self.largest * self.pixel_size_m
 
     def describe(self) -> str:
-        """Return how well nm per pixel is known."""
+        """Return how well nm per pixel is known, over which range, and under which conditions."""
         sigma_nm, size_nm = 1e9 * self.pixel_sigma_m, 1e9 * self.pixel_size_m
         digits = 2
         if 0.0 < sigma_nm < math.inf:
@@ -76,7 +79,9 @@ class Verdict:
             " or better" if self.high > self.low else ""
         )
         where = f", the least at {self.at:.0f}x" if self.high > self.low else ""
-        return f"nm per px is known to {best} {span}{where}: {size_nm:.{digits}f} +- {sigma_nm:.{digits}f} nm"
+        known = f"{size_nm:.{digits}f} +- {sigma_nm:.{digits}f} nm"
+        under = f" ({self.conditions})" if self.conditions else ""
+        return f"nm per px is known to {best} {span}{where}: {known}{under}"
 
     def advise(self) -> str:
         """Return what to record next; empty if that is not known."""
@@ -112,4 +117,5 @@ def judge_calibration(model: CalibrationModel) -> Verdict:
             first = plan.visits[0] if plan.visits else None
             if first is not None and first.largest < (1.0 - _WORTH) * largest:
                 visit = first
-    return Verdict(float(low), float(high), largest, at, size_m, floor, visit)
+    conditions = model.provenance.describe_essentials()
+    return Verdict(float(low), float(high), largest, at, size_m, floor, visit, conditions)

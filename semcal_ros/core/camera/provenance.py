@@ -30,6 +30,8 @@ NOT_RECORDED = "not recorded"
 # The microscope is named by these alone, without a label.
 _MICROSCOPE = ("maker", "model", "serial_number")
 # Of interest with the views, not with the microscope.
+# What changes the scale of any microscope.
+_ESSENTIAL = ("acceleration_voltage_v", "working_distance_m")
 _OF_VIEWS = ("beam", "stage_tilt_rad", "stage_rotation_rad", "frame_interval_s")
 
 
@@ -88,6 +90,17 @@ class Provenance:
             if name not in (*_MICROSCOPE, *_OF_VIEWS)
         ]
         return ", ".join(parts) or NOT_RECORDED
+
+    def describe_essentials(self) -> str:
+        """What a calibration holds for, in a few words: voltage, working distance and the days of its views."""
+        days = tuple(dict.fromkeys(date[:10] for date in self.recorded))
+        parts = {
+            describe_condition(name, ())[0]: describe_condition(name, self.conditions.get(name, ()))[1]
+            for name in _ESSENTIAL
+        } | {"date": " to ".join(days)}
+        if not any(parts.values()):
+            return f"conditions {NOT_RECORDED}"
+        return printable(", ".join(f"{name} {value or NOT_RECORDED}" for name, value in parts.items()))
 
     def describe(self) -> str:
         """All three, in one line for a log."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from semcal_ros.core.calibration.calibrate import CalibrationResult
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.findings import find_weaknesses
+from semcal_ros.core.calibration.findings import find_all
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance
@@ -120,9 +120,8 @@ def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
 
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
-    """Collect the calibration's warnings and its weaknesses, as sentences."""
-    found = dict.fromkeys((*result.warnings, *find_weaknesses(result, rejected)))
-    return [_format_sentence(text) for text in found]
+    """Collect what was found about the calibration as sentences, the most costly first."""
+    return [_format_sentence(own.tell(result.model)) for own in find_all(result, rejected)]
 
 
 def _format_sentence(text: str) -> str:

@@ -31,7 +31,8 @@ from semcal_ros.core.calibration.coverage import (
     compute_tilts_deg,
 )
 from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.core.calibration.findings import find_weaknesses
+from semcal_ros.core.calibration.finding import Finding, rank_findings
+from semcal_ros.core.calibration.findings import find_all
 from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
 from semcal_ros.core.camera.predicted_error import (
     make_field_lattice,
@@ -243,7 +244,8 @@ def test_what_costs_most_comes_first_and_says_how_many_nm(result: CalibrationRes
     residuals = list(result.fit.residuals_px)
     residuals[6] = 60.0 * residuals[6]
     fit = replace(result.fit, residuals_px=tuple(residuals))
-    found = find_weaknesses(replace(result, held_out_rms_px=held_out, fit=fit))
+    bad = replace(result, held_out_rms_px=held_out, fit=fit)
+    found = [own.tell(result.model) for own in find_all(bad)]
     costs = [re.search(r"costs ([\d.e+]+) nm at (\d+)x", text) for text in found]
     assert costs[0] is not None and costs[1] is not None
     assert "corners of" in found[0] and "predicted badly" in found[1]
@@ -321,3 +323,22 @@ def test_predictions_need_a_covariance(result: CalibrationResult) -> None:
         magnification_range=(low, low), image_size=(SIZE, SIZE), at=lambda _: camera_at(low)
     )
     assert plot_predicted_errors(bare) == []
+
+
+def test_all_kinds_of_findings_are_ranked_together_by_nm(result: CalibrationResult) -> None:
+    """A relative error of the scale costs what it moves the edge by; what costs nothing known comes last."""
+    size = result.model.image_width
+    at = {g: 1e9 * float(np.mean(result.model.at(g).pixel_size_m)) for g in (100.0, 1500.0)}
+    unknown = Finding("unknown")
+    # More px, but fewer nm than the other two.
+    px = Finding("px", 2.0, magnification=1500.0)
+    everywhere = Finding("scale: everywhere", cost_relative=-0.003)
+    there = Finding("scale: there", cost_relative=0.03, magnification=1500.0)
+    assert 2.0 * at[1500.0] < 0.015 * size * at[1500.0] < 0.0015 * size * at[100.0]
+    ranked = rank_findings((unknown, px, there, everywhere, px), result.model)
+    assert ranked == (everywhere, there, px, unknown)
+    texts = replace(result, findings=(unknown, px, there, everywhere)).warnings
+    assert [re.sub(r" \(.*", "", text) for text in texts] == [own.text for own in ranked]
+    assert f"at {result.model.magnification_range[0]:.0f}x" in texts[0]
+    (cost,) = re.findall(r"costs ([\d.]+) nm", texts[1])
+    assert float(cost) == pytest.approx(0.015 * size * at[1500.0], rel=0.05)

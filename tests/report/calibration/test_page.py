@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.calibrate import (
     calibrate_views,
 )
 from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.finding import Finding
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
@@ -211,7 +212,7 @@ def test_single_magnification_without_the_optional_parts(
         display_width_m=DISPLAY_M,
         options=CalibrationOptions("discrete"),
     )
-    one = replace(one, warnings=("fewer than 3 views at magnification 800",))
+    one = replace(one, findings=(Finding("fewer than 3 views at magnification 800"),))
     parsed = Page(write_calibration_report(one, tmp_path / "r.html").read_text(encoding="utf-8"))
     assert "needs 3 magnifications" in parsed.text
     assert "– *" not in parsed.text and "A star" not in parsed.text
