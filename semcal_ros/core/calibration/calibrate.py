@@ -65,6 +65,7 @@ from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.summary import (
     collect_statistics,
     describe_field,
+    describe_shares,
     describe_stage,
     list_undetermined,
 )
@@ -356,12 +357,13 @@ def calibrate_views(
     model = _make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
     poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
     held_out = _predict_held_out(setup, fit, options.method)
-    findings = (*fit.findings, *list_undetermined(setup, model))
+    findings, details = (*fit.findings, *list_undetermined(setup, model)), fit.details
     if options.method == "joint":
         findings = (*findings, *find_scale_weaknesses(setup, joint, model))
+        details = {**details, "scale_shares": describe_shares(model, joint.parts)}
     result = CalibrationResult(model, setup.views, poses, held_out, findings, outliers)
     statistics = collect_statistics(
-        setup, fit.details, fit.height_sigma_m, poses, held_out, result.warnings
+        setup, details, fit.height_sigma_m, poses, held_out, result.warnings
     )
     return replace(result, model=replace(model, statistics=statistics))
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, solve_scaled
+from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, BundleStatus, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.line_jitter import LineJitter, estimate_jitter, jitter_covariance
@@ -67,6 +67,7 @@ from semcal_ros.core.calibration.variance_components import (
     update_components,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -108,6 +109,8 @@ _LEAST_EXPLAINED = 1.0 / 3.0
 # RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
 # the noise of good corners.
 _FIELD_CONVERGED_PX = 1e-3
+# Step of a central difference: its error is the square of this, far below what a share is worth.
+_CERTAINTY_STEP = 0.02
 # Largest start of rho, 1/m. The depth gradient of weakly tilted views is noisy, and a pivot nearer
 # than 5 mm would be noise.
 _MAX_START_RHO = 200.0
@@ -178,6 +181,22 @@ class Adjustment:
 
 
 @dataclass(frozen=True)
+class CovarianceParts:
+    """What the covariance of the coefficients consists of; the rest of it is the form of the functions.
+
+    Attributes
+    ----------
+    corners
+        (K, K) the errors of the corners, in lines too.
+    visits
+        (K, K) what varies between visits and views, and all that is left open besides: poses, heights, grid, stage.
+    """
+
+    corners: Array
+    visits: Array
+
+
+@dataclass(frozen=True)
 class JointFit:
     """Result of :func:`fit_joint`.
 
@@ -196,6 +215,8 @@ class JointFit:
         What is irregular about the grid, or None.
     excess_px
         1-sigma per axis, px, by which all corners scatter beyond their own.
+    parts
+        What the covariance of the functions consists of.
     """
 
     adjustment: Adjustment
@@ -205,6 +226,7 @@ class JointFit:
     field: FittedField | None
     pattern: GridPattern | None
     excess_px: float
+    parts: CovarianceParts
 
 
 def refit_functions(
@@ -357,6 +379,52 @@ def _pad_covariance(
     covariance[:count, :count] += jitter_covariance(problem, result, jitter)
     keep = np.r_[0:size, count : len(moved)]
     return covariance[np.ix_(keep, keep)]
+
+
+def _split_covariance(
+    setup: Setup,
+    padded: Functions,
+    adjustment: Adjustment,
+    views: Sequence[GridView],
+    jitter: LineJitter,
+) -> CovarianceParts:
+    """Split the covariance C of the padded functions into what corners, visits and left-out coefficients add.
+
+    The information is that of the corners and that of the priors, C^-1 = N + P, so that C = C N C + C P C: the first
+    is what errors of the corners do to the estimate, the second what the priors stand for does. With all corners
+    ``1 + t`` times as certain, C is ``((1 + t)^2 N + P)^-1``, whose derivative at t = 0 is -2 C N C. The
+    prior of the coefficients that were left out is diagonal.
+    """
+    problem, result = _linearise(setup, padded, views, adjustment)
+    state = result.state
+
+    def covariance(certainty: float) -> Array:
+        scaled = replace(problem, whitening=certainty * problem.whitening)
+        return refine(scaled, state, max_iterations=0).covariance
+
+    whole = result.covariance
+    corners = (covariance(1.0 - _CERTAINTY_STEP) - covariance(1.0 + _CERTAINTY_STEP)) / (
+        4.0 * _CERTAINTY_STEP
+    )
+    left = _left_out(adjustment.functions, padded)
+    omitted = (whole[:, left] / problem.prior_sigma[left] ** 2) @ whole[left]
+    factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
+    size = len(state.theta) - len(setup.shared)
+    own = slice(0, size)
+    shaken = jitter_covariance(problem, result, jitter)
+    return CovarianceParts(
+        (factor * corners + shaken)[own, own], (factor * (whole - corners - omitted))[own, own]
+    )
+
+
+def _left_out(chosen: Functions, padded: Functions) -> Indices:
+    """Indices of the coefficients that the padded functions have and the chosen ones have not."""
+    out, start = [], 0
+    for name in FUNCTION_NAMES:
+        own, whole = chosen[name], padded[name]
+        out += range(start + own.smooth_size, start + whole.smooth_size)
+        start += whole.size
+    return np.array(out, dtype=np.intp)
 
 
 def _pattern_covariance(
@@ -549,7 +617,8 @@ def fit_joint(
     covariance = _pad_covariance(setup, padded, adjustment, field, jitter)
     if pattern is not None:
         covariance = covariance + _pattern_covariance(setup, padded, adjustment, pattern)
-    return JointFit(adjustment, padded, covariance, jitter, field, pattern, excess)
+    parts = _split_covariance(setup, padded, adjustment, final.views, jitter)
+    return JointFit(adjustment, padded, covariance, jitter, field, pattern, excess, parts)
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:

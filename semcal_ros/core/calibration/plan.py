@@ -39,6 +39,7 @@ from semcal_ros.core.camera.calibration_model import (
     FUNCTION_NAMES,
     CalibrationModel,
     design_matrix,
+    pixel_size_gradient,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
@@ -146,7 +147,7 @@ def plan_views(
     judged = np.geomspace(low, high, _JUDGED) if high > low else np.array([low])
     candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
     root = np.concatenate([_root(model), _aged(model, ageing)], axis=1)
-    rows = np.stack([_pixel_rows(model, float(g)) @ root for g in judged])  # (G, 2, K)
+    rows = np.stack([pixel_size_gradient(model, float(g)) @ root for g in judged])  # (G, 2, K)
     floor = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
     fixed = floor if single_setting else np.zeros_like(floor)
     designs = [_design(model, float(g)) @ root for g in candidates]
@@ -207,13 +208,6 @@ def _aged(model: CalibrationModel, ageing: float) -> Array:
 
 def _design(model: CalibrationModel, g: float) -> Array:
     return design_matrix(model.functions, g, model.nominal_px_per_m(g))
-
-
-def _pixel_rows(model: CalibrationModel, g: float) -> Array:
-    """(2, K) relative change of the pixel size along x and y per unit of the coefficients."""
-    camera, design = model.at(g), _design(model, g)
-    scale, aspect = design[0] / camera.m, design[1] / camera.aspect
-    return np.stack([-scale - aspect, -scale + aspect])
 
 
 def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:

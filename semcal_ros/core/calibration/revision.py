@@ -278,9 +278,7 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         problem = _build(model, setup, spread, sigmas)
         result = refine(problem, result.state)
     jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
-    # As in a calibration: what is left of a misfit makes everything less certain, and never more.
-    factor = max(variance_factor(problem, result), 1.0)
-    return Revision(model, setup, problem, result, factor * result.covariance + jitter, misfit)
+    return Revision(model, setup, problem, result, result.covariance + jitter, misfit)
 
 
 def _build(

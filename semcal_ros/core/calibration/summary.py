@@ -25,11 +25,17 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
 from semcal_ros.core.calibration.finding import Finding
-from semcal_ros.core.calibration.joint import FittedField, JointFit
+from semcal_ros.core.calibration.joint import CovarianceParts, FittedField, JointFit
 from semcal_ros.core.calibration.priors import Setup
-from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel, pixel_size_gradient
 
-__all__ = ["collect_statistics", "describe_field", "describe_stage", "list_undetermined"]
+__all__ = [
+    "collect_statistics",
+    "describe_field",
+    "describe_shares",
+    "describe_stage",
+    "list_undetermined",
+]
 
 
 def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
@@ -70,6 +76,25 @@ def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
         "lattice_sigma": None if spread.lattice_sigma is None else spread.lattice_sigma.tolist(),
         "line_jitter_px": fit.jitter.sigma_px,
     }
+
+
+def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> dict[str, list[float]]:
+    """Return the parts of the variance of nm per pixel at each calibrated magnification, of the less certain axis.
+
+    What is missing to 1 is the form of the functions: coefficients that were left out, and what would move with them.
+    """
+    size = len(parts.corners)
+    shares: dict[str, list[float]] = {"corners": [], "visits": []}
+    for g in model.magnifications:
+        rows = pixel_size_gradient(model, g)
+        whole = np.einsum("ai,ij,aj->a", rows, model.covariance[:size, :size], rows)
+        row, variance = rows[int(np.argmax(whole))], float(np.max(whole))
+        own = [max(float(row @ part @ row), 0.0) for part in (parts.corners, parts.visits)]
+        # A residual field takes over some of what the functions alone would have to explain.
+        most = max(variance, sum(own), np.finfo(np.float64).tiny)
+        shares["corners"].append(own[0] / most)
+        shares["visits"].append(own[1] / most)
+    return shares
 
 
 def _finite_or_none(value: float) -> float | None:

@@ -37,6 +37,7 @@ __all__ = [
     "ScaleSigma",
     "checked_magnification",
     "design_matrix",
+    "pixel_size_gradient",
 ]
 
 
@@ -272,3 +273,13 @@ class CalibrationModel:
             sigma[i] = 2.0 * (max(values) - min(values)) * distance
         sigma[0] *= self.nominal_px_per_m(g)
         return np.diag(sigma**2)
+
+
+def pixel_size_gradient(model: CalibrationModel, magnification: float) -> Array:
+    """(2, K) relative change of the pixel size along x and y per unit of the coefficients of the functions."""
+    camera = model.at(magnification)
+    design = design_matrix(
+        model.functions, magnification, model.nominal_px_per_m(magnification)
+    )
+    scale, aspect = design[0] / camera.m, design[1] / camera.aspect
+    return np.stack([-scale - aspect, -scale + aspect])

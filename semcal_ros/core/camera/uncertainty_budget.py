@@ -21,6 +21,7 @@ factor 2, which is 95 % for a normal distribution (6.2.1).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,11 @@ _COVERAGE = 2.0
 _JUDGED = 25
 # Where a length may lie in the image, as a part of width and height: the worst of these places counts.
 _PLACES = (0.25, 0.5, 0.75)
+# Names in the statistics of a calibration, and what they are called.
+_OF_VIEWS = {
+    "corners": "corners of the calibration",
+    "visits": "visits, poses and heights of the calibration",
+}
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,7 @@ def _scale_parts(
         "squares of the grid": sigma.grid,
         "height of the specimen": camera.rho * sigma.height_m / stretch,
         "magnification outside the calibrated range": beyond,
-        "views of the calibration": math.sqrt(max(own**2 - extra**2 - beyond**2, 0.0)),
+        **_split_views(model, magnification, max(own**2 - extra**2 - beyond**2, 0.0)),
         # The cosine of a small tilt differs from 1 by half of its square, of which this is the RMS.
         "tilt of the specimen": 0.5 * math.sqrt(3.0) * _TILT_SIGMA_RAD**2,
     }
@@ -138,6 +144,34 @@ def _scale_parts(
         rho_sigma = math.sqrt(max(float(camera.covariance[5, 5]), 0.0))
         parts["distance of the scan pivot"] = abs(height_m) * rho_sigma / stretch
     return rectified, rectified.pixel_size_m[0] * stretch, parts
+
+
+def _split_views(model: CalibrationModel, magnification: float, variance: float) -> dict[str, float]:
+    """What the covariance of the calibration adds, by its sources where the calibration tells them."""
+    fit = model.statistics.get("fit")
+    told = fit.get("scale_shares") if isinstance(fit, Mapping) else None
+    shares = [_share_at(told, name, model.magnifications, magnification) for name in _OF_VIEWS]
+    known = [share for share in shares if share is not None]
+    if len(known) < len(_OF_VIEWS) or not 0.0 <= sum(known) <= 1.0 + 1e-9:
+        return {"views of the calibration": math.sqrt(variance)}
+    parts = {
+        source: math.sqrt(variance * share)
+        for source, share in zip(_OF_VIEWS.values(), known, strict=True)
+    }
+    left = max(1.0 - sum(known), 0.0)
+    return parts | {"form of the functions of the calibration": math.sqrt(variance * left)}
+
+
+def _share_at(
+    told: object, name: str, magnifications: Sequence[float], magnification: float
+) -> float | None:
+    """A share at a magnification; None for statistics that are not those of this version, or that were edited."""
+    values = told.get(name) if isinstance(told, Mapping) else None
+    if not isinstance(values, (list, tuple)) or len(values) != len(magnifications):
+        return None
+    if not all(isinstance(v, (int, float)) and 0.0 <= v <= 1.0 for v in values):
+        return None
+    return float(np.interp(math.log(magnification), np.log(magnifications), values))
 
 
 def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:

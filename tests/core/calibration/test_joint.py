@@ -21,10 +21,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import refine
 from semcal_ros.core.calibration.joint import JointFit, fit_joint
+from semcal_ros.core.calibration.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import build_problem, stack_coefficients, variance_factor
+from semcal_ros.core.camera.calibration_model import design_matrix
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
@@ -60,3 +63,32 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
     # The covariance takes one Gauss-Newton step, the adjustment here goes to its end: they differ
     # by less than half a sigma.
     assert np.all(np.abs(added - change)[clear] < 0.5 * sigma[clear])
+
+
+def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
+    setup: Setup, fit: JointFit
+) -> None:
+    """A tenth of the stated noise is added to the corners, all else is as it was, and the scale scatters by that part."""
+    problem = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
+    start = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded))
+    sigma_px = np.concatenate([view.sigma_px for view in setup.views])[:, None]
+    rows = np.stack([design_matrix(fit.padded, g, 1.0)[0] for g in (150.0, 700.0, 3000.0, 8000.0)])
+    rng = np.random.default_rng(0)
+
+    def scale(noise_px: np.ndarray) -> np.ndarray:
+        noisy = replace(problem, observed_px=problem.observed_px + noise_px)
+        own = refine(noisy, start, max_iterations=0)
+        step = reduced_normal_equations(noisy, start.theta, own.information, own.gradient)
+        return np.asarray(rows @ solve_scaled(*step))
+
+    # So little noise leaves the corners that count less as outliers the same.
+    draws = [0.1 * sigma_px * rng.normal(size=problem.observed_px.shape) for _ in range(100)]
+    scatter = 10.0 * np.std([scale(noise_px) for noise_px in draws], axis=0)
+    stated = np.sqrt(np.einsum("gk,kl,gl->g", rows, fit.parts.corners, rows))
+    # A standard deviation of 100 is good to 7 %.
+    assert np.allclose(scatter, stated, rtol=0.2)
+    # What is left is positive in every direction: coefficients that were left out, and by how much all would move.
+    size = len(fit.parts.corners)
+    rest = fit.covariance[:size, :size] - fit.parts.corners - fit.parts.visits
+    for part in (fit.parts.corners, fit.parts.visits, rest):
+        assert np.all(np.einsum("gk,kl,gl->g", rows, part, rows) > 0.0)
