@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -24,7 +25,16 @@ from typing import Any
 from semcal_ros.bridge.fields import new_nested
 from semcal_ros.core.arrays import check_positive
 
-__all__ = ["DiagnosticLevel", "DiagnosticSummary", "StreamStatistics", "fill_diagnostic_status"]
+__all__ = [
+    "DiagnosticLevel",
+    "DiagnosticSummary",
+    "StreamStatistics",
+    "fill_diagnostic_status",
+    "join_states",
+    "split_states",
+]
+
+_BETWEEN = "; "
 
 
 class DiagnosticLevel(IntEnum):
@@ -43,6 +53,20 @@ class DiagnosticSummary:
     level: DiagnosticLevel
     message: str
     values: tuple[tuple[str, str], ...]
+
+
+def join_states(states: Iterable[str]) -> str:
+    """Join states to the one line of a diagnostic message.
+
+    Semicolons within a state, as between what was seen and what was expected, become commas: what reads the line can
+    tell the states apart again, see :func:`split_states`.
+    """
+    return _BETWEEN.join(state.replace(";", ",") for state in states)
+
+
+def split_states(message: str) -> list[str]:
+    """Split the line that :func:`join_states` made."""
+    return [state for part in message.split(_BETWEEN.strip()) if (state := part.strip())]
 
 
 class StreamStatistics:
@@ -160,7 +184,7 @@ class StreamStatistics:
             level, message = DiagnosticLevel.OK, f"{rate:.1f} Hz"
         if fresh_troubles and self._rejection:
             level = max(level, DiagnosticLevel.WARN)
-            message += f"; last rejection: {self._rejection}"
+            message = join_states([message, f"last rejection: {self._rejection}"])
         return DiagnosticSummary(level, message, self._values(now_s, rate))
 
     def _values(self, now_s: float, rate: float) -> tuple[tuple[str, str], ...]:

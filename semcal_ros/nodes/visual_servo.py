@@ -323,7 +323,7 @@ class VisualServo(SemNode):
     def conditions(self) -> list[str]:
         """Extend the base class: also report why the stage stands still."""
         standing = self._active and self._state not in ("servoing", "converged")
-        return super().conditions() + [self._state] * standing
+        return super().conditions() + [f"standing still: {self._state}"] * standing
 
     def idle(self) -> bool:
         """Return whether the control has not been started: it expects no stream before."""

@@ -20,6 +20,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from semcal_ros.bridge.diagnostics import split_states
 from semcal_ros.core.wording import counted
 from semcal_ros.viewer.source import Note, Rate
 
@@ -35,6 +36,7 @@ _SILENT_S = 5.0
 _WITHOUT_FRAMES = ("calibration_server", "parameter_server")
 
 # What a node says -> level, words (with the groups of the expression), what to do. The first that fits counts.
+# `tests/viewer/test_words.py` finds all states in the code of the nodes, and wants a sentence for each.
 _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
     (r"[\d.]+ Hz", _OK, "works", ""),
     (r"ready", _OK, "is ready", ""),
@@ -51,7 +53,12 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         r"has lost or refused \1 of the last frames",
         "if it goes on, this computer is too slow for the stream",
     ),
-    (r"last rejection: (.*)", _WARN, r"refused a frame: \1", ""),
+    (
+        r"last rejection: (.*)",
+        _WARN,
+        r"refused a message: \1",
+        "correct what sends it, or the configuration",
+    ),
     (
         r"uncalibrated",
         _WARN,
@@ -77,6 +84,18 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         "check the calibration, or set the conditions back",
     ),
     (
+        r"calibration (?:degraded|invalid)(.*)",
+        _WARN,
+        r"finds in the picture of the grid that the calibration does not hold any more\1",
+        "add views and press Check; then update the calibration, or calibrate anew",
+    ),
+    (
+        r"calibration (\S+) not used while (\S+) plays",
+        _WARN,
+        r"does not use the calibration \1 that comes from the recording that \2 plays",
+        "to use it, set replayed_calibration to take and play again, or load its file",
+    ),
+    (
         r"waiting for magnification",
         _WARN,
         "does not know the magnification",
@@ -100,6 +119,36 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         r"sees nothing: the image is \1, \2",
         "check beam blank, shutter and detector",
     ),
+    (
+        r"blank frames",
+        _WARN,
+        "gets pictures without anything in them",
+        "check beam blank, shutter and detector; it goes on by itself",
+    ),
+    (
+        r"magnification turned at the microscope: field width (\S+) m, (\S+) m asked for",
+        _WARN,
+        r"sees another magnification than was set from here: a field of \1 m, not \2 m",
+        "if that was wanted, press Start; else set it again",
+    ),
+    (
+        r"accelerating voltage (\S+) V, (\S+) V at the start",
+        _WARN,
+        r"sees \1 V of accelerating voltage, \2 V at the start: the scale changes with it",
+        "set it back; if it was wanted, press Start and check the calibration",
+    ),
+    (
+        r"not moving any more: (.*)",
+        _ERROR,
+        r"does not move anything any more: \1",
+        "look at the stage; then press Start to allow moves again",
+    ),
+    (
+        r"standing still: (.*)",
+        _WARN,
+        r"keeps the stage still: \1",
+        "it goes on by itself once that is over; a fault needs ~/start",
+    ),
     (r"paused", _WARN, "is paused", "press Start"),
     (r"stopped", _WARN, "is stopped", "press Start"),
     (
@@ -108,7 +157,12 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         r"has lost the microscope and tries again: \1",
         "look whether the microscope's computer and program run",
     ),
-    (r"connecting for (\d+) s", _WARN, r"has been connecting to the microscope for \1 s", ""),
+    (
+        r"connecting for (\d+) s",
+        _WARN,
+        r"has been connecting to the microscope for \1 s",
+        "if it goes on, look whether the microscope's computer and program run",
+    ),
     (
         r"source does not answer for (\d+) s",
         _ERROR,
@@ -122,13 +176,31 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         "start the corrector",
     ),
     (
+        r"no joint (\S+) on (\S+)",
+        _WARN,
+        r"does not find the joint \1 of the stage on \2",
+        "correct its name in the configuration, under stage",
+    ),
+    (
+        r"(\S+) (\S+) rad on (\S+): degrees\?",
+        _WARN,
+        r"does not use the stage: a \1 of \2 on \3 is no angle in rad",
+        "let the stage publish rad instead of degrees",
+    ),
+    (
+        r"(images of .*|the Fast DDS profile cannot be used: .*), (set the environment of .*)",
+        _WARN,
+        r"loses time with each image: \1",
+        r"\2",
+    ),
+    (
         r"(\S+) without (reliability|durability)",
         _WARN,
         r"gets \1 from a source that does not repeat lost messages",
         "set the source to reliable",
     ),
     (
-        r"(\S+) on (\S+)",
+        r"([\w/]+(?:, [\w/]+)*) on (\S+)",
         _ERROR,
         r"hears the wrong kind of message, \1, on \2",
         "correct the configuration",
@@ -147,7 +219,7 @@ class NodeReport:
     level
         0 to 3: OK, WARN, ERROR, STALE.
     message
-        Its sentence: states with semicolons between them.
+        Its line: states, as :func:`~semcal_ros.bridge.diagnostics.join_states` joins them.
     values
         Its figures, as texts.
     age_s
@@ -161,16 +233,11 @@ class NodeReport:
     age_s: float = 0.0
 
 
-def _split(message: str) -> list[str]:
-    """Split at the semicolons between states; what is within brackets belongs together."""
-    return [part.strip() for part in re.split(r";(?![^()]*\))", message) if part.strip()]
-
-
 def _explain_part(report: NodeReport, part: str) -> Note:
     name = report.name
     for pattern, level, words, do in _SENTENCES:
         if found := re.fullmatch(pattern, part):
-            return Note(level, name, found.expand(words), do)
+            return Note(level, name, found.expand(words), found.expand(do))
     # What this table does not know is in words already.
     return Note(_LEVELS.get(report.level, _WARN), name, f"says: {part}", "")
 
@@ -187,7 +254,7 @@ def explain(reports: Sequence[NodeReport]) -> tuple[Note, ...]:
             text = f"has said nothing for {report.age_s:.0f} s"
             found.append(Note(_ERROR, report.name, text, "it has ended or hangs; start it again"))
             continue
-        notes = [_explain_part(report, part) for part in _split(report.message)]
+        notes = [_explain_part(report, part) for part in split_states(report.message)]
         troubles = [note for note in notes if note.level != _OK]
         found += troubles
         if not troubles:

@@ -24,8 +24,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import Image
 
+from semcal_ros.bridge.diagnostics import join_states
 from tests.helpers.chromium import BROWSER, Page, chromium
 from tests.helpers.live_page import viewing
 from tests.helpers.node_scenes import write_recording
@@ -141,6 +143,9 @@ def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
             count = len(images)
             peer.spin(1.0)
             assert len(images) == count
+            page.wait_for(
+                "/virtual_sem is stopped/.test(document.querySelector('#notes').textContent)"
+            )
             press(page, "start")
             peer.wait_for(lambda n=count, i=images: len(i) > n, "frames again")
 
@@ -159,12 +164,27 @@ def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
     assert page.console == []
 
 
-def test_the_page_says_that_the_viewer_has_ended_and_goes_on_when_it_is_back(page: Page) -> None:
+def test_bad_days_and_the_end_of_the_viewer_are_told(peer: Peer, page: Page) -> None:
+    """What a microscope says of itself, and that the viewer has ended; it goes on when it is back."""
+    bad = join_states(["blank frames", "not moving any more: no answer; expected tilt 0.1 rad"])
+    said = DiagnosticStatus(level=b"\x01", name="/sem/microscope: stream", message=bad)
+    diagnostics = peer.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
     with viewing() as address:
         page.size(390, 844)
         page.open(address)
         page.wait_for("document.querySelector('#link').textContent === 'connected'")
         page.wait_for("document.querySelector('#notes').textContent.includes('no node')")
+
+        def shown() -> bool:
+            diagnostics.publish(DiagnosticArray(status=[said]))
+            return bool(page.evaluate("document.querySelectorAll('#notes li').length === 2"))
+
+        peer.wait_for(shown, "both states")
+        worst, other = (page.text(f"#notes li:nth-child({k})") for k in (1, 2))
+        assert worst.startswith("microscope does not move anything any more: no answer, expected")
+        assert "then press Start" in worst
+        assert other.startswith("microscope gets pictures without anything in them")
+        assert "beam blank" in other
         fits(page)
     page.wait_for("document.querySelector('#link').className.includes('error')")
     port = address.rstrip("/").rpartition(":")[2]

@@ -16,9 +16,17 @@
 
 from __future__ import annotations
 
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
 import numpy as np
 import pytest
 
+import semcal_ros
+from semcal_ros.bridge.diagnostics import join_states
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
@@ -31,35 +39,158 @@ def test_nodes_without_trouble_are_one_line() -> None:
     assert notes[0].text == "2 nodes without trouble"
 
 
-@pytest.mark.parametrize(
-    ("message", "level", "words", "do"),
-    [
-        ("9.8 Hz; uncalibrated", "warn", "nominal", "calibrat"),
-        ("9.8 Hz; magnification outside the calibrated range", "warn", "magnification", "range"),
-        ("no frame for 7.5 s", "error", "7.5 s", "Start"),
-        ("9.8 Hz; drift coasting: the overlap is too small", "warn", "overlap", "Reset drift"),
-        (
-            "3 frames dropped or rejected; last rejection: encoding bgra8; expected mono8",
-            "warn",
-            "3 of the last frames",
-            "slow",
-        ),
-        ("1 Hz; 2 publishers on /sem/image_raw: /sem/a, /sem/b", "error", "2 sources", "end"),
-        ("1 Hz; other conditions: voltage 10 kV, calibrated at 5 kV", "warn", "5 kV", "check"),
-        ("1 Hz; source lost, trying again: no route", "error", "lost the microscope", "computer"),
-        ("1 Hz; the image is dark: no grey level above 1", "warn", "sees nothing", "beam blank"),
-        ("1 Hz; stopped", "warn", "stopped", "Start"),
-        ("1 Hz; std_msgs/msg/Int32 on /sem/magnification", "error", "wrong kind", "configuration"),
-        ("1 Hz; something new that nobody knows", "warn", "something new", ""),
-    ],
-)
-def test_troubles_are_told_in_words_with_what_to_do(
-    message: str, level: str, words: str, do: str
-) -> None:
-    note = explain([NodeReport("corrector", 1, message)])[0]
-    assert (note.level, note.who) == (level, "corrector")
-    assert words in note.text
-    assert do in note.do
+# What nodes can say of themselves: level, what is understood of it, and the beginning of what to do.
+STATES = {
+    "9.8 Hz": ("ok", "", ""),
+    "ready": ("ok", "", ""),
+    "no frame received yet": ("warn", "not seen a frame", "start the microscope"),
+    "no frame for 7.5 s": ("error", "7.5 s", "press Start"),
+    "3 frames dropped or rejected": ("warn", "3 of the last frames", "if it goes on"),
+    "last rejection: encoding bgra8, expected mono8": ("warn", "bgra8, expected mono8", "correct"),
+    "uncalibrated": ("warn", "nominal", "calibrate"),
+    "scale of the calibration: a warning: few tilts": ("warn", "few tilts", "see the report"),
+    "magnification outside the calibrated range": ("warn", "magnification", "go back"),
+    "other conditions: voltage 10 kV, calibrated at 5 kV": ("warn", "5 kV", "check"),
+    "calibration invalid (scale): nm per px off by +0.400 +- 0.050 %, by 1 view": (
+        "warn",
+        "does not hold any more (scale): nm per px off by +0.400",
+        "add views and press Check",
+    ),
+    "calibration 0123456789ab not used while /sem/bag_player plays": (
+        "warn",
+        "0123456789ab",
+        "to use it, set replayed_calibration",
+    ),
+    "waiting for magnification": ("warn", "magnification", "look whether"),
+    "drift coasting: the overlap is too small": ("warn", "overlap", "focus"),
+    "2 publishers on /sem/image_raw: /sem/a, /sem/b": ("error", "2 sources", "end all but one"),
+    "the image is dark: no grey level above 1": ("warn", "sees nothing", "check beam blank"),
+    "the image is even: all grey levels are 128": ("warn", "sees nothing", "check beam blank"),
+    "blank frames": ("warn", "without anything", "check beam blank"),
+    "magnification turned at the microscope: field width 2.4e-05 m, 3e-05 m asked for": (
+        "warn",
+        "another magnification than was set from here: a field of 2.4e-05 m",
+        "if that was wanted, press Start",
+    ),
+    "accelerating voltage 10000 V, 5000 V at the start": ("warn", "5000 V at the", "set it back"),
+    "not moving any more: the stage has not arrived, expected tilt 0.1": (
+        "error",
+        "the stage has not arrived",
+        "look at the stage",
+    ),
+    "standing still: no frames": ("warn", "no frames", "it goes on by itself"),
+    "paused": ("warn", "paused", "press Start"),
+    "stopped": ("warn", "stopped", "press Start"),
+    "source lost, trying again: no route": ("error", "lost the microscope", "look whether"),
+    "connecting for 7 s": ("warn", "7 s", "if it goes on"),
+    "source does not answer for 12 s": ("error", "12 s", "look whether"),
+    "files wait for subscribers of image_raw": ("warn", "image_raw", "start the corrector"),
+    "no joint tilt on stage": ("warn", "joint tilt", "correct its name"),
+    "tilt 30 rad on stage: degrees?": ("warn", "a tilt of 30 on stage", "let the stage publish"),
+    "images of 4.0 MiB do not fit into the shared memory of Fast DDS, 0.5 MiB (default), set the "
+    "environment of `Large images` (doc/nodes.md) for every process with images": (
+        "warn",
+        "4.0 MiB",
+        "set the environment",
+    ),
+    "/sem/image_raw without reliability": ("warn", "repeat lost messages", "set the source"),
+    "std_msgs/msg/Int32 on /sem/magnification": ("error", "wrong kind", "correct the config"),
+}
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_every_state_is_told_in_words_with_what_to_do(state: str) -> None:
+    level, words, do = STATES[state]
+    notes = explain([NodeReport("corrector", 1, f"1.0 Hz; {state}")])
+    if level == "ok":
+        assert [(n.level, n.who) for n in notes] == [("ok", "corrector")]
+        return
+    assert [(n.level, n.who) for n in notes] == [(level, "corrector")]
+    assert words in notes[0].text and not notes[0].text.startswith("says:")
+    assert do and notes[0].do.startswith(do)
+
+
+N = TypeVar("N", bound=ast.AST)
+
+
+def _walk(tree: ast.AST, kind: type[N]) -> Iterator[N]:
+    return (node for node in ast.walk(tree) if isinstance(node, kind))
+
+
+def _returns(method: ast.FunctionDef) -> str:
+    return "" if method.returns is None else ast.unparse(method.returns)
+
+
+def _templates(path: Path) -> Iterator[str]:
+    """Regular expressions of the texts that the methods ``conditions`` and ``summary`` of a module can say."""
+    for defined in _walk(ast.parse(path.read_text()), ast.ClassDef):
+        methods = {m.name: m for m in defined.body if isinstance(m, ast.FunctionDef)}
+        for name in ("conditions", "summary"):
+            method = methods.get(name)
+            if method is None or _returns(method) not in ("list[str]", "DiagnosticSummary"):
+                continue
+            # What stands within a text is a part of it, and what is compared is not said at all.
+            within = [*_walk(method, ast.JoinedStr), *_walk(method, ast.Compare)]
+            parts = {id(n) for f in within for n in ast.walk(f)}
+            used = {n.attr for n in _walk(method, ast.Attribute) if id(n) not in parts}
+            looked_at: list[ast.AST] = [method]
+            looked_at += [m for u in used if (m := methods.get(u)) and _returns(m) == "str"]
+            # What is kept in an attribute until somebody asks.
+            looked_at += [
+                node.value
+                for node in _walk(defined, ast.Assign)
+                if any(isinstance(t, ast.Attribute) and t.attr in used for t in node.targets)
+            ]
+            for tree in looked_at:
+                yield from _texts(tree)
+
+
+def _texts(tree: ast.AST) -> Iterator[str]:
+    if isinstance(tree, ast.FunctionDef):
+        for part in tree.body[ast.get_docstring(tree) is not None :]:
+            yield from _texts(part)
+    elif isinstance(tree, ast.JoinedStr):
+        parts = [
+            re.escape(str(part.value)) if isinstance(part, ast.Constant) else ".+"
+            for part in tree.values
+        ]
+        if any(part.strip(" .+;:") for part in parts):
+            yield "".join(parts)
+    elif isinstance(tree, ast.Constant):
+        # A word alone is the name of a value or of a phase, unless it is a state below.
+        if isinstance(tree.value, str) and (" " in tree.value or tree.value in STATES):
+            yield re.escape(tree.value)
+    elif not isinstance(tree, ast.Compare):
+        for part in ast.iter_child_nodes(tree):
+            yield from _texts(part)
+
+
+def test_no_state_of_a_node_is_missing_above() -> None:
+    """A condition that is new in the code must be given an example, and with it words."""
+    package = Path(semcal_ros.__file__).parent
+    files = [package / "bridge/diagnostics.py"]
+    files += [path for room in ("nodes", "drivers") for path in (package / room).rglob("*.py")]
+    found = {template: path.name for path in files for template in _templates(path)}
+    # As many as the nodes have today, so that the search itself cannot stop finding them.
+    assert len(found) >= 25
+    missing = {
+        template: name
+        for template, name in found.items()
+        if not any(re.fullmatch(template, state) for state in STATES)
+    }
+    assert not missing
+
+
+def test_what_no_table_knows_is_told_as_it_is() -> None:
+    note = explain([NodeReport("corrector", 1, "1.0 Hz; something new that nobody knows")])[0]
+    assert (note.level, note.text) == ("warn", "says: something new that nobody knows")
+
+
+def test_an_error_text_stays_one_note() -> None:
+    """What was seen, expected and to do is one state, though its own line has semicolons."""
+    line = join_states(["9.8 Hz", "last rejection: 16UC9; expected mono8; set the encoding"])
+    notes = explain([NodeReport("corrector", 1, line)])
+    assert [n.text for n in notes] == ["refused a message: 16UC9, expected mono8, set the encoding"]
 
 
 def test_the_worst_comes_first_and_silence_is_bad() -> None:

@@ -33,6 +33,8 @@ from semcal_ros.bridge.diagnostics import (
     DiagnosticLevel,
     DiagnosticSummary,
     fill_diagnostic_status,
+    join_states,
+    split_states,
 )
 from semcal_ros.config.config import load_config
 from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
@@ -174,7 +176,7 @@ class SemNode(Node):
         conditions = self.conditions()
         if not conditions:
             return summary
-        message = "; ".join([summary.message, *conditions])
+        message = join_states([*split_states(summary.message), *conditions])
         level = DiagnosticLevel(max(summary.level, DiagnosticLevel.WARN))
         return replace(summary, level=level, message=message)
 
