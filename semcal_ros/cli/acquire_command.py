@@ -31,6 +31,7 @@ from semcal_ros.cli.options import (
     require_folder,
 )
 from semcal_ros.config.config import load_config
+from semcal_ros.core.calibration.acquisition import MOST_VIEWS
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 
 __all__ = ["command"]
@@ -97,11 +98,21 @@ def _wait_for_enter(text: str) -> None:
 @click.option(
     "--most-views",
     type=click.IntRange(6, 1000),
-    default=150,
+    default=MOST_VIEWS,
     show_default=True,
     help="End after so many views, with the target met or not.",
 )
-@click.option("--record", type=PATH, help="Also record all pictures to this bag, a new folder.")
+@click.option(
+    "--record",
+    type=PATH,
+    help="Recording of all pictures, a new folder. [default: named after the calibration file]",
+)
+@click.option("--no-record", is_flag=True, help="Record nothing; it cannot be gone on with then.")
+@click.option(
+    "--resume",
+    type=PATH,
+    help="Go on with an interrupted acquisition: take over the views of its recording.",
+)
 @click.option("--namespace", default="/sem", show_default=True, help="Of the nodes and topics.")
 @config_option
 def command(
@@ -114,23 +125,37 @@ def command(
     turn_by: str,
     most_views: int,
     record: Path | None,
+    no_record: bool,
+    resume: Path | None,
     namespace: str,
     config: str,
 ) -> None:
     """Calibrate a live microscope unattended: move it, take views of the grid, until nm per pixel is certain enough.
 
     The nodes of the microscope must run, with the grid in view and in focus, and moving allowed. Exit status 1 if the
-    target was not met; what was calibrated is written all the same.
+    target was not met; what was calibrated is written all the same. All pictures are recorded, so that --resume can go
+    on after Ctrl-C, and `semcal calibrate` can use them again.
 
     \b
     Example:
-      semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem --record views
+      semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem
+      semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem --resume cal_views
       semcal acquire -o cal.yaml --range 500,10000 --by-hand
     """
     require_folder(output)
     load_config(config)
+    if record is not None and no_record:
+        raise InvalidValueError("--record and --no-record", expected="one of them")
     if record is not None and record.exists():
         raise InvalidValueError(f"--record {record} exists", expected="a new folder")
+    if resume is not None and not resume.exists():
+        raise InvalidValueError(
+            f"--resume {resume} does not exist",
+            expected="the recording of an interrupted acquisition",
+        )
+    if record is None and not no_record:
+        # The node adds a number if there is one already.
+        record = output.with_name(f"{output.stem}_views")
     if not namespace.startswith("/"):
         raise InvalidValueError(f"--namespace {namespace}", expected="a name that begins with /")
     try:
@@ -155,6 +180,8 @@ def command(
         parameters["microscope"] = microscope
     if record is not None:
         parameters["record"] = str(record.absolute())
+    if resume is not None:
+        parameters["resume"] = str(resume.absolute())
     arguments = ["--ros-args", "-r", f"__ns:={namespace}", "--log-level", "error"]
     for name, value in parameters.items():
         arguments += ["-p", f"{name}:={value}"]

@@ -26,6 +26,7 @@ from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException
 
 from semcal_ros.core.errors import MicroscopeError
+from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.run import Progress
 from semcal_ros.nodes.calibration_server import CalibrationServer
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -43,6 +44,7 @@ _MISSED = 1
 class _Acquirer(CalibrationServer):
     def __init__(self, say: Callable[[str], None], ask: Callable[[str], None]) -> None:
         super().__init__()
+        self._told_end = False
         self._say = say
         self._ask = ask
         self._ended = False
@@ -58,6 +60,23 @@ class _Acquirer(CalibrationServer):
             # Once: what a second thread raised nobody would hear.
             self._timer.cancel()
             raise ExternalShutdownException
+
+    def destroy_node(self) -> None:
+        """Extend the base class: say how to go on with what Ctrl-C has interrupted, now that it is on the disk."""
+        super().destroy_node()
+        self._tell_end()
+
+    def _tell_end(self) -> None:
+        if self._told_end or self.recording is None:
+            return
+        self._told_end = True
+        if self.acquisition_progress.state == "done":
+            self._say(f"all pictures: {self.recording}")
+        elif self.recording.exists():
+            views = counted(self.acquisition_progress.views, "view")
+            self._say(
+                f"ended with {views}; the same command with --resume {self.recording} goes on"
+            )
 
     def show(self, progress: Progress) -> None:
         """Extend the base class: also on the terminal."""
@@ -100,6 +119,7 @@ class _Acquirer(CalibrationServer):
             time.sleep(_POLL_S)
         progress = self.acquisition_progress
         self._say(progress.text)
+        self._tell_end()
         if self.has_calibration:
             self._say(self.save())
         if progress.state == "done" and progress.largest <= self.parameters["target"]:

@@ -36,7 +36,11 @@ from semcal_ros.bridge.calibration_warnings import ScaleWarnings
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.acquisition import ViewRequest, find_picture_fault
+from semcal_ros.core.calibration.acquisition import (
+    ViewRequest,
+    find_picture_fault,
+    is_magnification_of,
+)
 from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.check import Verdict
 from semcal_ros.core.calibration.stage import StageReading
@@ -52,8 +56,10 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.view_recorder import ViewRecorder
+from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
+from semcal_ros.nodes.acquisition.recorded import read_views
 from semcal_ros.nodes.acquisition.run import (
     ACQUISITION,
     AcquisitionRun,
@@ -104,8 +110,6 @@ _OTHER_CLOCK_NS = 30 * 10**9
 # Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
 _PICTURE_S = 600.0
 _POLL_S = 0.1
-# Relative difference of a magnification from the one that was asked for: what a display rounds.
-_MAGNIFICATION_OFF = 0.02
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,10 @@ class CalibrationServer(StreamNode):
         self._request: ViewRequest | None = None
         self._taken_by_hand = ""
         self._recorder: ViewRecorder | None = None
+        # What the acquisition is recorded to, and the recording that it went on with.
+        self.recording: Path | None = None
+        self._resumed: Path | None = None
+        self._first_visit = 0
         self._pictures = 0
         self._warnings = ScaleWarnings()
         self._output = OutputFile(self.parameters, self.reporter.info)
@@ -259,7 +267,7 @@ class CalibrationServer(StreamNode):
         conditions = Conditions.from_topic(self._known.current)
         with self._lock:
             before = self._newest
-            visit = 0 if before is None else before.visit
+            visit = self._first_visit if before is None else before.visit
             visit += before is not None and before.frame.magnification != magnification
             self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns), conditions)
             self._pictures += 1
@@ -294,8 +302,7 @@ class CalibrationServer(StreamNode):
             raise InvalidValueError("the same frame as before", do="wait for the next one")
         if request is not None:
             self._record(newest, frame.magnification)
-            off = frame.magnification / request.magnification - 1.0
-            if abs(off) > _MAGNIFICATION_OFF:
+            if not is_magnification_of(request, frame.magnification):
                 raise CalibrationError(
                     f"a picture at {frame.magnification:g}x",
                     expected=f"{request.magnification:.0f}x",
@@ -458,7 +465,8 @@ class CalibrationServer(StreamNode):
                 )
             goal = goal_of(self.parameters, self.config.squares_m, self.config.display_width_m)
             run, verb = self._acquisition, "going on"
-            if run is None or run.goal != goal or run.progress.state == "done":
+            ended = run is None or run.discarded or run.progress.state == "done"
+            if run is None or ended or run.goal != goal:
                 verb = "begun"
                 run = AcquisitionRun(
                     goal,
@@ -474,22 +482,74 @@ class CalibrationServer(StreamNode):
                     do="start the node with allow_writing true, or record nothing",
                 )
             path = _free_folder(self.parameters.allowed_path(record)) if record else None
+            before = self._recording_to_resume(run)
             recorder = None if path is None else ViewRecorder(path, self.config)
-            self._acquisition, self._acquisition_wanted = run, True
+            self._acquisition, self._acquisition_wanted, self.recording = run, True, path
             self._acquiring = threading.Thread(
-                target=self._acquire_beside, args=(run, recorder), daemon=True
+                target=self._acquire_beside, args=(run, recorder, before), daemon=True
             )
         self._acquiring.start()
-        where = "" if path is None else f", recorded to {path}"
+        where = "" if before is None else f" with the views of {before}"
+        where += "" if path is None else f", recorded to {path}"
         return f"acquisition {verb}{where}; ~/progress shows it, ~/cancel ends it"
 
-    def _acquire_beside(self, run: AcquisitionRun, recorder: ViewRecorder | None) -> None:
+    def _recording_to_resume(self, run: AcquisitionRun) -> Path | None:
+        """The recording that a new acquisition goes on with, once."""
+        text = self.parameters["resume"]
+        if not text or run is self._acquisition:
+            return None
+        path = self.parameters.allowed_path(text)
+        if path == self._resumed:
+            return None
+        if not path.exists():
+            raise InvalidValueError(
+                f"parameter resume: there is no {path}",
+                expected="the recording of an interrupted acquisition",
+                do="correct it, or leave it empty to begin anew",
+            )
+        return path
+
+    def _resume(self, run: AcquisitionRun, path: Path) -> None:
+        """Take over the views of a recording, and record them again, so that the new recording has all."""
+        with self._lock:
+            newest = self._newest
+
+        def on_frame(frame: RecordedFrame) -> None:
+            if not self._still_acquiring():
+                raise CalibrationError("stopped", do="call ~/acquire to go on")
+            if self._recorder is not None:
+                known = frame.conditions or Conditions()
+                g, stage = frame.magnification, frame.stage
+                self._recorder.write(frame.image, frame.encoding, frame.stamp_ns, g, stage, known)
+
+        size = None if newest is None else newest.frame.size
+        try:
+            taken = read_views(path, self.config, size, run.adopt, on_frame)
+        except NODE_ERRORS:
+            # With a part of the views: the next call begins anew.
+            run.discarded = True
+            raise
+        with self._lock:
+            self._resumed = path
+            self._views += without_images([one.view for one in taken])
+            self._taken += [(one.stamp_ns, one.conditions) for one in taken]
+            # What comes now was set anew.
+            self._first_visit = 1 + max((one.view.visit for one in taken), default=-1)
+            if self._newest is not None:
+                self._newest = replace(self._newest, visit=self._newest.visit + self._first_visit)
+        run.report(f"{counted(len(taken), 'view')} taken over from {path}")
+
+    def _acquire_beside(
+        self, run: AcquisitionRun, recorder: ViewRecorder | None, resumed: Path | None
+    ) -> None:
         """Run an acquisition, and say how it has ended."""
         level, state = DiagnosticLevel.OK, "done"
         try:
             with recorder or nullcontext():
                 self._recorder = recorder
                 try:
+                    if resumed is not None:
+                        self._resume(run, resumed)
                     ended = run.run()
                 except NODE_ERRORS as error:
                     # What was recorded is kept: the error is told, not raised.

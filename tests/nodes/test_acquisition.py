@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -69,28 +71,55 @@ class Progress:
         return str(self.messages[-1].message)
 
 
-def test_semcal_acquire_calibrates_the_virtual_microscope(tmp_path: Path) -> None:
-    """From nothing to a calibration that is right within what it states, and a recording of it."""
-    output, views = tmp_path / "cal.yaml", tmp_path / "views"
-    arguments = ["--range", "1500,3000", "--target", "5%", "--microscope", "virtual_sem"]
+def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl_c(
+    tmp_path: Path,
+) -> None:
+    """From nothing to a calibration that is right within what it states, and a recording of it, in two parts."""
+    output = tmp_path / "cal.yaml"
+    command = [sys.executable, "-m", "semcal_ros", "acquire", "-o", str(output)]
+    command += ["--config", "virtual_sem", "--microscope", "virtual_sem"]
+    command += ["--range", "1500,3000", "--target", "5%"]
+    options: dict[str, Any] = {
+        "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+        "text": True,
+    }
     with running("virtual_sem", SEM):
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options
+        ) as first:
+            assert first.stdout is not None
+            said = ""
+            # The first visit, and a part of the second one.
+            while not re.search(r"^5/12: set", said, re.MULTILINE):
+                line = first.stdout.readline()
+                assert line, said
+                said += line
+            first.send_signal(signal.SIGINT)
+            said += first.stdout.read()
+        assert first.returncode == 1, said
+        views = tmp_path / "cal_views"
+        assert f"recorded to {views}" in said.splitlines()[0]
+        assert said.splitlines()[-1].endswith(f"--resume {views} goes on")
+        assert not output.exists()
         done = subprocess.run(
-            [
-                *(sys.executable, "-m", "semcal_ros", "acquire"),
-                *("-o", str(output), "--record", str(views), "--config", "virtual_sem"),
-                *arguments,
-            ],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            [*command, "--resume", str(views)],
             capture_output=True,
-            text=True,
             timeout=150.0,
             check=False,
+            **options,
         )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert sum(line.startswith("acquisition begun") for line in lines) == 1
-    assert "the target is met" in lines[-2]
+    assert lines[0].startswith(
+        f"acquisition begun with the views of {views}, recorded to {views}_2"
+    )
+    kept = re.fullmatch(rf"(\d)/12: (\d) views taken over from {views}", lines[1])
+    # One more may have been taken before the signal came.
+    assert kept is not None and kept[1] == kept[2] and kept[1] in "56"
+    assert f"{kept[1]}/12: view {int(kept[1]) + 1} at" in done.stdout
+    assert "the target is met" in lines[-3]
+    assert lines[-2] == f"all pictures: {views}_2"
     assert lines[-1].startswith(f"saved to {output}")
     calibration = Calibration.load(output)
     assert calibration.magnification_range == (1500.0, 3000.0)
@@ -103,7 +132,7 @@ def test_semcal_acquire_calibrates_the_virtual_microscope(tmp_path: Path) -> Non
         assert np.all(stated < 0.05)
     # Four visits with three tilts; the recording has each of them, and gives as many views.
     assert calibration.provenance is not None and len(calibration.provenance.views) == 12
-    again = calibrate_recording(views, config="virtual_sem")
+    again = calibrate_recording(tmp_path / "cal_views_2", config="virtual_sem")
     assert len(again.collected.views) >= 12
     readings = [view.stage for view in again.collected.views]
     tilts = {round(np.degrees(r.tilt_rad) / 20.0) for r in readings if r is not None and r.tilt_rad}

@@ -37,13 +37,21 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
 __all__ = [
+    "MOST_VIEWS",
     "AcquisitionGoal",
     "Proposal",
     "ViewRequest",
     "find_picture_fault",
+    "is_magnification_of",
     "plan_survey",
     "propose_visits",
+    "request_of_picture",
 ]
+
+MOST_VIEWS = 300
+"""Views that an acquisition takes at most, by default. Three seeds of a microscope and a one-axis stage needed 111, 153
+and 243 for 0.1 % from 500x to 10 000x (`python -m benchmarks.acquisition`); an acquisition whose further views would
+hardly help ends before."""
 
 # Ratio of neighbouring magnifications of the survey: the functions of a calibration are smooth over a factor of two.
 _SURVEY_RATIO = 1.7
@@ -62,6 +70,8 @@ _STEEPEST_RAD = math.radians(60.0)
 _SATURATED = 0.05
 # Blur of the edges, as a part of the spacing, from which corners of neighbouring squares run into each other.
 _BLURRED = 0.25
+# Relative difference of a magnification from the one that was asked for: what a display rounds.
+_MAGNIFICATION_OFF = 0.02
 # Tilt that is no longer the one that was asked for.
 _TILT_OFF_RAD = math.radians(2.0)
 # Part of the image, along x and y, that the grid must span.
@@ -93,7 +103,7 @@ class AcquisitionGoal:
     display_width_m: float
     target: float = 1e-3
     tilts_rad: tuple[float, ...] = PLANNED_TILTS_RAD
-    most_views: int = 150
+    most_views: int = MOST_VIEWS
 
     def __post_init__(self) -> None:
         low, high = self.magnification_range
@@ -185,13 +195,17 @@ def _survey_magnifications(magnification_range: tuple[float, float]) -> tuple[fl
     return tuple(float(g) for g in visits)
 
 
+def _square_in_view(goal: AcquisitionGoal, magnification: float) -> float:
+    field_m = goal.display_width_m / magnification
+    fitting = [size for size in goal.squares_m if field_m / size >= _SQUARES_ACROSS]
+    return max(fitting) if fitting else min(goal.squares_m)
+
+
 def _requests_of(
     goal: AcquisitionGoal, visit: int, magnification: float
 ) -> tuple[ViewRequest, ...]:
     """The views of one visit."""
-    field_m = goal.display_width_m / magnification
-    fitting = [size for size in goal.squares_m if field_m / size >= _SQUARES_ACROSS]
-    square_m = max(fitting) if fitting else min(goal.squares_m)
+    square_m = _square_in_view(goal, magnification)
     return tuple(
         ViewRequest(
             visit,
@@ -253,6 +267,42 @@ def propose_visits(
             for request in _requests_of(goal, first + number, visit.magnification)
         )
     return Proposal(requests, plan.largest, plan.at, plan.largest <= goal.target, reason)
+
+
+def is_magnification_of(request: ViewRequest, magnification: float) -> bool:
+    """Return whether a magnification is the one of a request, as far as a display tells it."""
+    return abs(magnification / request.magnification - 1.0) <= _MAGNIFICATION_OFF
+
+
+def request_of_picture(
+    goal: AcquisitionGoal, visit: int, magnification: float, stage: StageReading | None
+) -> ViewRequest | None:
+    """Return the request that a picture of an earlier acquisition must have answered, which is not of the survey.
+
+    Parameters
+    ----------
+    goal
+        What is asked for.
+    visit
+        Number of its visit.
+    magnification, stage
+        Of the picture.
+
+    Returns
+    -------
+    None for a magnification outside the range.
+    """
+    low, high = goal.magnification_range
+    if not low / (1.0 + _MAGNIFICATION_OFF) <= magnification <= high * (1.0 + _MAGNIFICATION_OFF):
+        return None
+    known = stage or StageReading()
+    return ViewRequest(
+        visit,
+        magnification,
+        known.tilt_rad or 0.0,
+        known.scan_rotation_rad or known.rotation_rad or 0.0,
+        _square_in_view(goal, magnification),
+    )
 
 
 def find_picture_fault(

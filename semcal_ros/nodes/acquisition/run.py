@@ -19,17 +19,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.acquisition import (
+    MOST_VIEWS,
     AcquisitionGoal,
     Proposal,
     ViewRequest,
+    find_picture_fault,
+    is_magnification_of,
     plan_survey,
     propose_visits,
+    request_of_picture,
 )
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
 from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
@@ -67,11 +74,19 @@ ACQUISITION = (
         "What turns the grid in the image between views.",
         choices=("scan_rotation", "rotation", "nothing"),
     ),
-    ParameterDeclaration("most_views", 150, "Views that ~/acquire takes at most.", "", 6, 1000),
+    ParameterDeclaration(
+        "most_views", MOST_VIEWS, "Views that ~/acquire takes at most.", "", 6, 1000
+    ),
     ParameterDeclaration(
         "record",
         "",
         "Recording of all pictures that ~/acquire judges, a new folder; empty: none.",
+        confined=True,
+    ),
+    ParameterDeclaration(
+        "resume",
+        "",
+        "Recording of an interrupted acquisition whose views the first ~/acquire takes over; empty: none.",
         confined=True,
     ),
 )
@@ -187,6 +202,15 @@ class AcquisitionRun:
         Which joint turns the grid in the image.
     still_wanted
         If it returns False, the run ends as soon as nothing moves.
+
+    Attributes
+    ----------
+    goal
+        What is asked for.
+    progress
+        How far it is.
+    discarded
+        Whether it cannot be gone on with.
     """
 
     def __init__(
@@ -198,6 +222,7 @@ class AcquisitionRun:
         still_wanted: Callable[[], bool],
     ) -> None:
         self.goal = goal
+        self.discarded = False
         self._taker = taker
         self._commands = commands
         self._turn_by = turn_by
@@ -212,6 +237,30 @@ class AcquisitionRun:
         self._visit = -1
         self._magnification = math.nan
         self.progress = Progress("stopped", "not begun", planned=len(self._waiting))
+
+    def adopt(
+        self,
+        magnification: float,
+        grey: NDArray[Any],
+        detection: LatticeDetection,
+        stage: StageReading | None,
+    ) -> bool:
+        """Take a picture that was recorded before as the answer to a request; return whether it is one.
+
+        It answers the first open request that it fits. One that fits none was chosen after a calibration.
+        """
+        for number, request in enumerate(self._waiting):
+            if is_magnification_of(request, magnification) and not find_picture_fault(
+                grey, detection, request, stage
+            ):
+                self._requested.append(self._waiting.pop(number))
+                return True
+        visit = 1 + max(request.visit for request in (*self._waiting, *self._requested))
+        own = request_of_picture(self.goal, visit, magnification, stage)
+        if own is None or find_picture_fault(grey, detection, own, stage):
+            return False
+        self._requested.append(own)
+        return True
 
     def run(self) -> Proposal:
         """Go on until the target is met or cannot be; return the last proposal, which says why it ended.
@@ -236,6 +285,10 @@ class AcquisitionRun:
             if proposal.reason:
                 return proposal
             self._waiting.extend(proposal.requests)
+
+    def report(self, text: str) -> None:
+        """Tell how far it is, with what has just been done."""
+        self._show("running", text)
 
     def _show(self, state: str, text: str) -> None:
         taken = len(self._requested) - self._left_out

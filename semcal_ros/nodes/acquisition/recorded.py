@@ -1,0 +1,103 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Reads the pictures that an interrupted acquisition has recorded, to go on with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from semcal_ros.bridge.images import to_gray
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.corners import LatticeDetection, find_lattice
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.files.recordings import RecordedFrame, open_recording
+from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.workflows.find_grid import count_visits
+
+__all__ = ["Judge", "RecordedView", "read_views"]
+
+#: Says whether a picture is one of the views: its magnification, grey levels, corners, and the stage.
+Judge = Callable[[float, NDArray[Any], LatticeDetection, StageReading | None], bool]
+
+
+@dataclass(frozen=True)
+class RecordedView:
+    """A view without its picture, with the stamp (ns) and what was known of how it was taken."""
+
+    view: FoundView
+    stamp_ns: int
+    conditions: Conditions
+
+
+def read_views(
+    path: Path,
+    config: MicroscopeConfig,
+    size: tuple[int, int] | None,
+    judge: Judge,
+    on_frame: Callable[[RecordedFrame], object],
+) -> list[RecordedView]:
+    """Read the views of a recording; their visits count from 0.
+
+    Parameters
+    ----------
+    path
+        A recording of :class:`~semcal_ros.files.bags.view_recorder.ViewRecorder`.
+    config
+        How to read it.
+    size
+        (width, height) of the pictures that will follow, px; None where it is not known.
+    judge
+        Asked of each picture in which the grid is found.
+    on_frame
+        Called with each picture before that.
+
+    Raises
+    ------
+    BagError
+        It cannot be read.
+    InvalidValueError
+        Its pictures have another size.
+    """
+    magnifications: list[float] = []
+    stamps_ns: list[int | None] = []
+    taken: list[tuple[int, RecordedView]] = []
+    with open_recording(path, config) as recording:
+        for number, frame in enumerate(recording.frames()):
+            on_frame(frame)
+            grey = to_gray(frame.visible, frame.encoding)
+            recorded = grey.shape[1], grey.shape[0]
+            if size is not None and recorded != size:
+                raise InvalidValueError(
+                    "{} x {} px pictures in {}".format(*recorded, path),
+                    expected="{} x {} px, as live".format(*size),
+                    do="set the scan as it was, or begin anew without resume",
+                )
+            magnifications.append(frame.magnification)
+            stamps_ns.append(frame.stamp_ns)
+            found = find_lattice(grey)
+            g, stage = frame.magnification, frame.stage
+            if not isinstance(found, Rejection) and judge(g, grey, found, stage):
+                view = FoundView(f"view {len(taken)}", g, None, found, stage)
+                known = frame.conditions or Conditions()
+                taken.append((number, RecordedView(view, frame.stamp_ns, known)))
+    visits = count_visits(magnifications, stamps_ns)
+    return [replace(one, view=replace(one.view, visit=visits[k])) for k, one in taken]
