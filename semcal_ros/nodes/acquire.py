@@ -45,6 +45,8 @@ class _Acquirer(CalibrationServer):
     def __init__(self, say: Callable[[str], None], ask: Callable[[str], None]) -> None:
         super().__init__()
         self._told_end = False
+        # Held while the first line is said, which tells where the recording is.
+        self._begins = threading.Lock()
         self._say = say
         self._ask = ask
         self._ended = False
@@ -81,6 +83,8 @@ class _Acquirer(CalibrationServer):
     def show(self, progress: Progress) -> None:
         """Extend the base class: also on the terminal."""
         super().show(progress)
+        with self._begins:
+            pass
         if progress.state != "waiting":
             self._say(f"{progress.views}/{progress.planned}: {progress.text}")
 
@@ -102,7 +106,8 @@ class _Acquirer(CalibrationServer):
                     do="check that the microscope publishes, by `semcal doctor`",
                 )
             time.sleep(_POLL_S)
-        self._say(self.acquire())
+        with self._begins:
+            self._say(self.acquire())
 
     def _follow(self) -> None:
         asked = ""
