@@ -24,8 +24,10 @@ Exit status: 0; 1 if the build fails; 3 if MkDocs cannot be installed.
 from __future__ import annotations
 
 import ast
+import base64
 import fcntl
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -33,6 +35,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -209,6 +212,7 @@ def collect(target: Path) -> None:
     """Lay out everything that the site is made of."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(ROOT / "doc", target)
+    convert_notebooks(sorted(target.rglob("*.ipynb")))
     for name in BESIDE:
         text = (ROOT / name).read_text(encoding="utf-8")
         # Links of the root lead into doc/; what is not on the site is named only.
@@ -223,10 +227,43 @@ def collect(target: Path) -> None:
         up = "../" * len(path.relative_to(target).parents[:-1])
         for name in BESIDE:
             text = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}project/{name.lower()}", text)
+        text = re.sub(r"(\]\([^)\s]*)\.ipynb\)", r"\1.md)", text)
         path.write_text(text, encoding="utf-8")
     for name, make in GENERATED.items():
         (target / name).parent.mkdir(exist_ok=True)
         (target / name).write_text(make(), encoding="utf-8")
+
+
+def convert_notebooks(paths: list[Path]) -> None:
+    """Put a page with the outputs that a notebook keeps in place of each notebook.
+
+    nbconvert makes the same pages, with 24 more packages.
+    """
+    for path in paths:
+        parts: list[str] = []
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            source = "".join(cell["source"])
+            if cell["cell_type"] == "markdown":
+                parts.append(source)
+                continue
+            parts.append(f"```python\n{source}\n```")
+            for output in cell["outputs"]:
+                picture = path.with_name(f"{path.stem}_{len(parts)}.png")
+                parts.append(_shown(output, picture))
+        path.with_suffix(".md").write_text("\n\n".join([*parts, ""]), encoding="utf-8")
+        path.unlink()
+
+
+def _shown(output: dict[str, Any], picture: Path) -> str:
+    """What a cell printed or drew; a picture goes into a file."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        picture.write_bytes(base64.b64decode("".join(data["image/png"])))
+        return f"![]({picture.name})"
+    if "text/html" in data:
+        return "".join(data["text/html"])
+    text = "".join(output.get("text", data.get("text/plain", "")))
+    return f"```text\n{text.rstrip()}\n```"
 
 
 def install() -> bool:

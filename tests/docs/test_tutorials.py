@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -29,6 +30,8 @@ from tests.helpers.project import NODES, ROOT
 
 DOC = ROOT / "doc"
 TUTORIALS = sorted((DOC / "tutorials").glob("*.md"))
+NOTEBOOKS = sorted((DOC / "tutorials").glob("*.ipynb"))
+HOWTO = sorted((DOC / "howto").glob("*.md"))
 # Another processor rounds differently, and a fit amplifies that; what a reader sees is the same.
 TOLERANCE = 0.05
 
@@ -85,13 +88,21 @@ def test_a_listing_is_read_and_compared_line_by_line(tmp_path: Path) -> None:
     assert differences(("a", "b"), ["a", "x", "b"], 0.05) == ["b"]
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *TUTORIALS], ids=lambda path: path.stem)
+def _prose(page: Path) -> str:
+    """The text of a page or a notebook, without listings, tables, headings, pictures and targets of links."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    text = re.sub(r"^(    .*|\|.*|#.*|!\[.*)$", "", text, flags=re.MULTILINE)
+    return re.sub(r"\]\([^)]*\)", "]", text)
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *TUTORIALS, *NOTEBOOKS, *HOWTO], ids=lambda path: path.stem
+)
 def test_no_sentence_is_longer_than_thirty_words(page: Path) -> None:
-    prose = re.sub(
-        r"^(    .*|\|.*|#.*|!\[.*)$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE
-    )
-    prose = re.sub(r"\]\([^)]*\)", "]", prose)
-    sentences = re.split(r"(?<=[.!?:;])\s+|\n\n|\n- ", prose)
+    sentences = re.split(r"(?<=[.!?:;])\s+|\n\n|\n- ", _prose(page))
     assert [s for s in sentences if len(s.split()) > 30] == []
 
 

@@ -32,6 +32,7 @@ import yaml
 from examples.cantilever.figure_16a import SCALES, compare_calibrations, root_mean_square_nm
 from semcal_ros.files.bags.simulated import SIMULATED_START_NS
 from tests.helpers.listings import listings, run_page
+from tests.helpers.notebooks import follow_notebook
 from tests.helpers.ros_domain import claim_domain
 
 # They make their recordings and calibrations themselves.
@@ -130,6 +131,8 @@ def test_cantilever(tmp_path: Path) -> None:
     for name in ("poses.png", "strip.png", "figure_16a_calibration.png", "figure_16a_length.png"):
         assert (out / name).read_bytes()[1:4] == b"PNG"
     follow_tutorial("cantilever", tmp_path)
+    notebook = ROOT / "doc" / "tutorials" / "cantilever_notebook.ipynb"
+    assert follow_notebook(notebook, tmp_path, TOLERANCE, but="!python -m examples.") == 5
 
 
 def test_nano_ball(tmp_path: Path) -> None:
