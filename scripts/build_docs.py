@@ -33,6 +33,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,23 @@ PAGES = ROOT / "build" / "docs"
 SITE = ROOT / "site"
 CANNOT_INSTALL = 3
 _WORD = re.compile(r"[a-z]{3}")
+# Three words at least, and nothing that only code has.
+_SENTENCE = re.compile(r"(?=(?:.*?\b[a-z]{2,}\b){2})[^<>{}\\=_$|]*\s[^<>{}\\=_$|]*\s[^<>{}\\=_$|]*")
+_FINDINGS = ("ok", "note", "problem")
+# Their texts are in the other generated pages, or are none.
+_NOT_SHOWN = (
+    *("option", "argument", "command", "group", "Option", "Argument", "ParameterDeclaration"),
+    *("add_argument", "compile", "Executable", "Field", "deprecated", "warn_deprecated"),
+)
+# Who says what is not an error, by the rooms of the package.
+SAID_BY = {
+    "What nodes say: log, diagnostics, answers of services": ("nodes", "middleware", "drivers"),
+    "What the page in the browser says": ("viewer",),
+    "Notes and warnings of commands and calibrations; why something was not used": (
+        *("applications", "bridge", "calibration.py", "cli", "config", "core", "files"),
+        *("synthetic", "workflows"),
+    ),
+}
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 # Files beside doc/ that its pages link to.
 BESIDE = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
@@ -146,37 +164,71 @@ def without_sphinx(html: str) -> str:
 
 
 def messages_page() -> str:
-    """Every message of an error that the source can raise, so that a search finds it."""
-    found: dict[str, tuple[str, str]] = {}
-    reasons: set[str] = set()
+    """Every message that the source can show, so that a search finds it."""
+    errors: dict[str, tuple[str, str]] = {}
+    findings: dict[str, tuple[str, str]] = {}
+    others: dict[str, set[str]] = {title: set() for title in SAID_BY}
     for path in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        room = path.relative_to(PACKAGE).parts[0]
+        titles = (title for title, rooms in SAID_BY.items() if room in rooms)
+        said = others.get(next(titles, ""), set())
+        for node in _shown_nodes(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call):
+                said.add(_text_of(node).replace("(.*)", "…"))
                 continue
-            kind = _name_of(node.func)
             words = {k.arg: _text_of(k.value) for k in node.keywords}
-            if kind.endswith("Error") and node.args:
-                text = _text_of(node.args[0])
-                if _WORD.search(text):
-                    found.setdefault(text, (words.get("expected", ""), words.get("do", "")))
-            elif kind == "Rejection" and _WORD.search(
-                reason := words.get("reason") or "".join(map(_text_of, node.args[1:2]))
-            ):
-                reasons.add(reason)
+            finds = room == "doctor" and _name_of(node.func) in _FINDINGS
+            text = _text_of(node.args[1 if finds else 0])
+            if _WORD.search(text):
+                table = findings if finds else errors
+                table.setdefault(text, (words.get("expected", ""), words.get("do", "")))
     parts = ["# Messages", ""]
     parts += [
-        "Generated from the source: what went wrong, what was expected, and what to do. An ellipsis is a value.",
+        "Generated from the source. An ellipsis is a value.",
         "By symptom: [Troubleshooting](../howto/troubleshooting.md).",
         "",
-        "| message | expected | what to do |",
-        "|---|---|---|",
+        "## Errors",
+        "",
+        "What went wrong, what was expected, and what to do.",
+        "",
     ]
-    for text in sorted(found, key=_order):
-        parts.append(f"| {' | '.join(map(_cell, (text, *found[text])))} |")
-    parts += ["", "## Why a view, a frame or a match was not used", ""]
-    parts += ["| reason |", "|---|"]
-    parts += [f"| {_cell(reason)} |" for reason in sorted(reasons, key=_order)]
-    return "\n".join([*parts, ""])
+    parts += _message_table(errors)
+    parts += ["## What `semcal doctor` finds", "", *_message_table(findings)]
+    for title, texts in others.items():
+        parts += [f"## {title}", "", "| message |", "|---|"]
+        parts += [f"| {_cell(text)} |" for text in sorted(texts - errors.keys(), key=_order)]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _message_table(found: dict[str, tuple[str, str]]) -> list[str]:
+    rows = [
+        f"| {' | '.join(map(_cell, (text, *found[text])))} |" for text in sorted(found, key=_order)
+    ]
+    return ["| message | expected | what to do |", "|---|---|---|", *rows, ""]
+
+
+def _shown_nodes(tree: ast.AST) -> Iterator[ast.Call | ast.expr]:
+    """Calls that make errors or findings, and other texts of several words that somebody may be shown."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Call):
+            name = _name_of(node.func)
+            if name in _NOT_SHOWN:
+                continue
+            if node.args and (name.endswith("Error") or (name in _FINDINGS and len(node.args) > 1)):
+                yield node
+                continue
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            continue  # a docstring
+        if isinstance(node, ast.keyword) and node.arg in ("help", "short_help", "description"):
+            continue
+        if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp):
+            text = _text_of(node)
+            if _SENTENCE.fullmatch(text) and "'self'" not in text:
+                yield node
+            if text != "…":
+                continue
+        yield from _shown_nodes(node)
 
 
 def _order(text: str) -> str:

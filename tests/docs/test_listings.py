@@ -50,7 +50,9 @@ NOT_RUN = {
 
 def _listed(page: Path) -> list[str]:
     """Commands of the listings of a page, with a prompt or without."""
-    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
+    text = re.sub(
+        r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+    )
     lines = re.findall(r"^    (?:\$ )?(\S.*)$", re.sub(r" *\\\n +", " ", text), re.MULTILINE)
     without_comment = [re.sub(r" +# .*", "", line) for line in lines]
     return [line for line in without_comment if line.partition(" ")[0] in PROGRAMS]

@@ -122,10 +122,18 @@ def test_the_site_builds_without_a_warning() -> None:
         pytest.skip("MkDocs cannot be installed here")
     assert done.returncode == 0, done.stdout + done.stderr
     messages = (ROOT / "site" / "reference" / "messages.html").read_text(encoding="utf-8")
-    assert "no range of magnifications" in messages
+    for text in (
+        "no range of magnifications",  # an error
+        "uses the configuration …, this command …",  # a finding of the doctor
+        "check beam blank, shutter and detector",  # a condition of a node
+        "has said nothing for … s",  # of the page in the browser
+        "to improve it most: views of the … um squares",  # of a command
+        "the views do not determine the",  # a warning of a calibration
+        "too little overlap",  # a rejection
+    ):
+        assert text in messages, text
     commands = (ROOT / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "semcal acquire" in commands and "--by-hand" in commands
-    assert "Why a view, a frame or a match was not used" in messages
     parameters = (ROOT / "site" / "reference" / "parameters.html").read_text(encoding="utf-8")
     for node in NODES:
         section = parameters.partition(f'id="{node}"')[2].partition("<h2")[0]
