@@ -24,6 +24,7 @@ from pathlib import Path
 import click
 import pytest
 
+from semcal_ros.config.config import parse_config
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from tests.helpers.listings import listings
 from tests.helpers.project import NODES, ROOT
@@ -105,3 +106,15 @@ def test_parameters_of_listed_executables_exist(node: str) -> None:
     lines = [c for page in PAGES for c in _listed(page) if c.startswith(start)]
     given = {word.partition(":=")[0] for c in lines for word in shlex.split(c) if ":=" in word}
     assert given <= known
+
+
+def test_configurations_of_pages_are_valid() -> None:
+    texts = [
+        text
+        for page in PAGES
+        for text in re.findall(
+            r"^```yaml\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        )
+        if "display_width_m:" in text
+    ]
+    assert [parse_config(text).name for text in texts] == ["my SEM", "my other SEM"]
