@@ -56,11 +56,13 @@ __all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
 
 # Range of an edge's step over that in the reference within which it counts as the same edge.
 _SAME_STEP = (0.5, 1.6)
-# Relative difference between measured and given length above which there is a note: a choice, well
-# above the uncertainty of a calibrated scale and of both ends.
-_NOTED_LENGTH = 0.03
-# That above which it is another length, or another body: five times what makers of cantilevers state, 3 %.
-_WRONG_LENGTH = 0.15
+# What makers of cantilevers state of the length, as a fraction of it. A larger difference is told. As a uniform
+# distribution between limits it has a 1-sigma of 1.7 %.
+_MAKER_TOLERANCE = 0.03
+# Sigmas of the difference between measured and given length beyond which one of them is wrong: one of 370 right
+# lengths would be refused if all of the difference were noise, and none if the maker keeps the tolerance and ends
+# and scale are known well.
+_WRONG_LENGTH = 3.0
 # Sizes of the field of view beyond which a length has the wrong unit, since no bending would be seen.
 _LARGEST_LENGTH = 50.0
 # Deviation of the shape of the bending from a given one, in sigmas, that is told.
@@ -227,7 +229,7 @@ def measure_series(
     undeformed = measure_undeformed_beam(
         rough, [work.sample(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
-    _check_length(undeformed, settings.length_m)
+    _check_length(undeformed, settings.length_m, plane.camera)
     frames, shape, misfit = work.deflections(undeformed, tuple(reference), on_frame)
     notes = _collect_notes(undeformed, frames, background.path, tuple(reference), settings)
     notes += () if misfit is None else (misfit,)
@@ -254,21 +256,22 @@ def _invert(image: AnyImage) -> AnyImage:
     return np.asarray(np.invert(image) if image.dtype.kind == "u" else np.negative(image))
 
 
-def _check_length(undeformed: UndeformedBeam, length_m: float) -> None:
+def _check_length(undeformed: UndeformedBeam, length_m: float, camera: ScanCamera) -> None:
     """Refuse a length that contradicts what is seen."""
-    axis, sigma_m = undeformed.axis, undeformed.length_sigma_m
-    seen_m, told = undeformed.length_m, f"{1e6 * undeformed.length_m:.4g} um long"
-    room_m = _WRONG_LENGTH * length_m + (5.0 * sigma_m if np.isfinite(sigma_m) else 0.0)
-    wrong = abs(seen_m - length_m) > room_m
-    if not np.isfinite(seen_m):
-        # Only a part of the beam is in view, which cannot be longer than all of it.
-        seen_m = axis.visible_m[1] - axis.visible_m[0]
-        told = f"at least {1e6 * seen_m:.4g} um long"
-        wrong = seen_m > length_m + room_m
-    if wrong:
+    axis, whole = undeformed.axis, bool(np.isfinite(undeformed.length_m))
+    # Where only a part of the beam is in view, it cannot be longer than all of it.
+    seen_m = undeformed.length_m if whole else axis.visible_m[1] - axis.visible_m[0]
+    ends_m = undeformed.length_sigma_m if whole else undeformed.zero_sigma_m
+    scale = scale_covariance(camera, seen_m * axis.direction, np.zeros(2))[:2, :2]
+    maker_m = _MAKER_TOLERANCE / np.sqrt(3.0) * length_m
+    sigma_m = float(np.sqrt(ends_m**2 + axis.direction @ scale @ axis.direction + maker_m**2))
+    difference_m = seen_m - length_m
+    if (abs(difference_m) if whole else difference_m) > _WRONG_LENGTH * sigma_m:
         raise InvalidValueError(
-            f"a cantilever of {1e6 * length_m:.4g} um that is {told} according to the calibration",
-            expected=f"a length within {100.0 * _WRONG_LENGTH:g} % of what is seen",
+            f"a length of {1e6 * length_m:.4g} um for a cantilever that is {'' if whole else 'at least '}"
+            f"{1e6 * seen_m:.4g} um long according to the calibration",
+            expected=f"at most {1e6 * _WRONG_LENGTH * sigma_m:.2g} um of difference ({_WRONG_LENGTH:g} sigma: "
+            f"both ends, the scale, and {100.0 * _MAKER_TOLERANCE:g} % for the maker)",
             do="check --length, --base and --tip, and whether the calibration is that of this microscope",
         )
 
@@ -327,7 +330,7 @@ def _collect_notes(
         notes.append(
             f"no drift in {lost} of {counted(len(path), 'frame')} ({_name_reasons(path)}): {left}"
         )
-    if abs(undeformed.length_m / settings.length_m - 1.0) > _NOTED_LENGTH:
+    if abs(undeformed.length_m / settings.length_m - 1.0) > _MAKER_TOLERANCE:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"

@@ -31,6 +31,7 @@ from semcal_ros.applications.cantilever import (
 )
 from semcal_ros.applications.cantilever.bending import Shape, fit_bending, locate_end, parse_shape
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
+from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
 from semcal_ros.synthetic.specimens.cantilever import CantileverScene, cantilever_plan
@@ -280,21 +281,44 @@ def test_a_dark_beam_is_measured_as_its_negative(end_plan):
 
 @pytest.mark.parametrize(
     ("length_m", "told"),
-    [(3e-6, "3 um that is at least"), (35.0, "a cantilever of 35 m where")],
+    [
+        (3e-6, "a length of 3 um for a cantilever that is at least"),
+        # 13.8 um of it are in view.
+        (12e-6, "a length of 12 um for a cantilever that is at least 13"),
+        (35.0, "a cantilever of 35 m where"),
+    ],
 )
-def test_a_length_that_the_pixels_contradict_is_refused(end_plan, length_m, told):
-    images = [end_plan.render(0)]
-    with pytest.raises(InvalidValueError, match=told):
-        measure_series(images, [0.0], scope(256).camera_at(7760.0), None, SeriesSettings(length_m))
+def test_a_length_of_less_than_what_is_in_view_is_refused(length_m, told):
+    plan = cantilever_plan(scope(256), pushes=(0.0,), magnifications=(6450.0,), view="end", seed=6)
+    with pytest.raises(InvalidValueError, match=told) as refused:
+        measure_series(
+            [plan.render(0)],
+            [0.0],
+            plan.microscope.camera_at(6450.0),
+            None,
+            SeriesSettings(length_m),
+        )
+    assert "check --length" in str(refused.value)
 
 
 def test_a_whole_beam_of_another_length_is_refused_and_a_small_difference_told():
     plan = cantilever_plan(scope(256, 0.4), pushes=(0.0,), magnifications=(8890.0,), seed=2)
-    camera = plan.microscope.camera_at(8890.0)
-    image = plan.render(0)
-    with pytest.raises(InvalidValueError, match=r"28 um that is 34\.99 um long"):
-        measure_series([image], [0.0], camera, None, SeriesSettings(28e-6))
-    found = measure_series([image], [0.0], camera, None, SeriesSettings(33e-6))
+    camera, image = plan.microscope.camera_at(8890.0), plan.render(0)
+
+    def with_length(length_m, camera=camera):
+        return measure_series([image], [0.0], camera, None, SeriesSettings(length_m))
+
+    # 33 um are 6 % away: the maker's 3 % are no more than 5.2 % in three sigmas of a uniform distribution.
+    for length_m in (12e-6, 33e-6, 37.1e-6):
+        told = rf"{1e6 * length_m:g} um for a cantilever that is 34\.99 um long.*check --length"
+        with pytest.raises(InvalidValueError, match=told):
+            with_length(length_m)
+    found = with_length(33.8e-6)
+    assert any("not 33.8 um: check the length" in note for note in found.notes)
+    # A scale that is known to 4 % contradicts nothing by 6 %.
+    covariance = np.zeros((len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
+    covariance[0, 0] = (0.04 * camera.m) ** 2
+    found = with_length(33e-6, replace(camera, covariance=covariance))
     assert any("not 33 um: check the length" in note for note in found.notes)
 
 
