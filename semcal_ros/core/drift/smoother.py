@@ -27,7 +27,7 @@ With a white acceleration the result is the cubic smoothing spline through the m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,6 +55,9 @@ _MIN_FOR_LIKELIHOOD = 4
 # highest maximum, and Brent's method refines it; a tenth is far less than what the data can tell.
 _LOG_RANGE, _GRID = (-14.0, 5.0), 9
 _LOG_TOLERANCE = 0.1
+# Events between two states to which the backward pass returns. A step takes up to 320 kB (48 keyframes, of four
+# numbers each), so that a block stays below 170 MB, and so do the states between the blocks of 20 000 frames.
+_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -83,39 +86,47 @@ _Step = Array | _Update | DriftState
 
 def _run_forward(
     start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
-) -> tuple[list[_Step], DriftState, float]:
-    """The steps, the last state, and minus twice the log likelihood of the measurements."""
-    state, cost, count = start, 0.0, 0
-    steps: list[_Step] = []
+) -> Iterator[tuple[_Step, DriftState, float]]:
+    """The step and the state of each event, and its part of minus twice the log likelihood."""
+    state = start
     for event in events:
+        cost = 0.0
+        step: _Step
         if isinstance(event, Operation):
             transition = event.transition(state, process_noise)
             state = transition.apply(state)
-            steps.append(transition.matrix)
+            step = transition.matrix
         elif isinstance(event, Measure):
             outcome = event(state, process_noise)
             state = outcome.state
             remaining = np.eye(state.mean.size) - outcome.gain @ outcome.jacobian
             inverse = invert_scaled(outcome.innovation_covariance)
-            steps.append(_Update(outcome.jacobian, outcome.innovation, inverse, remaining))
-            count += 1
-            if count > _UNCOUNTED:
-                size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-                cost += min(outcome.nis + outcome.shear_nis, _MAX_COST) + size
+            step = _Update(outcome.jacobian, outcome.innovation, inverse, remaining)
+            size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
+            cost = min(outcome.nis + outcome.shear_nis, _MAX_COST) + size
         else:
-            steps.append(state)
-    return steps, state, cost
+            step = state
+        yield step, state, cost
 
 
 def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoise) -> DriftState:
     """The state after all events are applied again."""
-    return _run_forward(start, events, process_noise)[1]
+    state = start
+    for event in events:
+        if isinstance(event, Operation):
+            state = event(state, process_noise)
+        elif isinstance(event, Measure):
+            state = event(state, process_noise).state
+    return state
 
 
 def smooth(
     start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
 ) -> list[DriftState]:
-    """States at the marks, each given all measurements.
+    """States at the marks, without their keyframes, each given all measurements.
+
+    Steps are kept of one block of events at a time, and computed again from the state before it: those of a
+    long recording with many keyframes would not fit into memory.
 
     Parameters
     ----------
@@ -131,23 +142,32 @@ def smooth(
     InvalidValueError
         If a time goes back or the process noise is negative.
     """
-    steps, last, _ = _run_forward(start, events, process_noise)
+    blocks: list[tuple[DriftState, Sequence[Event]]] = []
+    last = start
+    for first in range(0, len(events), _BLOCK):
+        blocks.append((last, events[first : first + _BLOCK]))
+        last = replay(*blocks[-1], process_noise)
     smoothed: list[DriftState] = []
     # Adjoint of the state and its information: what later measurements say of it.
     adjoint = np.zeros(last.mean.size)
     information = np.zeros((last.mean.size, last.mean.size))
-    for step in reversed(steps):
-        if isinstance(step, _Update):
-            weighted = step.jacobian.T @ step.inverse
-            adjoint = step.remaining.T @ adjoint - weighted @ step.innovation
-            information = weighted @ step.jacobian + step.remaining.T @ information @ step.remaining
-        elif isinstance(step, DriftState):
-            mean = step.mean - step.covariance @ adjoint
-            covariance = step.covariance - step.covariance @ information @ step.covariance
-            covariance = 0.5 * (covariance + covariance.T)
-            smoothed.append(replace(step, mean=mean, covariance=covariance))
-        else:
-            adjoint, information = step.T @ adjoint, step.T @ information @ step
+    while blocks:
+        steps = [step for step, _, _ in _run_forward(*blocks.pop(), process_noise)]
+        for step in reversed(steps):
+            if isinstance(step, _Update):
+                weighted = step.jacobian.T @ step.inverse
+                adjoint = step.remaining.T @ adjoint - weighted @ step.innovation
+                information = (
+                    weighted @ step.jacobian + step.remaining.T @ information @ step.remaining
+                )
+            elif isinstance(step, DriftState):
+                mean = step.mean - step.covariance @ adjoint
+                covariance = step.covariance - step.covariance @ information @ step.covariance
+                covariance = 0.5 * (covariance + covariance.T)
+                known = replace(step, mean=mean, covariance=covariance)
+                smoothed.append(known.without_keyframes())
+            else:
+                adjoint, information = step.T @ adjoint, step.T @ information @ step
     return smoothed[::-1]
 
 
@@ -196,7 +216,13 @@ def _maximise_likelihood(
         return replace(near, psd=psd, time_constant_s=time_constant_s)
 
     def cost(log_psd: float) -> float:
-        return _run_forward(start, events, with_density(log_psd))[2]
+        steps = _run_forward(start, events, with_density(log_psd))
+        costs = [
+            cost
+            for event, (_, _, cost) in zip(events, steps, strict=True)
+            if isinstance(event, Measure)
+        ]
+        return sum(costs[_UNCOUNTED:], start=0.0)
 
     grid = np.linspace(*_LOG_RANGE, _GRID)
     best = int(np.argmin([cost(float(v)) for v in grid]))
