@@ -117,6 +117,8 @@ class FieldSlice:
     weights, whole_covariance
         (ng,) weights of the coefficients of the whole field in these, and their covariance
         (2 ng ny nx, 2 ng ny nx), or None.
+    largest_slope
+        A bound of the slopes of either component along x and y together.
     """
 
     knots_x: Array
@@ -125,6 +127,7 @@ class FieldSlice:
     cross_covariance: Array | None = None
     weights: Array | None = None
     whole_covariance: Array | None = None
+    largest_slope: float = float("inf")
 
     @cached_property
     def covariance(self) -> Array | None:
@@ -143,6 +146,10 @@ class FieldSlice:
         x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
         y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
         return (y[:, :, None] * x[:, None, :]).reshape(len(q), -1)
+
+    def basis_down(self, y: Array) -> Array:
+        """Return (n, ny) basis functions down the image at normalised raw coordinates (n,)."""
+        return _spline_rows(y, self.knots_y, _DEGREE)
 
     def displacement(self, q: Array) -> Array:
         """Return (n, 2) displacements at normalised raw positions (n, 2); NaN at NaN positions."""
@@ -286,7 +293,21 @@ class ResidualField:
             between,
             weights,
             None if between is None else covariance,
+            self._largest_slope,
         )
+
+    @cached_property
+    def _largest_slope(self) -> float:
+        """That of all slices: they lie between the coefficients.
+
+        The slope of a spline is one of lower degree, and lies between coefficients of its own.
+        """
+        total = np.zeros(2)
+        for axis, knots in ((1, self.knots_y), (2, self.knots_x)):
+            apart = np.maximum(knots[_DEGREE + 1 : -1] - knots[1 : -_DEGREE - 1], 1e-9) / _DEGREE
+            slopes = np.diff(self.coefficients, axis=axis).swapaxes(axis, 2)
+            total += np.max(np.abs(slopes / apart[:, None]), axis=(0, 1, 2))
+        return float(np.max(total))
 
     def overlaps(self) -> Array:
         """Return (8, slice_size) inner products with the patterns of the rest of the model.

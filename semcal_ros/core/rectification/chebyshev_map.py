@@ -22,8 +22,9 @@ from a table (:mod:`semcal_ros.core.rectification.field_table`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -50,13 +51,23 @@ _MAX_MAP_ERROR_PX = 0.001
 # With a residual field and a specimen that drifts while a departure of the field is scanned, which is known to first
 # order: a tenth of what OpenCV rounds positions by.
 _MAX_MOVING_ERROR_PX = 0.003
+# Drift during the scan of a departure up to which the specimen drifts slowly.
+_SMALL_RESPONSE_PX = 0.005
+# The first order is not tested where it is wrong by no more; the rest must then be so much better.
+_MAX_RESPONSE_ERROR_PX = _MAX_MOVING_ERROR_PX - _MAX_MAP_ERROR_PX
 # Columns and rows at which such a map is tested.
 _FIELD_TESTS = (17, 11)
-# Part of the height by which a drift may differ from a tested one of the same camera without another test: the knots of
-# a field are a quarter of the height apart, so that interpolation is as good that near.
-_TESTED_NEARBY = 0.01
-# Drift during the scan of a departure up to which a first order needs no test of its own: it is wrong by a tenth.
-_SMALL_RESPONSE_PX = 0.005
+# Parts of the width and of the height by which a map may differ from a tested one without another test. Across, the
+# columns of a test are a tenth of the width apart; down, the knots of a field are a quarter of the height apart, and
+# interpolation is as good that near.
+_TESTED_NEARBY = (0.05, 0.01)
+# Tested maps that are kept: for a magnification that goes up and down, or a stage to and fro.
+_MAX_TESTED = 16
+# Rows at which the interpolation of another field is compared with that of a tested one: some four per node.
+_COMPARED_ROWS = 49
+# That comparison is in one column, of the field and not of its inverse: others are displaced by a few rows, and the
+# inverse of a field whose slope is some hundredths differs by as much. This leaves ample room.
+_COMPARED_IN_ONE_COLUMN = 2.0
 # Degrees down the image of what the field adds; across it, every column has its own values.
 _FIELD_DEGREES = (12, 24, 48)
 # Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
@@ -67,6 +78,7 @@ _MAX_TABLES = 2
 _MAX_KEPT = 16
 # A raw position outside every frame, for output pixels without one: they come out as 0.
 _OUTSIDE_PX = -1e4
+_IDENTITY = np.eye(2, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -142,6 +154,76 @@ def _make_interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
 
 
 @dataclass(frozen=True)
+class _TestedMap:
+    """A map with a residual field that was compared with exact positions.
+
+    Attributes
+    ----------
+    size, degree
+        (width, height) of the image, and degree of the field down the image.
+    camera
+        The camera.
+    raw
+        (k, 2, 3) raw minus output columns and rows at the nodes, in the first, the middle and the last column.
+    undisplaced
+        (k,) undisplaced rows at the nodes, in the middle column.
+    error_px
+        The largest difference that was found.
+    """
+
+    size: tuple[int, int]
+    degree: int
+    camera: ScanCamera
+    raw: Array32
+    undisplaced: Array32
+    error_px: float
+
+    def covers(self, other: _TestedMap) -> bool:
+        """Whether a map like the other one, whose ``error_px`` is what it may have, needs no test of its own.
+
+        It must be much the same, and the error that its field adds to the one that was measured, which is linear
+        in the difference of the fields, small.
+        """
+        if (self.size, self.degree, self.raw.shape) != (other.size, other.degree, other.raw.shape):
+            return False
+        middle = len(self.raw) // 2
+        for axis, nearby in enumerate(_TESTED_NEARBY):
+            # Most of the others are told by one pixel.
+            differ = abs(float(self.raw[middle, axis, 1]) - float(other.raw[middle, axis, 1]))
+            if not differ <= nearby * self.size[axis]:
+                return False
+        own, field = self.camera.residual, other.camera.residual
+        assert own is not None
+        assert field is not None
+        # The slices of one field share their knots.
+        if field.knots_y is not own.knots_y or field.knots_x is not own.knots_x:
+            return False
+        nearby_px = np.multiply(_TESTED_NEARBY, self.size)[:, None]
+        if not (np.abs(self.raw - other.raw) <= nearby_px).all():
+            return False
+        added_px = 0.0
+        if field.coefficients is not own.coefficients:
+            norm_px = self.camera.norm_px
+            changed = other.camera.norm_px * field.coefficients - norm_px * own.coefficients
+            # A spline lies between its coefficients: none of the columns has a larger error.
+            left = self._remainders @ changed.reshape(len(changed), -1)
+            added_px = _COMPARED_IN_ONE_COLUMN * _largest(left)
+        return self.error_px + added_px <= other.error_px
+
+    @cached_property
+    def _remainders(self) -> Array:
+        """(n, ny) what interpolation leaves of each basis function of the field down the image, at some rows."""
+        assert self.camera.residual is not None
+        height, nodes = self.size[1], len(self.undisplaced)
+        angles = np.pi * (np.arange(_COMPARED_ROWS) + 0.5) / _COMPARED_ROWS
+        rows = 0.5 * (height - 1) * (1.0 - np.cos(angles))
+        matrix = _make_basis(height, nodes - 1, rows)[1]
+        at = np.concatenate([self.undisplaced, matrix @ self.undisplaced])
+        basis = self.camera.residual.basis_down((at - 0.5 * (height - 1)) / self.camera.norm_px)
+        return np.asarray(basis[nodes:] - matrix @ basis[:nodes])
+
+
+@dataclass(frozen=True)
 class RawMap:
     """Raw positions of all output pixels of one frame, computed in bands of rows.
 
@@ -189,8 +271,9 @@ class SmoothMaps:
         self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._seen: tuple[object, float] | None = None
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
-        # By camera: degree, and drift at the first and last pixel, of the last map that was tested.
-        self._tested: LruCache[tuple[object, ...], tuple[int, Array] | None] = LruCache(_MAX_TABLES)
+        self._tested: deque[_TestedMap] = deque(maxlen=_MAX_TESTED)
+        # Of the frame before: where to begin.
+        self._departure: Array32 | None = None
 
     def make_map(
         self,
@@ -219,9 +302,14 @@ class SmoothMaps:
         width, height = size
         plain = camera.parametric
         moving = None if drift is None else PixelDrift(size, plain, drift, timing)
-        path_px = _drift_path(size, moving)
+        smooth = self._map_by_polynomials(size, plain, drift, timing)
+        if smooth._columns is None:
+            return None
         step = _BEYOND_STEP * height
-        beyond = step * min(np.ceil(_largest(path_px) / step), 1.0 / _BEYOND_STEP)
+        # The polynomials have nodes in the first and the last row.
+        outside = smooth._columns[[0, -3], width:]
+        farthest = max(-float(outside[0].min()), float(outside[1].max()), 0.0)
+        beyond = step * min(np.ceil(farthest / step), 1.0 / _BEYOND_STEP)
         key = camera_key(size, camera)
         table = self._tables.get((key, beyond), None)
         if table is None and self._seen == (key, beyond):
@@ -229,11 +317,7 @@ class SmoothMaps:
             table = tabulate_field(camera, size, beyond)
             self._tables.put((key, beyond), table)
         self._seen = key, beyond
-        smooth = self._map_by_polynomials(size, plain, drift, timing)
-        if smooth._columns is None:
-            return None
-        response = _response(size, plain, moving, timing)
-        tested = self._tested.get(key, None)
+        response, spread = _response(size, plain, moving, timing)
         smooth_degree = len(smooth._columns) - 3
         for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
             # The nodes of the field carry the rest, too.
@@ -244,26 +328,31 @@ class SmoothMaps:
             column = columns[:-2, :width] + columns[-2, :width]
             row = columns[:-2, width:] + rows.places
             used = tabulate_field(camera, size, beyond, row) if table is None else table
-            departure = None if used is None else used.invert(column, row)
+            if used is None:
+                return None
+            start = self._departure
+            if start is not None and start.shape != (*column.shape, 2):
+                start = None
+            self._departure = departure = used.invert(column, row, start)
             if departure is None:
                 return None
-            for axis, factors in enumerate(response.tolist()):
-                part = columns[:-2, axis * width : (axis + 1) * width]
-                for of, factor in enumerate(factors):
-                    if factor != 0.0:
-                        part += np.float32(factor) * departure[..., of]
-            more = np.abs(response - np.eye(2)).sum(axis=1)
-            change = float(more.max()) * cv2.norm(departure, cv2.NORM_INF)
+            added = departure if response is None else cv2.transform(departure, response)
+            columns[:-2, :width] += added[..., 0]
+            columns[:-2, width:] += added[..., 1]
             found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
-            is_small = change <= _SMALL_RESPONSE_PX
-            tested_px = (
-                tested[1] if is_small and tested is not None and tested[0] == degree else None
-            )
-            if tested_px is not None and _largest(path_px - tested_px) <= _TESTED_NEARBY * height:
+            largest_px = cv2.norm(departure, cv2.NORM_INF)
+            uncertain_px = spread * largest_px
+            is_slow = response is None or _largest(response - _IDENTITY) * largest_px <= _SMALL_RESPONSE_PX
+            limit_px = _MAX_MAP_ERROR_PX if is_slow else _MAX_MOVING_ERROR_PX
+            is_known = is_slow or uncertain_px <= _MAX_RESPONSE_ERROR_PX
+            made = _describe(found, degree, row, limit_px - (0.0 if is_slow or not is_known else uncertain_px))
+            if is_known and any(test.covers(made) for test in self._tested):
                 return found
-            if _is_accurate(found, plain, departure, None if is_small else moving):
+            error_px = _measure_error(found, plain, departure, None if is_known else moving)
+            if error_px <= made.error_px:
                 self._field_degrees.put(size, degree)
-                self._tested.put(key, (degree, path_px))
+                if is_known:
+                    self._tested.appendleft(replace(made, error_px=error_px))
                 return found
         return None
 
@@ -323,36 +412,52 @@ def _response(
     plain: ScanCamera,
     moving: PixelDrift | None,
     timing: ScanTiming | None,
-) -> Array:
-    """The (2, 2) raw shift per departure of the field, to first order in the drift per row."""
-    if moving is None or timing is None:
-        return np.eye(2)
-    middle = 0.5 * np.array([[size[0], size[1]]])
-    step = 1e-3 * moving.velocity_px_s * timing.frame_time_s
-    raw = plain.raw_from_rect(np.vstack([middle, middle + step]))
-    raw_velocity = (raw[1] - raw[0]) / (1e-3 * timing.frame_time_s)
-    at = timing.pixel_offset_s(
-        np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), size[1], size[0]
+) -> tuple[Array32 | None, float]:
+    """The (2, 2) raw shift per departure of the field, to first order in the drift per row, in the middle of the image
+    and of the frame, None for the identity; and by how much it differs in the corners at most.
+    """
+    if moving is None or timing is None or moving.is_still:
+        return None, 0.0
+    width, height = size
+    right, bottom = width - 1.0, height - 1.0
+    places = np.array(
+        [[0.5 * right, 0.5 * bottom], [0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
     )
-    return np.asarray(np.linalg.inv(np.eye(2) - np.outer(raw_velocity, at[1:] - at[0])))
-
-
-def _drift_path(size: tuple[int, int], moving: PixelDrift | None) -> Array:
-    """Drift, (2, 2) px, at the times of the first and the last pixel."""
-    if moving is None:
-        return np.zeros((2, 2))
-    corners = np.array([[0.0, 0.0], np.subtract(size, 1.0)])
-    return moving.displacement(corners)
+    # What lies there at the time at which its row is scanned, and the next.
+    scanned = np.vstack([places, places + [0.0, 1.0]])
+    raw = plain.raw_from_rect(moving.moved(np.vstack([places, places]), scanned))
+    per_row = raw[5:] - raw[:5]
+    offset_s = timing.pixel_offset_s(
+        np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), height, width
+    )
+    rows_per_px = (offset_s[1:] - offset_s[0]) / (offset_s[2] - offset_s[0])
+    # The inverse of the identity minus the outer product of the two (Sherman and Morrison).
+    growth = per_row / (1.0 - per_row @ rows_per_px)[:, None]
+    responses = growth[:, :, None] * rows_per_px
+    spread = np.abs(responses[1:] - responses[0]).sum(axis=2)
+    return (np.eye(2) + responses[0]).astype(np.float32), float(np.max(spread))
 
 
 def _largest(values: Array | Array32) -> float:
     return float(np.max(np.abs(values)))
 
 
-def _is_accurate(
+def _describe(found: RawMap, degree: int, row: Array32, error_px: float) -> _TestedMap:
+    """A map whose field has its nodes at the undisplaced rows (k, w), with the error that it may have."""
+    width = found.size[0]
+    camera = found._exact[0]
+    assert camera is not None
+    assert found._columns is not None
+    picked = [0, width // 2, width - 1, width, width + width // 2, 2 * width - 1]
+    raw = found._columns[:-2, picked].reshape(-1, 2, 3)
+    return _TestedMap(found.size, degree, camera, raw, row[:, width // 2].copy(), error_px)
+
+
+def _measure_error(
     found: RawMap, plain: ScanCamera, departure: Array32, moving: PixelDrift | None
-) -> bool:
-    """Whether some pixels of a map with a departure by a field at its nodes fulfil the equation of the exact position.
+) -> float:
+    """By how much some pixels of a map with a departure by a field at its nodes miss the equation of the exact
+    position, px.
 
     The test takes no iteration: where the field moves a raw position to is where the drift and the rest of the camera
     put it. Without ``moving``, the first order of the response is not tested.
@@ -373,14 +478,13 @@ def _is_accurate(
     if moving is None:
         at_nodes = departure[:, at[0]].reshape(len(departure), -1)
         undisplaced = raw - (rows[:, :-2] @ at_nodes).reshape(-1, 2)
-        largest = _MAX_MAP_ERROR_PX
     else:
         # The response is that of the middle of the image and of the frame.
         x, y = np.meshgrid(*at)
         xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
-        undisplaced, largest = plain.raw_from_rect(moving.moved(xy, raw)), _MAX_MOVING_ERROR_PX
+        undisplaced = plain.raw_from_rect(moving.moved(xy, raw))
     miss = camera.without_residual(raw) - undisplaced
-    return bool(np.max(np.abs(miss[scanned]), initial=0.0) <= largest)
+    return float(np.max(np.abs(miss[scanned]), initial=0.0))
 
 
 def _find_frame_edges(found: RawMap) -> Indices:

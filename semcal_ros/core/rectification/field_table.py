@@ -40,8 +40,8 @@ __all__ = ["FieldTable", "tabulate_field"]
 # height apart, so that a step of a few rows does.
 _COLUMN_PX = 0.5
 _MOST_ROWS = 256
-# Change of the last step, px; what is left is smaller by the slope of the field.
-_SETTLED_PX = 0.002
+# What further steps would add, px: less than half of what a map with a field may be wrong by.
+_SETTLED_PX = 0.0004
 _MAX_STEPS = 12
 # A larger displacement is none of a microscope, and would make a table much larger than the image.
 _LARGEST_PX = 256.0
@@ -63,6 +63,8 @@ class FieldTable:
         (left, top) pixels from the first column and row of the table to those of the image.
     step_px
         Distance between columns and between rows.
+    slope
+        A bound of the larger of the slopes of both components, along x and y together, px per px.
     strips
         (n, 1) rows of the table by which each row of look-ups lies farther down in it, where it holds only what is
         near these; else (1, 1) zero.
@@ -71,11 +73,14 @@ class FieldTable:
     back_px: Array32
     margin_px: tuple[float, float]
     step_px: tuple[float, float]
+    slope: float
     strips: Array32
 
-    def invert(self, column: Array32, row: Array32) -> Array32 | None:
+    def invert(
+        self, column: Array32, row: Array32, start: Array32 | None = None
+    ) -> Array32 | None:
         """Return raw minus undisplaced positions, (n, k, 2), at undisplaced columns and rows, (n, k) each, or None
-        where that does not settle.
+        where that does not settle. The nearer ``start`` is to them, the sooner they are found.
         """
         count, width = column.shape
         at = np.empty((count, width, 2), dtype=np.float32)
@@ -86,12 +91,14 @@ class FieldTable:
         per_px = np.tile([1.0 / step for step in self.step_px], width).astype(np.float32)
         at.reshape(count, -1)[...] *= per_px
         at[..., 1] += self.strips
-        found = self._look_up(at)
+        # Each step leaves an error of at most the slope times that before it; a steeper field need not settle.
+        settled = _SETTLED_PX * max(1.0 / max(self.slope, 1e-3) - 1.0, 1.0)
+        found = self._look_up(at) if start is None else start
         for _ in range(_MAX_STEPS):
             moved = found.reshape(count, -1) * per_px
             moved += at.reshape(count, -1)
             before, found = found, self._look_up(moved.reshape(at.shape))
-            if cv2.norm(found, before, cv2.NORM_INF) <= _SETTLED_PX:
+            if cv2.norm(found, before, cv2.NORM_INF) <= settled:
                 return found
         return None
 
@@ -150,7 +157,7 @@ def tabulate_field(
             picked = np.clip(first[:, None] + np.arange(tall), 0, len(rows) - 1).ravel()
             strips = (np.arange(len(first)) * tall - first)[:, None].astype(np.float32)
     table = back_px.on_lattice(columns / norm, rows / norm, picked)
-    return FieldTable(table, (margins[0], margins[1]), steps, strips)
+    return FieldTable(table, (margins[0], margins[1]), steps, field.largest_slope, strips)
 
 
 @lru_cache(maxsize=4)
