@@ -342,10 +342,15 @@ class SmoothMaps:
             found = RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
             largest_px = cv2.norm(departure, cv2.NORM_INF)
             uncertain_px = spread * largest_px
-            is_slow = response is None or _largest(response - _IDENTITY) * largest_px <= _SMALL_RESPONSE_PX
+            is_slow = (
+                response is None
+                or _largest(response - _IDENTITY) * largest_px <= _SMALL_RESPONSE_PX
+            )
             limit_px = _MAX_MAP_ERROR_PX if is_slow else _MAX_MOVING_ERROR_PX
             is_known = is_slow or uncertain_px <= _MAX_RESPONSE_ERROR_PX
-            made = _describe(found, degree, row, limit_px - (0.0 if is_slow or not is_known else uncertain_px))
+            made = _describe(
+                found, degree, row, limit_px - (0.0 if is_slow or not is_known else uncertain_px)
+            )
             if is_known and any(test.covers(made) for test in self._tested):
                 return found
             error_px = _measure_error(found, plain, departure, None if is_known else moving)

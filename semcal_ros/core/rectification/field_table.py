@@ -76,9 +76,7 @@ class FieldTable:
     slope: float
     strips: Array32
 
-    def invert(
-        self, column: Array32, row: Array32, start: Array32 | None = None
-    ) -> Array32 | None:
+    def invert(self, column: Array32, row: Array32, start: Array32 | None = None) -> Array32 | None:
         """Return raw minus undisplaced positions, (n, k, 2), at undisplaced columns and rows, (n, k) each, or None
         where that does not settle. The nearer ``start`` is to them, the sooner they are found.
         """

@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
@@ -55,14 +56,15 @@ def camera_with(field: ResidualField, g: float = G) -> ScanCamera:
     return replace(plain, residual=field.at(g))
 
 
-def pixels() -> Array:
-    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+def pixels() -> NDArray[np.intp]:
+    """Every third one, which is a sixth of the beam's settling, and the edges."""
+    x, y = np.meshgrid(*(np.union1d(np.arange(0, n, 3), n - 1) for n in SIZE))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def largest_error(made: RawMap, camera: ScanCamera, drift: RasterDrift | None = None) -> float:
     """The largest error of a pixel that comes out; what lies outside of the raw frame is black."""
-    exact = raw_from_output(pixels(), SIZE, camera, drift, TIMING)
+    exact = raw_from_output(pixels().astype(np.float64), SIZE, camera, drift, TIMING)
     scanned = np.all((exact > -1.0) & (exact < np.array(SIZE)), axis=1)
     return float(np.max(np.abs(whole(made) - exact)[scanned]))
 
@@ -70,7 +72,8 @@ def largest_error(made: RawMap, camera: ScanCamera, drift: RasterDrift | None = 
 def whole(made: RawMap) -> Array:
     band = np.empty((SIZE[1], 2 * SIZE[0]), np.float32)
     made.band(0, SIZE[1], band)
-    return np.stack([band[:, : SIZE[0]].ravel(), band[:, SIZE[0] :].ravel()], axis=1)
+    x, y = pixels().T
+    return np.stack([band[y, x], band[y, SIZE[0] + x]], axis=1)
 
 
 def drift_px(position: tuple[float, float], velocity: tuple[float, float], acceleration=(0.0, 0.0)):
@@ -106,6 +109,7 @@ def test_a_stage_that_starts_to_move_is_tested_anew() -> None:
         drift_px((1.0, 0.5), (0.1, 0.0)),
         # Far from what was tested, and so fast that rows of the field that did before do not now.
         drift_px((31.0, -20.0), (-3.0, 5.0)),
+        drift_px((0.0, -60.0), (0.1, 0.0)),
     ):
         made = maps.make_map(SIZE, camera, drift, TIMING)
         assert largest_error(made, camera, drift) < 0.004
@@ -118,6 +122,26 @@ def test_every_magnification_of_a_zoom_has_its_own_field() -> None:
         made = maps.make_map(SIZE, camera, None, None)
         assert made.is_interpolated
         assert largest_error(made, camera) < 0.004
+
+
+def test_a_field_that_changes_with_the_magnification_is_tested_anew() -> None:
+    zero = zero_field(SIZE, (100.0, 10000.0), 2)
+    coefficients = zero.coefficients.copy()
+    # Along the lines only, so that rows stay where they are; from line to line more than twelve degrees follow.
+    coefficients[1, ..., 0] = 6.0 / (0.5 * SIZE[0]) * np.cos(3.0 * np.arange(7))[:, None]
+    maps, field = SmoothMaps(), replace(zero, coefficients=coefficients)
+    plain = preset("pincushion").camera_at(G).resized(*SIZE)
+    for g in (100.0, 10000.0, 100.0):
+        camera = replace(plain, residual=field.at(g))
+        assert largest_error(maps.make_map(SIZE, camera, None, None), camera) < 0.004
+
+
+def test_the_slope_of_a_field_is_bounded() -> None:
+    field = settling_field(2.0)
+    at = np.random.default_rng(0).uniform(-1.0, 1.0, (20000, 2)) * [1.0, SIZE[1] / SIZE[0]]
+    slices = [field.at(g) for g in (100.0, 1000.0, 10000.0)]
+    largest = max(float(np.abs(one.gradient(at)).sum(axis=2).max()) for one in slices)
+    assert all(largest <= one.largest_slope < 2.0 * largest for one in slices)
 
 
 def test_a_field_that_is_too_steep_for_the_table_is_computed_exactly() -> None:
