@@ -69,8 +69,10 @@ def find_failure(
     """
     best, worst = np.sqrt(np.maximum(np.linalg.eigvalsh(alignment.covariance), 0.0)).tolist()
     if not worst <= limits.max_sigma_px and best <= limits.max_sigma_px:
+        # The scatter of the blocks: a strained specimen, which has structure, has it too.
         return Rejection(
-            MatchFailure.UNDETERMINED, f"featureless in one direction (sigma {worst:.2f} px)"
+            MatchFailure.UNDETERMINED,
+            f"one direction is not determined (sigma {worst:.2f} px): featureless there, or strained",
         )
     # What does not converge scatters in every direction, and that is no lack of structure.
     if rejection := find_divergence(alignment):
