@@ -67,6 +67,34 @@ def test_beyond_the_range_the_sigma_is_twice_the_change_within_it(
     assert not camera.in_range
 
 
+@pytest.mark.parametrize("g", [4000.0, 100.0])
+def test_beyond_the_range_covariance_extrapolation_and_repeatability_add_as_variances(
+    rising: CalibrationModel, g: float
+) -> None:
+    """Of a straight line in log g between the ends of the range, whose values there are known to 0.3 and 0.1 %."""
+    ends, cross, repeatability = np.array([0.003, 0.001]), 1e-6, 0.002
+    covariance = rising.covariance.copy()
+    # The coefficients of the scale are the first ones.
+    covariance[:2, :2] = np.diag(ends**2) + cross * (1 - np.eye(2))
+    model = replace(
+        rising,
+        covariance=covariance,
+        scale_sigma=replace(rising.scale_sigma, repeatability=repeatability),
+    )
+    t = np.log(g / LOW) / np.log(HIGH / LOW)
+    scale = 1.0 + 0.02 * t
+    propagated = (
+        (1 - t) ** 2 * ends[0] ** 2 + t**2 * ends[1] ** 2 + 2 * t * (1 - t) * cross
+    ) / scale**2
+    beyond = 2.0 * 0.02 * min(abs(t), abs(t - 1.0)) / scale
+    camera = model.at(g)
+    expected = np.sqrt(propagated + beyond**2 + repeatability**2)
+    # None of them is so small that it would not be missed.
+    assert min(propagated, beyond**2, repeatability**2) > 0.01 * expected**2
+    for sigma, size in zip(camera.pixel_size_sigma_m, camera.pixel_size_m, strict=True):
+        assert sigma / size == pytest.approx(expected, rel=1e-9)
+
+
 def test_inside_the_range_nothing_is_added(rising: CalibrationModel) -> None:
     for g in (LOW, 700.0, HIGH):
         assert rising.extrapolation_sigma(g) == 0.0
