@@ -49,12 +49,22 @@ def test_the_exit_status_is_the_verdict(folder: Path, capsys: pytest.CaptureFixt
     out = capsys.readouterr().out
     assert out.startswith(f"{folder / 'cal.yaml'}: valid\n")
     assert "6 views" in out
+    header, *rows = out.splitlines()[1:9]
+    assert "z  px at most  nm at most  probability" in header
+    assert "times those expected" in rows[-1] and "other distortion" in rows[-2]
     with pytest.raises(SystemExit) as ended:
         run("check", folder / "off.yaml", folder / "today", "--json")
     assert ended.value.code == 1
     said = json.loads(capsys.readouterr().out)
     assert said["verdict"] == "degraded"
-    assert said["changes"][0]["name"] == "scale"
+    (change,) = [own for own in said["changes"] if own["name"] == "scale"]
+    assert change in said["tested"]
+    assert change["z_scores"] == pytest.approx([change["values"][0] / change["sigmas"][0]])
+    # nm are most at the lowest magnification of the views, 600x; px are the same at all, but for the distortion.
+    pixel_m = np.mean(Calibration.load(folder / "off.yaml").at(600.0).pixel_size_m)
+    assert change["largest_m"] == pytest.approx(change["largest_px"] * pixel_m, rel=0.1)
+    assert {"z_score", "p_value"} <= set(said["shape"])
+    assert said["misfit_z"] == pytest.approx((said["misfit"] - 1.0) / 0.1)
     # px per m of the file are 1 / 0.96 of those of the images.
     assert said["scale_change"] == pytest.approx(0.96 - 1.0, abs=3.0 * said["scale_sigma"])
 

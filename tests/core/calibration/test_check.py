@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from semcal_ros.core.calibration.calibrate import (
     CalibrationOptions,
@@ -83,6 +84,8 @@ def test_what_holds_is_valid_and_no_z_score_is_off(calibrated: CalibrationResult
     # By chance one of 20 tests in 200 is this improbable.
     assert min(change.p_value for done in checks for change in done.tested) > 5e-4
     z = [done.scale_change / done.scale_sigma for done in checks]
+    # The corners are as uncertain as they say, but for the lines that jitter.
+    assert all(0.9 < done.misfit < 1.5 for done in checks)
     # The calibration's own error is common to all; without it, the scatter would be 0.5 to 1.5.
     assert np.std(z) < 2.0
     assert max(np.abs(z)) < 3.5
@@ -109,6 +112,16 @@ def test_a_change_is_named_with_its_size(
     for value, sigma, true in zip(found.values, found.sigmas, (*by.values(), 0.0), strict=False):
         assert abs(value - true) < 3.5 * sigma
         assert sigma < 0.35 * max(by.values(), key=abs) or true == 0.0 or abs(true) > 3 * sigma
+    # What has not changed is judged beside it: a centre of distortion elsewhere looks like a scale, too.
+    assert abs(done.scale_change - by.get("m", 0.0)) < 3.0 * done.scale_sigma
+    named = {change.name for change in done.changes}
+    assert all(change.p_value > 1e-3 for change in done.tested if change.name not in named)
+    assert [change for change in done.tested if change.name == name] == [found]
+    # On the specimen it is largest where the pixels are.
+    low = calibrated.model.at(CHECKED[0])
+    if name in ("scale", "aspect", "skew"):
+        assert found.largest_m == pytest.approx(found.largest_px * np.mean(low.pixel_size_m), rel=0.05)
+    assert found.z_scores == tuple(np.divide(found.values, found.sigmas))
 
 
 def test_two_changes_are_both_named(calibrated: CalibrationResult) -> None:
@@ -136,6 +149,8 @@ def test_distortion_that_no_parameter_describes(calibrated: CalibrationResult) -
     done = check(calibrated, stage)
     assert done.verdict is Verdict.DEGRADED
     assert done.shape.significant
+    # As improbable as the normal deviate, two-sided.
+    assert 2.0 * norm.sf(done.shape.z_score) == pytest.approx(done.shape.p_value)
     # 0.15 px amplitude along one axis are 0.075 px RMS per axis; cells are half of a wave high.
     assert 0.02 < done.shape.rms_px < 0.08
 
@@ -173,3 +188,19 @@ def test_views_outside_the_range_are_not_judged(calibrated: CalibrationResult) -
         check(calibrated, outside)
     done = check(calibrated, [*outside, *simulated(SEM.camera_at, (2000.0,), 36)])
     assert (done.views, done.out_of_range) == (3, 3)
+
+
+def test_noise_beyond_that_of_the_corners_is_told_and_is_no_change(
+    calibrated: CalibrationResult,
+) -> None:
+    rng = np.random.default_rng(5)
+    noisy = [
+        replace(view, image_xy=view.image_xy + 0.2 * rng.normal(size=view.image_xy.shape))
+        for view in simulated(SEM.camera_at, CHECKED, 12)
+    ]
+    done = check(calibrated, noisy)
+    assert done.verdict is Verdict.VALID
+    # 0.05 px of its own and 0.05 px of the lines along x.
+    expected = np.sqrt(0.2**2 + 0.05**2 + 0.5 * 0.05**2) / 0.05
+    assert done.misfit == pytest.approx(expected, rel=0.25)
+    assert done.misfit_z > 10.0
