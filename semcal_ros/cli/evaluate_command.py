@@ -24,6 +24,7 @@ import click
 from semcal_ros.cli.options import PATH, dask_option, json_option
 from semcal_ros.cli.output import (
     echo_json,
+    echo_notes,
     echo_rejected,
     echo_table,
     list_rejections,
@@ -100,4 +101,5 @@ def command(
     click.echo(
         f"{result.views} of {counted(result.views + result.rejected, 'view')}, RMS {result.rms_px:.4f} px"
     )
+    echo_notes(result.notes)
     echo_rejected(result.rejections)

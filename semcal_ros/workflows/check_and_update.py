@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.calibrate import name_untilted, options_for
+from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -255,8 +256,10 @@ def _see(
     microscope = resolve_config(config, model)
     sizes = microscope.squares_m if squares_m is None else check_positives(squares_m, "squares_m")
     frames: dict[str, RecordedFrame] = {}
+    conditions = ConditionsComparison(model)
 
     def note_frame(name: str, frame: RecordedFrame) -> None:
+        conditions.add(frame)
         frames[name] = replace(frame, image=frame.image[:0])
 
     with open_source(source, microscope) as opened:
@@ -267,7 +270,7 @@ def _see(
             keep_images=False,
             pattern=pattern,
         )
-        notes = opened.notes
+        notes = (*opened.notes, *conditions.notes)
     return _arrange(found, rejected, microscope, sizes, untilted, notes, frames)
 
 

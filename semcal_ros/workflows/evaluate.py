@@ -23,6 +23,7 @@ from typing import Any
 
 from semcal_ros.core.calibration.evaluate import compare_scales, fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -82,6 +83,8 @@ class Evaluation:
         The same for each magnification, ascending.
     rejections
         The images that were rejected, each with the reason.
+    notes
+        Notes for the user about the recording.
     """
 
     rms_px: float
@@ -89,6 +92,7 @@ class Evaluation:
     rejected: int
     by_magnification: tuple[MagnificationError, ...]
     rejections: tuple[RejectedView, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def evaluate(
@@ -130,18 +134,20 @@ def evaluate(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model)
+    conditions = ConditionsComparison(model)
     with (
         open_workers(dask) as workers,
         open_source(source, microscope, magnification=magnification) as opened,
     ):
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
-            named_frames(opened),
+            named_frames(opened, lambda _, frame: conditions.add(frame)),
             on_progress=advance,
             workers=workers if workers.elsewhere else None,
             keep_images=False,
             pattern=pattern,
         )
+        notes = (*opened.notes, *conditions.notes)
     collected = collect_views(
         found,
         rejected,
@@ -175,7 +181,7 @@ def evaluate(
         for g, rms in rms_by_magnification(fit).items()
     )
     views, rejections = len(collected.views), collected.rejected
-    return Evaluation(fit.rms_px(), views, len(rejections), tuple(errors), rejections)
+    return Evaluation(fit.rms_px(), views, len(rejections), tuple(errors), rejections, notes)
 
 
 def _visit_height_sigma_m(statistics: Mapping[str, Any]) -> float:

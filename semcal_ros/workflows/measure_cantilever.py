@@ -40,6 +40,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
 from semcal_ros.files.tables import write_table
+from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -305,12 +306,14 @@ def _read(
     """Frames by recording and magnification, in the order in which these first appear."""
     found: dict[tuple[Path, str], _Run] = {}
     notes: list[str] = []
+    conditions = ConditionsComparison(model)
     for source in sources:
         with open_source(source, microscope, magnification=magnification) as opened:
             path = opened.path
             advance = count_frames(on_progress, "reading", opened.frame_count)
             for frame in opened.frames():
                 advance(1)
+                conditions.add(frame)
                 label = f"{frame.magnification:.6g}"
                 if (path, label) not in found:
                     camera = camera_for(frame, model, microscope)
@@ -329,7 +332,7 @@ def _read(
                         expected="frames in the order of time",
                     )
             notes += [f"{path}: {note}" for note in opened.notes]
-    return list(found.values()), notes
+    return list(found.values()), [*notes, *conditions.notes]
 
 
 def _check_counts(runs: Sequence[_Run]) -> None:

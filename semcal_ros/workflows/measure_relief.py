@@ -32,6 +32,7 @@ from semcal_ros.files.images.write import TIFF_SUFFIXES, PixelScale, open_tiff_s
 from semcal_ros.files.meshes import UNITS_PER_M, save_cloud
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
+from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import camera_for
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -180,7 +181,10 @@ def measure_relief(
                 do="choose them, or give --calibration without --tilts for a ball that turns",
             )
         frames = list(opened.frames())
-        notes = list(opened.notes)
+        conditions = ConditionsComparison(model)
+        for frame in frames:
+            conditions.add(frame)
+        notes = [*opened.notes, *conditions.notes]
     if len({frame.magnification for frame in frames}) > 1:
         raise InvalidValueError(
             "images of different magnifications", expected="images of one magnification"

@@ -46,6 +46,7 @@ from semcal_ros.files.images.write import (
 )
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.files.tables import TABLE_SUFFIXES
+from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
@@ -200,6 +201,7 @@ def rectify(
     kind = None if output is None else _choose_kind(output, scale_bar)
     target = None if output is None else Path(output)
     frames: list[RectifiedFrame] = []
+    conditions = ConditionsComparison(model)
     states: Counter[str] = Counter()
     extrapolated, count, matched = 0, 0, 0
     with ExitStack() as open_files:
@@ -217,6 +219,7 @@ def rectify(
 
         def orders() -> Iterator[tuple[object, ...]]:
             for followed in _follow(opened, model, microscope, follower):
+                conditions.add(followed.frame)
                 under_way.append(followed)
                 raster = None if followed.update is None else followed.update.raster
                 image = followed.frame.image
@@ -235,7 +238,7 @@ def rectify(
             count += 1
             advance(1)
         on_progress("finishing", 0, None)
-        notes = (*opened.notes, *_note_timing(microscope, follower, model))
+        notes = (*opened.notes, *conditions.notes, *_note_timing(microscope, follower, model))
     kinds = dict(states.most_common())
     return RectifiedRecording(
         count, target, tuple(frames), kinds, extrapolated, notes, followed=matched > 1

@@ -27,6 +27,12 @@ from semcal_ros.files.recordings import open_recording
 from tests.helpers.semcal_runs import refused, run
 
 
+OTHER_VOLTAGE = (
+    "other conditions than those of the calibration: voltage 10 kV, calibrated at 5 kV; check it (semcal check), or "
+    "use one that was made under these conditions"
+)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A calibration, and two recordings of the grid by other seeds."""
@@ -39,6 +45,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # The same with a display that is 4 % narrower: all magnifications are other ones.
     data = yaml.safe_load((place / "cal.yaml").read_text())
     data["display_width_m"] *= 0.96
+    # And it was made at half of the voltage.
+    data["provenance"]["conditions"]["acceleration_voltage_v"] = [5000.0, 5000.0]
     (place / "off.yaml").write_text(yaml.safe_dump(data))
     return place
 
@@ -57,6 +65,7 @@ def test_the_exit_status_is_the_verdict(folder: Path, capsys: pytest.CaptureFixt
     assert ended.value.code == 1
     said = json.loads(capsys.readouterr().out)
     assert said["verdict"] == "degraded"
+    assert [note for note in said["notes"] if "conditions" in note] == [OTHER_VOLTAGE]
     (change,) = [own for own in said["changes"] if own["name"] == "scale"]
     assert change in said["tested"]
     assert change["z_scores"] == pytest.approx([change["values"][0] / change["sigmas"][0]])
@@ -111,6 +120,19 @@ def test_rejected_views_are_named_with_the_reason(
         assert run(*command, "--json") == 0
         rejections = json.loads(capsys.readouterr().out)["rejections"]
         assert len(rejections) == 2 and all(r["reason"] for r in rejections)
+
+
+@pytest.mark.slow
+def test_other_conditions_are_told_by_all_that_use_a_recording(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = folder / "today"
+    for cal, told in (("off.yaml", 1), ("cal.yaml", 0)):
+        given = folder / cal
+        rectify = ("rectify", views, "--calibration", given, "-o", f"{tmp_path / cal}/", "--no-drift")
+        for command in (("evaluate", given, views), rectify):
+            assert run(*command) == 0
+            assert capsys.readouterr().err.count(f"note: {OTHER_VOLTAGE}") == told
 
 
 @pytest.mark.slow

@@ -1,0 +1,64 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcal_ros import Calibration
+from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.files.recordings import RecordedFrame
+from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.workflows.conditions import ConditionsComparison
+from tests.helpers.calibrations import DEFAULT, calibrated
+
+MADE = {"acceleration_voltage_v": (5e3, 5e3), "working_distance_m": (0.01, 0.0101), "detector": ("SE",)}
+
+
+def notes(calibration: Calibration | None, *seen: Conditions | None) -> tuple[str, ...]:
+    comparison = ConditionsComparison(calibration)
+    frame = RecordedFrame(np.zeros((2, 2), np.uint8), 0, 0, 1000.0, "sem", "mono8")
+    for own in seen:
+        comparison.add(replace(frame, conditions=own))
+    return comparison.notes
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    model = calibrated("jsm820", DEFAULT).model
+    return Calibration.from_model(replace(model, provenance=Provenance(conditions=MADE)))
+
+
+def test_what_changes_the_scale_and_what_does_not_are_told_once_each(
+    calibration: Calibration,
+) -> None:
+    other = Conditions(acceleration_voltage_v=1e4, detector="BSE")
+    decisive, harmless = notes(calibration, other, other, replace(other, working_distance_m=0.0115))
+    assert "voltage 10 kV, calibrated at 5 kV, working distance 11.5 mm, calibrated at 10 mm to 10.1 mm" in decisive
+    assert decisive.count("voltage 10 kV") == 1 and "semcal check" in decisive
+    assert harmless == "different from the calibration: detector BSE, calibrated at SE"
+    # A list that nobody reads is cut.
+    (many,) = notes(calibration, *(Conditions(working_distance_m=0.02 + 1e-3 * k) for k in range(9)))
+    assert many.count("calibrated at") == 4 and "and 5 more" in many
+
+
+def test_what_one_of_them_does_not_tell_is_not_compared(calibration: Calibration) -> None:
+    same = Conditions(acceleration_voltage_v=5e3, working_distance_m=0.01005, detector="se")
+    assert notes(calibration, same, None, Conditions()) == ()
+    unknown = Calibration.from_model(replace(calibration, provenance=Provenance()))
+    other = Conditions(acceleration_voltage_v=1e4)
+    assert notes(unknown, other) == notes(None, other) == ()
