@@ -75,7 +75,10 @@ def load_microscope(folder: Path) -> VirtualMicroscope:
         name: json.loads((folder / name / "truth.json").read_text())
         for name in ("grid_calibration", "grid_zoom_sweep")
     }
-    size, display_m = truth["grid_calibration"]["size"], 1e-6 * truth["grid_calibration"]["display_um"]
+    size, display_m = (
+        truth["grid_calibration"]["size"],
+        1e-6 * truth["grid_calibration"]["display_um"],
+    )
     known: dict[float, dict[str, Any]] = {
         float(g): values for own in truth.values() for g, values in own["params"].items()
     }
@@ -143,10 +146,6 @@ def visits_of(microscope: VirtualMicroscope, magnifications: list[float], seed: 
     return frames
 
 
-def _draw(
-    microscope: VirtualMicroscope, pose: Pose, g: float, seed: tuple[int, ...]
-) -> AnyImage:
+def _draw(microscope: VirtualMicroscope, pose: Pose, g: float, seed: tuple[int, ...]) -> AnyImage:
     square_m = square_for(microscope.nominal_pixel_size_m(g), microscope.width)
-    return render_frame(
-        microscope, ChessGrid(square_m), pose, g, seed=seed, detector=Detector()
-    )
+    return render_frame(microscope, ChessGrid(square_m), pose, g, seed=seed, detector=Detector())

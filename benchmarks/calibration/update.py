@@ -17,8 +17,8 @@
     python -m benchmarks.calibration.update [--quick]
 
 A microscope is calibrated (17 visits of nine magnifications, four views each); then its scale changes by 0.5 %. The
-calibration is renewed with ten views, and the changed microscope calibrated anew with all 68. Both are compared with the
-new truth between the calibrated magnifications. The stages, and the scatter of their visits, are those of
+calibration is renewed with ten views, and the changed microscope calibrated anew with all 68. Both are compared with
+the new truth between the calibrated magnifications. The stages, and the scatter of their visits, are those of
 `benchmarks.calibration.check`; each run draws all of it anew.
 """
 
@@ -57,9 +57,7 @@ CameraAt = Callable[[float], ScanCamera]
 def _views(
     camera_at: CameraAt, visits: Sequence[float], tilts: tuple[float, ...], seed: int
 ) -> list[GridView]:
-    return stage_views(
-        camera_at, visits, replace(STAGE, tilts_rad=tilts), seed=seed, readings=True
-    )
+    return stage_views(camera_at, visits, replace(STAGE, tilts_rad=tilts), seed=seed, readings=True)
 
 
 def _one_each(camera_at: CameraAt, seed: int) -> list[GridView]:

@@ -26,7 +26,6 @@ from semcal_ros import Calibration
 from semcal_ros.files.recordings import open_recording
 from tests.helpers.semcal_runs import refused, run
 
-
 OTHER_VOLTAGE = (
     "other conditions than those of the calibration: voltage 10 kV, calibrated at 5 kV; check it (semcal check), or "
     "use one that was made under these conditions"
@@ -129,7 +128,15 @@ def test_other_conditions_are_told_by_all_that_use_a_recording(
     views = folder / "today"
     for cal, told in (("off.yaml", 1), ("cal.yaml", 0)):
         given = folder / cal
-        rectify = ("rectify", views, "--calibration", given, "-o", f"{tmp_path / cal}/", "--no-drift")
+        rectify = (
+            "rectify",
+            views,
+            "--calibration",
+            given,
+            "-o",
+            f"{tmp_path / cal}/",
+            "--no-drift",
+        )
         for command in (("evaluate", given, views), rectify):
             assert run(*command) == 0
             assert capsys.readouterr().err.count(f"note: {OTHER_VOLTAGE}") == told

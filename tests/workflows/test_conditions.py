@@ -26,7 +26,11 @@ from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.conditions import ConditionsComparison
 from tests.helpers.calibrations import DEFAULT, calibrated
 
-MADE = {"acceleration_voltage_v": (5e3, 5e3), "working_distance_m": (0.01, 0.0101), "detector": ("SE",)}
+MADE = {
+    "acceleration_voltage_v": (5e3, 5e3),
+    "working_distance_m": (0.01, 0.0101),
+    "detector": ("SE",),
+}
 
 
 def notes(calibration: Calibration | None, *seen: Conditions | None) -> tuple[str, ...]:
@@ -48,11 +52,16 @@ def test_what_changes_the_scale_and_what_does_not_are_told_once_each(
 ) -> None:
     other = Conditions(acceleration_voltage_v=1e4, detector="BSE")
     decisive, harmless = notes(calibration, other, other, replace(other, working_distance_m=0.0115))
-    assert "voltage 10 kV, calibrated at 5 kV, working distance 11.5 mm, calibrated at 10 mm to 10.1 mm" in decisive
+    assert (
+        "voltage 10 kV, calibrated at 5 kV, working distance 11.5 mm, calibrated at 10 mm to 10.1 mm"
+        in decisive
+    )
     assert decisive.count("voltage 10 kV") == 1 and "semcal check" in decisive
     assert harmless == "different from the calibration: detector BSE, calibrated at SE"
     # A list that nobody reads is cut.
-    (many,) = notes(calibration, *(Conditions(working_distance_m=0.02 + 1e-3 * k) for k in range(9)))
+    (many,) = notes(
+        calibration, *(Conditions(working_distance_m=0.02 + 1e-3 * k) for k in range(9))
+    )
     assert many.count("calibrated at") == 4 and "and 5 more" in many
 
 

@@ -419,7 +419,8 @@ def _split_covariance(
 
 def _left_out(chosen: Functions, padded: Functions) -> Indices:
     """Indices of the coefficients that the padded functions have and the chosen ones have not."""
-    out, start = [], 0
+    out: list[int] = []
+    start = 0
     for name in FUNCTION_NAMES:
         own, whole = chosen[name], padded[name]
         out += range(start + own.smooth_size, start + whole.smooth_size)

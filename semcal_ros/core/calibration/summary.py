@@ -107,7 +107,7 @@ def list_undetermined(setup: Setup, model: CalibrationModel) -> list[Finding]:
     covariance = model.at(float(np.sqrt(np.prod(model.magnification_range)))).covariance
     assert covariance is not None
     sigma = np.sqrt(np.diag(covariance))
-    # A fitted pose takes up an error of the principal point; a pivot at another distance makes a height count differently.
+    # A fitted pose takes up an error of the principal point; at another pivot a height counts differently.
     costs = {"px": np.nan, "rho": float(sigma[5]) * model.scale_sigma.height_m}
     for index, name, label in (
         (3, "px", "principal point"),

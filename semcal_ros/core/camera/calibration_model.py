@@ -278,8 +278,6 @@ class CalibrationModel:
 def pixel_size_gradient(model: CalibrationModel, magnification: float) -> Array:
     """(2, K) relative change of the pixel size along x and y per unit of the coefficients of the functions."""
     camera = model.at(magnification)
-    design = design_matrix(
-        model.functions, magnification, model.nominal_px_per_m(magnification)
-    )
+    design = design_matrix(model.functions, magnification, model.nominal_px_per_m(magnification))
     scale, aspect = design[0] / camera.m, design[1] / camera.aspect
     return np.stack([-scale - aspect, -scale + aspect])

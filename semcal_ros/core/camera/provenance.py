@@ -95,12 +95,16 @@ class Provenance:
         """What a calibration holds for, in a few words: voltage, working distance and the days of its views."""
         days = tuple(dict.fromkeys(date[:10] for date in self.recorded))
         parts = {
-            describe_condition(name, ())[0]: describe_condition(name, self.conditions.get(name, ()))[1]
+            describe_condition(name, ())[0]: describe_condition(
+                name, self.conditions.get(name, ())
+            )[1]
             for name in _ESSENTIAL
         } | {"date": " to ".join(days)}
         if not any(parts.values()):
             return f"conditions {NOT_RECORDED}"
-        return printable(", ".join(f"{name} {value or NOT_RECORDED}" for name, value in parts.items()))
+        return printable(
+            ", ".join(f"{name} {value or NOT_RECORDED}" for name, value in parts.items())
+        )
 
     def describe(self) -> str:
         """All three, in one line for a log."""

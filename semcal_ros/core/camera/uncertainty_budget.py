@@ -146,7 +146,9 @@ def _scale_parts(
     return rectified, rectified.pixel_size_m[0] * stretch, parts
 
 
-def _split_views(model: CalibrationModel, magnification: float, variance: float) -> dict[str, float]:
+def _split_views(
+    model: CalibrationModel, magnification: float, variance: float
+) -> dict[str, float]:
     """What the covariance of the calibration adds, by its sources where the calibration tells them."""
     fit = model.statistics.get("fit")
     told = fit.get("scale_shares") if isinstance(fit, Mapping) else None

@@ -120,7 +120,9 @@ def test_a_change_is_named_with_its_size(
     # On the specimen it is largest where the pixels are.
     low = calibrated.model.at(CHECKED[0])
     if name in ("scale", "aspect", "skew"):
-        assert found.largest_m == pytest.approx(found.largest_px * np.mean(low.pixel_size_m), rel=0.05)
+        assert found.largest_m == pytest.approx(
+            found.largest_px * np.mean(low.pixel_size_m), rel=0.05
+        )
     assert found.z_scores == tuple(np.divide(found.values, found.sigmas))
 
 

@@ -68,7 +68,7 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
 def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
     setup: Setup, fit: JointFit
 ) -> None:
-    """A tenth of the stated noise is added to the corners, all else is as it was, and the scale scatters by that part."""
+    """A tenth of the stated noise is added to the corners, and the scale scatters by that part of its sigma."""
     problem = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
     start = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded))
     sigma_px = np.concatenate([view.sigma_px for view in setup.views])[:, None]

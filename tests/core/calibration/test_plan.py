@@ -25,6 +25,7 @@ from semcal_ros.core.calibration.plan import ViewPlan, plan_views
 from semcal_ros.core.calibration.update import update_calibration
 from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import InvalidValueError
 from tests.core.calibration.test_check import AXIS, SEM, simulated
 
@@ -132,6 +133,17 @@ def test_the_verdict_names_the_weakest_place_and_the_next_visit(poor: Calibratio
     # The sentence's own numbers: the sigma in nm is the stated part of the size in nm.
     size, sigma = map(float, re.findall(r"([\d.]+) \+- ([\d.]+) nm", verdict.describe())[0])
     assert sigma == pytest.approx(verdict.largest * size, rel=0.06)
+    assert verdict.describe().endswith(" nm (conditions not recorded)")
+    made = Provenance(
+        recorded=("2026-03-01 22:00:00", "2026-03-02 01:00:00"),
+        conditions={"acceleration_voltage_v": (5e3, 5e3), "working_distance_m": (0.01, 0.0101)},
+    )
+    told = judge_calibration(replace(known, provenance=made)).describe()
+    under = "voltage 5 kV, working distance 10 mm to 10.1 mm, date 2026-03-01 to 2026-03-02"
+    assert told == verdict.describe().replace("conditions not recorded", under)
+    # What nothing told is said, too.
+    undated = judge_calibration(replace(known, provenance=replace(made, recorded=())))
+    assert undated.describe().endswith("10.1 mm, date not recorded)")
 
 
 def test_no_visit_is_proposed_where_none_would_help(poor: CalibrationModel) -> None:
