@@ -105,6 +105,7 @@ _PARAMETERS = (
     ),
     *ACQUISITION,
 )
+_GOAL = ("lowest_magnification", "highest_magnification", "target")
 # Stamps that are behind by more are of another clock, or of so slow a scan that one follows the other.
 _OTHER_CLOCK_NS = 30 * 10**9
 # Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
@@ -240,12 +241,14 @@ class CalibrationServer(StreamNode):
             values.append(("largest_tilt_deg", f"{max(coverage.tilts_deg):.1f}"))
         if stage is not None:
             values += [("stage", stage.name), ("fraction", f"{stage.fraction:.3f}")]
+        # What ~/acquire would do, and with what: a viewer shows it before it begins.
+        values += [(name, f"{self.parameters[name]:g}") for name in _GOAL]
+        values.append(("microscope", self.parameters["microscope"]))
         if acquisition is not None:
             progress = acquisition.progress
             values += [("acquisition", progress.state), ("request", progress.text)]
             values += [("taken", str(progress.views)), ("planned", str(progress.planned))]
             values += [("left_out", str(progress.left_out))]
-            values += [("target", f"{acquisition.goal.target:g}")]
             values += [("largest_sigma", f"{progress.largest:.3g}")]
         status = DiagnosticStatus()
         name = f"{self.get_fully_qualified_name()}: calibration"

@@ -22,23 +22,28 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from numpy.typing import NDArray
+from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from sensor_msgs.msg import Image
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.core.corners import find_lattice
+from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.wording import counted
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
     REPLAYED_CALIBRATION,
@@ -50,8 +55,9 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, ViewedImages
-from semcal_ros.viewer.coverage import describe_coverage, describe_run
+from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
@@ -81,15 +87,61 @@ _COMPUTE_S = 600.0
 _CALIBRATION_ACTIONS = {
     "add_view": "add_view",
     "calibrate": "calibrate_start",
+    "acquire": "acquire",
     "cancel": "cancel",
     "check": "check",
     "save": "save",
     "clear": "clear",
 }
 _SLOW = ("add_view", "check")
+# Parameters of the calibration server that the values of `acquire` are, in their order.
+_GOAL = ("lowest_magnification", "highest_magnification", "target")
+# Corners are looked for once a second, and never for more than a fourth of the time of one processor; in pictures that
+# are no wider than this, which is more than the page shows.
+_CORNERS_S, _CORNERS_SHARE, _CORNERS_PX = 1.0, 0.25, 1024
 _SERVER = "calibration_server"
 # A tenth of the processor against a node that wants it too.
 _NICE = 10
+
+
+@dataclass(frozen=True, order=True)
+class _Sought:
+    """A picture in which corners are looked for; the order is that of the frames."""
+
+    number: int
+    image: NDArray[Any] = field(compare=False)
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """A picture with the corners that were found, what is to be said of it, and how long that took."""
+
+    number: int
+    picture: NDArray[Any]
+    text: str
+    seconds: float
+
+
+def _find_corners(sought: _Sought) -> _Corners:
+    started_s = time.monotonic()
+    image = sought.image
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    height, width = grey.shape
+    if width > _CORNERS_PX:
+        size = _CORNERS_PX, max(1, round(height * _CORNERS_PX / width))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    refused, xy = "", np.empty((0, 2))
+    try:
+        found = find_lattice(grey)
+        if isinstance(found, Rejection):
+            refused = found.reason
+        else:
+            xy = found.xy
+    except NODE_ERRORS as error:
+        refused = " ".join(str(error).split())
+    text = f"no grid: {refused}" if refused else counted(len(xy), "corner")
+    picture = corner_overlay(grey, xy)
+    return _Corners(sought.number, picture, text, time.monotonic() - started_s)
 
 
 class Viewer(SemNode):
@@ -109,7 +161,9 @@ class Viewer(SemNode):
         self._speed: tuple[float, float] | None = None
         self._reports: dict[str, tuple[float, NodeReport]] = {}
         self._progress: tuple[str, str, dict[str, str]] | None = None
-        self._overlay: tuple[int, NDArray[Any]] | None = None
+        self._corners: _Corners | None = None
+        self._corners_s = 0.0
+        self._finder = LatestWorker(self.endpoints.guard, _find_corners, self._on_corners)
         self._offered: dict[str, tuple[str, Any]] = {}
         # Clients, and when they were made.
         self._callers: dict[str, tuple[Any, float]] = {}
@@ -128,7 +182,6 @@ class Viewer(SemNode):
             (TwistWithCovarianceStamped, "drift_velocity", stream_output(1), self._on_velocity),
             (DiagnosticArray, "/diagnostics", stream_output(100), self._on_diagnostics),
             (DiagnosticStatus, f"{_SERVER}/progress", latched(), self._on_progress),
-            (Image, f"{_SERVER}/overlay", stream_output(1), self._on_overlay),
         ]
         self._values = [
             self.endpoints.subscribe(kind, topic, handler, profile, group)
@@ -173,14 +226,14 @@ class Viewer(SemNode):
 
     def overlay(self) -> NDArray[Any] | None:
         """Return the newest picture with corners."""
-        overlay = self._overlay
-        return None if overlay is None else overlay[1]
+        corners = self._corners
+        return None if corners is None else corners.picture
 
     def describe(self) -> Status:
         """Return the state at the last tick."""
         return self._described
 
-    def act(self, action: str, value: float | None) -> str:
+    def act(self, action: str, value: float | tuple[float, ...] | None) -> str:
         """Call the service of an action, and return its answer."""
         found = self._offered.get(action)
         if found is None:
@@ -190,20 +243,39 @@ class Viewer(SemNode):
                 do="start it, or look at the namespace",
             )
         service, kind = found
+        if action == "acquire" and isinstance(value, tuple):
+            self._set_goal(service.rpartition("/")[0], value)
         request = SetBool.Request(data=True) if kind is SetBool else Trigger.Request()
+        response = self._ask(service, kind, request, _COMPUTE_S if action in _SLOW else _ANSWER_S)
+        if not response.success:
+            raise InvalidValueError(response.message or f"{service} refused")
+        return response.message or f"{service}: done"
+
+    def _set_goal(self, node: str, values: tuple[float, ...]) -> None:
+        """Tell the calibration server what to acquire."""
+        if len(values) != len(_GOAL):
+            raise InvalidValueError(
+                counted(len(values), "value"), expected="two magnifications and a target"
+            )
+        numbers = zip(_GOAL, values, strict=True)
+        parameters = [Parameter(name, value=float(v)).to_parameter_msg() for name, v in numbers]
+        request = SetParameters.Request(parameters=parameters)
+        answer = self._ask(f"{node}/set_parameters", SetParameters, request, _ANSWER_S)
+        for result in answer.results:
+            if not result.successful:
+                raise InvalidValueError(result.reason)
+
+    def _ask(self, service: str, kind: Any, request: Any, limit_s: float) -> Any:
         answer: Future[Any] = Future()
         with self._lock:
             self._wanted.append((service, kind, request, answer))
         self._changed.trigger()
         try:
-            response = answer.result(_COMPUTE_S if action in _SLOW else _ANSWER_S)
+            return answer.result(limit_s)
         except TimeoutError as error:
             raise InvalidValueError(
                 f"no answer from {service}", do="look whether its node still runs"
             ) from error
-        if not response.success:
-            raise InvalidValueError(response.message or f"{service} refused")
-        return response.message or f"{service}: done"
 
     # -- callbacks -----------------------------------------------------------------------------------
 
@@ -259,6 +331,7 @@ class Viewer(SemNode):
         except NODE_ERRORS as error:
             self.reporter.reject(error)
         now_s = time.monotonic()
+        self._look_for_corners(now_s)
         if now_s - self._graph_s > _GRAPH_S:
             self._graph_s = now_s
             self._look_for_services()
@@ -331,14 +404,25 @@ class Viewer(SemNode):
         values = {pair.key: pair.value for pair in message.values}
         self._progress = message.message, "ok" if level == 0 else "warn", values
 
-    def _on_overlay(self, message: Any, _info: Any) -> None:
-        try:
-            image = image_from_message(message)
-        except SemcalError as error:
-            self.reporter.reject(error)
+    def _look_for_corners(self, now_s: float) -> None:
+        """Look for the grid in the newest raw picture, in a thread beside, while a calibration is being made."""
+        view = self._view
+        if view is None or now_s < self._corners_s or not self._makes_calibration():
             return
-        number = 1 if self._overlay is None else self._overlay[0] + 1
-        self._overlay = number, image
+        before = self._corners
+        if "raw" not in view.pictures or (before is not None and before.number == view.number):
+            return
+        # Until the result is there.
+        self._corners_s = math.inf
+        self._finder.submit(_Sought(view.number, view.pictures["raw"]))
+
+    def _on_corners(self, corners: _Corners) -> None:
+        self._corners = corners
+        wait_s = max(_CORNERS_S - corners.seconds, corners.seconds * (1.0 / _CORNERS_SHARE - 1.0))
+        self._corners_s = time.monotonic() + wait_s
+
+    def _makes_calibration(self) -> bool:
+        return self._progress is not None and "add_view" in self._offered
 
     def _look_for_services(self) -> None:
         """Find out who offers what the buttons do: the nodes behind the images, and the calibration server."""
@@ -389,16 +473,18 @@ class Viewer(SemNode):
         return self._trace.panel("no drift is published; start stream_corrector")
 
     def _describe_calibration(self) -> CalibrationPanel | None:
-        if self._progress is None or "add_view" not in self._offered:
+        if self._progress is None or not self._makes_calibration():
             return None
         answer, level, values = self._progress
-        overlay = self._overlay
+        corners = self._corners
         return CalibrationPanel(
             answer,
             level,
             describe_coverage(values),
             describe_run(values),
-            0 if overlay is None else overlay[0],
+            0 if corners is None else corners.number,
+            "" if corners is None else corners.text,
+            describe_acquisition(values),
         )
 
 

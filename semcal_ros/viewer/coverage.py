@@ -20,9 +20,9 @@ import math
 import re
 from collections.abc import Mapping
 
-from semcal_ros.viewer.source import Bar
+from semcal_ros.viewer.source import AcquisitionPanel, Bar
 
-__all__ = ["describe_coverage", "describe_run"]
+__all__ = ["describe_acquisition", "describe_coverage", "describe_run"]
 
 # What doc/calibration.md asks for: five views at each magnification, tilts that differ by 20 to 40 degrees, and nine
 # magnifications.
@@ -90,3 +90,32 @@ def describe_run(values: Mapping[str, str]) -> Bar | None:
     if fraction is None or "stage" not in values or values["stage"] == "done":
         return None
     return Bar("Calibrating", min(max(fraction, 0.0), 1.0), values["stage"])
+
+
+def describe_acquisition(values: Mapping[str, str]) -> AcquisitionPanel | None:
+    """Describe a calibration that records itself; None from a server that does not tell of it."""
+    microscope = values.get("microscope")
+    if microscope is None:
+        return None
+    low, high = _number(values, "lowest_magnification"), _number(values, "highest_magnification")
+    target, sigma = _number(values, "target"), _number(values, "largest_sigma")
+    taken, planned = _number(values, "taken"), _number(values, "planned")
+    bars: tuple[Bar, ...] = ()
+    if taken is not None and planned:
+        left_out = _number(values, "left_out") or 0.0
+        text = f"{taken:.0f} of {planned:.0f} so far" + f", {left_out:.0f} left out" * bool(
+            left_out
+        )
+        bars = (Bar("Views of the plan", min(taken / planned, 1.0), text),)
+    if target and bars:
+        known = "not known yet" if sigma is None else f"{100.0 * sigma:.2g} %"
+        share = 0.0 if not sigma else min(target / sigma, 1.0)
+        bars += (Bar("Certainty of nm per px", share, f"{known}; {100.0 * target:.2g} % wanted"),)
+    return AcquisitionPanel(
+        values.get("acquisition", "ready"),
+        f"{microscope} moves by itself" if microscope else "you set each view, step by step",
+        values.get("request", ""),
+        bars,
+        (low, high) if low and high else None,
+        target,
+    )

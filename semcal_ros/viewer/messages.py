@@ -37,7 +37,15 @@ from semcal_ros.viewer.pictures import (
 )
 from semcal_ros.viewer.source import View
 
-__all__ = ["Wish", "describe_distance", "encode_overlay", "encode_view", "measure", "read_wish"]
+__all__ = [
+    "Wish",
+    "describe_distance",
+    "encode_overlay",
+    "encode_view",
+    "measure",
+    "read_value",
+    "read_wish",
+]
 
 # A page that asks for more gets this: the longest side of a screen with room to spare.
 _LARGEST_WIDTH_PX = 4096
@@ -69,6 +77,21 @@ def _number(value: Any, name: str) -> float:
     if type(value) not in (int, float) or not math.isfinite(value):
         raise InvalidValueError(f"{name} = {value!r}", expected="a finite number")
     return float(value)
+
+
+def read_value(value: Any) -> float | tuple[float, ...] | None:
+    """Read the value of an action: nothing, a number, or several.
+
+    Raises
+    ------
+    InvalidValueError
+        It is something else, or a number is not finite.
+    """
+    if value is None:
+        return None
+    if isinstance(value, list):
+        return tuple(_number(one, "value") for one in value)
+    return _number(value, "value")
 
 
 def _pair(value: Any, name: str) -> tuple[float, float]:

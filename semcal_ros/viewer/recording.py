@@ -135,9 +135,9 @@ class RecordingSource:
         """Return None: nothing is calibrated here."""
         return None
 
-    def act(self, action: str, value: float | None) -> str:
+    def act(self, action: str, value: float | tuple[float, ...] | None) -> str:
         """Play, pause, or go to the frame with the number ``value``."""
-        if action == "seek" and value is not None:
+        if action == "seek" and isinstance(value, float):
             with self._changed:
                 self._wanted = int(min(max(value, 0), self._count - 1))
                 self._changed.notify_all()

@@ -38,7 +38,14 @@ from tornado import httpserver, web, websocket
 
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.images.write import PixelScale, pixel_scale, write_image
-from semcal_ros.viewer.messages import Wish, encode_overlay, encode_view, measure, read_wish
+from semcal_ros.viewer.messages import (
+    Wish,
+    encode_overlay,
+    encode_view,
+    measure,
+    read_value,
+    read_wish,
+)
 from semcal_ros.viewer.source import ACTIONS, View, ViewSource
 
 __all__ = ["LOCAL_HOSTS", "PageServer"]
@@ -416,10 +423,7 @@ class _Live(websocket.WebSocketHandler):
             view = self._server.source.newest()
             self._tell({"type": "measured", "of": str(told.get("of", "")), **measure(view, told)})
         elif kind == "act" and told.get("action") in ACTIONS:
-            value = told.get("value")
-            task = asyncio.create_task(
-                self._act(told["action"], float(value) if isinstance(value, (int, float)) else None)
-            )
+            task = asyncio.create_task(self._act(told["action"], read_value(told.get("value"))))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
         else:
@@ -427,7 +431,7 @@ class _Live(websocket.WebSocketHandler):
                 f"a message of type {kind!r}", expected="seen, wish, measure or act"
             )
 
-    async def _act(self, action: str, value: float | None) -> None:
+    async def _act(self, action: str, value: float | tuple[float, ...] | None) -> None:
         loop = asyncio.get_running_loop()
         try:
             text = await loop.run_in_executor(

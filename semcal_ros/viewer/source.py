@@ -25,6 +25,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
     "ACTIONS",
+    "AcquisitionPanel",
     "Bar",
     "CalibrationPanel",
     "DriftPanel",
@@ -39,10 +40,11 @@ __all__ = [
 
 ACTIONS = (
     *("start", "stop", "reset"),
-    *("add_view", "calibrate", "cancel", "check", "save", "clear"),
+    *("add_view", "calibrate", "acquire", "cancel", "check", "save", "clear"),
     *("play", "pause", "seek"),
 )
-"""What the page can ask for; ``seek`` has the number of the frame as its value."""
+"""What the page can ask for. ``seek`` has the number of the frame as its value; ``acquire`` the least and greatest
+magnification and the relative 1-sigma of nm per pixel to reach, or no value for those that the node has."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,34 @@ class Bar:
 
 
 @dataclass(frozen=True)
+class AcquisitionPanel:
+    """A calibration that records itself, or tells a person what to set.
+
+    Attributes
+    ----------
+    state
+        ``ready``, ``running``, ``waiting`` for a person, ``stopped``, ``failed`` or ``done``.
+    who
+        What moves the microscope, in words.
+    request
+        What happens, or is to be done, or why it has ended; may be empty.
+    bars
+        Views taken, and how far nm per pixel is known.
+    magnifications
+        Least and greatest; None where they are not known yet.
+    target
+        Relative 1-sigma of nm per pixel to reach.
+    """
+
+    state: str
+    who: str
+    request: str = ""
+    bars: tuple[Bar, ...] = ()
+    magnifications: tuple[float, float] | None = None
+    target: float | None = None
+
+
+@dataclass(frozen=True)
 class CalibrationPanel:
     """The state of a calibration in the making."""
 
@@ -138,6 +168,8 @@ class CalibrationPanel:
     bars: tuple[Bar, ...] = ()
     running: Bar | None = None
     overlay: int = 0  # number of the picture with the corners that was found last; 0: none yet
+    overlay_text: str = ""
+    acquisition: AcquisitionPanel | None = None
 
 
 @dataclass(frozen=True)
@@ -185,7 +217,7 @@ class ViewSource(Protocol):
         """Return the state of everything else."""
         ...
 
-    def act(self, action: str, value: float | None) -> str:
+    def act(self, action: str, value: float | tuple[float, ...] | None) -> str:
         """Do one of :data:`ACTIONS` and return what has come of it in a sentence; may take its time.
 
         Called from a thread of its own. Raises a :class:`~semcal_ros.core.errors.SemcalError` that says why it could

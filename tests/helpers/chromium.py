@@ -137,6 +137,25 @@ class Page:
             self.call(mouse, type="mouseMoved", x=x, y=y, button="left", buttons=1)
         self.call(mouse, type="mouseReleased", x=last[0], y=last[1], **button)
 
+    def download(self, selector: str, folder: Path) -> Path:
+        """Click on a link that downloads a file; the file, once it is complete."""
+        before = set(folder.iterdir())
+        self.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+        self.click(selector)
+        deadline = time.monotonic() + ANSWER_S
+        while True:
+            new = [path for path in set(folder.iterdir()) - before if path.suffix != ".crdownload"]
+            if new:
+                return new[0]
+            assert time.monotonic() < deadline, "no file has come"
+            time.sleep(0.05)
+
+    def type(self, selector: str, text: str) -> None:
+        """Put text in place of what stands in a field, as a keyboard does."""
+        self.click(selector)
+        self.evaluate(f"document.querySelector({json.dumps(selector)}).select()")
+        self.call("Input.insertText", text=text)
+
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
         done = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         path.write_bytes(base64.b64decode(done["data"]))

@@ -20,10 +20,13 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tifffile
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import Image
 
@@ -46,6 +49,7 @@ SEM = {
     "rate": 10.0,
     "width": SIZE,
     "height": SIZE,
+    "bits": 16,
 }
 
 
@@ -87,7 +91,53 @@ def fits(page: Page) -> None:
     assert (wide, small) == (0, 0)
 
 
-def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
+def hover(page: Page, picture: str, fraction: float) -> None:
+    """Move the mouse over a picture, to a part of its width at half of its height."""
+    x, y, w, h = page.box(f"figure[data-picture={picture}] canvas")
+    page.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + fraction * w, y=y + 0.5 * h)
+
+
+def wait_cursor(page: Page, picture: str, fraction: float, expected_um: float) -> None:
+    """Wait until the cursor there has an x, um: a picture of what was asked for may be on its way."""
+    deadline, found = time.monotonic() + 20.0, None
+    while found is None or abs(float(found[1]) - expected_um) > 0.7:
+        assert time.monotonic() < deadline, page.text("#cursor")
+        hover(page, picture, fraction)
+        time.sleep(0.1)
+        form = r"x (-?[\d.]+), y -?[\d.]+ µm from the middle, ± [\d.]+"
+        found = re.fullmatch(form, page.text("#cursor"))
+
+
+def look_closer(page: Page, folder: Path) -> None:
+    """What is done with one picture: contrast, cursor, zoom, Move, and a file of it."""
+    folder.mkdir(exist_ok=True)
+    # Grey levels of 16 bit, of which the darkest and brightest half per cent are lost.
+    low, high, most = (float(number) for number in re.findall(r"[\d.]+", page.text("#levels")))
+    assert most == 65535 and 0 <= low < high <= most
+    page.evaluate(
+        "(() => { const s = document.querySelector('#contrast'); s.value = 'full';"
+        " s.dispatchEvent(new Event('change')); })()"
+    )
+    page.wait_for("document.querySelector('#levels').textContent === '0 to 65535 of 65535'")
+    # A field of 0.12 m / 4000 = 30 um; a pixel is 0.3 um.
+    wait_cursor(page, "corrected", 0.75, 7.5)
+    wait_cursor(page, "corrected", 0.5, 0.0)
+    for _ in range(2):
+        page.click("#zoom-in")
+    page.click("[data-tool=move]")
+    x, y, w, h = page.box("figure[data-picture=corrected] canvas")
+    # Dragged to the right by a quarter of what is shown, 30 / 2.25 um: the middle now shows what was left of it.
+    page.drag([(x + f * w, y + 0.5 * h) for f in (0.5, 0.6, 0.75)])
+    wait_cursor(page, "corrected", 0.5, -30 / 2.25 / 4)
+    page.click("[data-tool=ruler]")
+    page.click("#zoom-all")
+    with tifffile.TiffFile(page.download("#snap-corrected", folder)) as file:
+        assert file.asarray().dtype == np.uint16 and file.asarray().shape == (SIZE, SIZE)
+        told = file.ome_metadata or ""
+    assert "PhysicalSizeX" in told and "drift_x_m" in told and "calibrated" in told
+
+
+def test_the_live_page(peer: Peer, page: Page, calibration_file: Path, tmp_path: Path) -> None:
     raw = peer.node.get_publishers_info_by_topic
     with (
         running("virtual_sem", SEM),
@@ -133,6 +183,8 @@ def test_the_live_page(peer: Peer, page: Page, calibration_file: Path) -> None:
             # changes by a per cent or two; an end is placed to a pixel of the screen.
             assert float(found[1]) == pytest.approx(15.0, rel=0.05)
             assert "calibration" in page.text("#why")
+            if width == 1280:
+                look_closer(page, tmp_path / "files")
 
             press(page, "reset")
             page.wait_for("document.querySelector('#answer').className === 'ok'")
@@ -236,14 +288,37 @@ def test_the_calibration_panel(page: Page, tmp_path: Path) -> None:
         page.size(1280, 844)
         page.open(address)
         page.wait_for("!document.querySelector('#calibration').hidden")
-        press(page, "save")
-        page.wait_for("document.querySelector('#answer').textContent.includes('no calibration')")
-        for count in (1, 2, 3):
+        for action in ("save", "check"):
+            press(page, action)
+            page.wait_for("document.querySelector('#answer').className === 'error'")
+            page.wait_for(
+                "/no calibration|no usable view/.test(document.querySelector('#answer').textContent)"
+            )
+        # Nobody has added a view: these are the corners of the live picture.
+        page.wait_for("document.querySelector('#overlay img').naturalWidth === 320")
+        page.wait_for("/^\\d+ corners$/.test(document.querySelector('#corners').textContent)")
+        # A person is guided through the plan: the first view is the one that the microscope shows.
+        for field, value in (("low", "1000"), ("high", "3000"), ("target", "2")):
+            page.type(f"#goal-{field}", value)
+        press(page, "acquire")
+        page.wait_for(
+            "/^Please set 1000x anew, tilt to 0/.test(document.querySelector('#request').textContent)"
+        )
+        assert page.evaluate("document.querySelector('#goal-high').value") == "3000"
+        press(page, "add_view")
+        page.wait_for(
+            "/tilt to 20 degrees.*then press Add view/.test(document.querySelector('#request').textContent)"
+        )
+        assert "1 of 12 so far" in page.text("#acquisition-bars")
+        fits(page)
+        page.click("#acquisition [data-action=cancel]")
+        page.wait_for("document.querySelector('[data-action=acquire]').textContent === 'Go on'")
+        assert page.text("#request").startswith("stopped")
+        for count in (2, 3):
             press(page, "add_view")
             page.wait_for(
                 f"document.querySelector('#calibration-answer').textContent.includes('view {count} at')"
             )
-        page.wait_for("document.querySelector('#overlay img').naturalWidth === 320")
         shares = page.evaluate("[...document.querySelectorAll('#bars progress')].map(p => p.value)")
         # Three views of one magnification, which the grid fills: of nine magnifications, and five views.
         assert shares[0] > 0.9

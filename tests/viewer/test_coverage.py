@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import pytest
 
-from semcal_ros.viewer.coverage import describe_coverage, describe_run
+from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
 
 
 def test_bars_fill_with_the_views() -> None:
@@ -59,3 +59,26 @@ def test_a_running_calibration_has_a_bar() -> None:
     bar = describe_run({"stage": "joint", "fraction": "0.400"})
     assert bar is not None
     assert (bar.fraction, bar.text) == (0.4, "joint")
+
+
+def test_an_acquisition_is_described_before_and_while_it_runs() -> None:
+    assert describe_acquisition({"views": "5"}) is None
+    goal = {"lowest_magnification": "0", "highest_magnification": "0", "target": "0.001"}
+    ready = describe_acquisition({**goal, "microscope": ""})
+    assert ready is not None
+    assert (ready.state, ready.magnifications, ready.target) == ("ready", None, 1e-3)
+    assert ready.who.startswith("you set") and not ready.bars
+    goal |= {"lowest_magnification": "500", "highest_magnification": "10000"}
+    run = {"acquisition": "waiting", "request": "set 500x anew", "taken": "6", "planned": "24"}
+    run |= {"left_out": "2", "largest_sigma": "nan", "microscope": "virtual_sem"}
+    panel = describe_acquisition({**goal, **run})
+    assert panel is not None
+    assert (panel.state, panel.request) == ("waiting", "set 500x anew")
+    assert panel.who == "virtual_sem moves by itself" and panel.magnifications == (500.0, 10000.0)
+    views, certainty = panel.bars
+    assert (views.fraction, views.text) == (0.25, "6 of 24 so far, 2 left out")
+    assert (certainty.fraction, certainty.text) == (0.0, "not known yet; 0.1 % wanted")
+    later = describe_acquisition({**goal, **run, "largest_sigma": "0.004"})
+    assert later is not None
+    assert later.bars[1].fraction == pytest.approx(0.25)
+    assert later.bars[1].text == "0.4 %; 0.1 % wanted"

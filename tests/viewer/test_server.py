@@ -48,7 +48,7 @@ class Source:
 
     def __init__(self) -> None:
         self.pages: list[int] = []
-        self.acts: list[tuple[str, float | None]] = []
+        self.acts: list[tuple[str, float | tuple[float, ...] | None]] = []
         pictures: dict[str, NDArray[Any]] = {"raw": RAW, "corrected": RAW[::-1].copy()}
         self.view = View(1, 1_700_000_000 * 10**9, pictures, CAMERA, True, (2.0, 1.0))
 
@@ -65,7 +65,7 @@ class Source:
         at = describe_magnification(2000.0, (500.0, 8000.0))
         return Status("test", "live", at, (), explain([]), DriftPanel("none"), ("reset", "stop"))
 
-    def act(self, action: str, value: float | None) -> str:
+    def act(self, action: str, value: float | tuple[float, ...] | None) -> str:
         self.acts.append((action, value))
         if action == "stop":
             raise InvalidValueError("it will not stop", do="pull the plug")
@@ -166,6 +166,9 @@ def test_buttons_are_passed_on_and_refusals_come_back(server: PageServer, source
     assert not answers["stop"]["success"]
     assert "pull the plug" in answers["stop"]["text"]
     assert set(source.acts) == {("reset", None), ("stop", None)}
+    goal = {"type": "act", "action": "acquire", "value": [500, 1e4, 0.001]}
+    assert talk(server, [goal], 1)[0]["success"]
+    assert source.acts[-1] == ("acquire", (500.0, 10000.0, 0.001))
 
 
 @pytest.mark.parametrize(
@@ -173,6 +176,7 @@ def test_buttons_are_passed_on_and_refusals_come_back(server: PageServer, source
     [
         {"type": "act", "action": "move_stage"},
         {"type": "act"},
+        {"type": "act", "action": "acquire", "value": [500, "much"]},
         {"type": "wish", "zoom": "large"},
         {"type": "wish", "contrast": {"mode": "fixed", "low": 9, "high": 3}},
         {"type": "wish", "pictures": ["x"]},

@@ -143,8 +143,12 @@ function showCalibration(panel) {
   if (!panel) return;
   $("calibration-answer").textContent = panel.answer;
   $("calibration-answer").className = panel.level === "ok" ? "" : panel.level;
-  const bars = panel.running ? [...panel.bars, panel.running] : panel.bars;
-  fill($("bars"), bars, "div", (element, bar) => {
+  fillBars($("bars"), panel.running ? [...panel.bars, panel.running] : panel.bars);
+  setText($("corners"), panel.overlay_text);
+  showAcquisition(panel.acquisition);
+}
+function fillBars(parent, bars) {
+  fill(parent, bars, "div", (element, bar) => {
     element.className = "bar";
     if (!element.firstChild) element.innerHTML = "<div><span></span><span></span></div><progress max='1'></progress>";
     const [name, text] = element.querySelectorAll("span");
@@ -152,6 +156,36 @@ function showCalibration(panel) {
     const progress = element.querySelector("progress");
     progress.value = bar.fraction; progress.setAttribute("aria-label", bar.name);
   });
+}
+
+function showAcquisition(panel) {
+  $("acquisition").hidden = !panel;
+  const waiting = panel?.state === "waiting";
+  document.querySelector("[data-action=add_view]").classList.toggle("wanted", waiting);
+  if (!panel) return;
+  const under = waiting || panel.state === "running";
+  setText($("acquisition-who"), panel.who);
+  const request = { waiting: `Please ${panel.request}; then press Add view.`, running: panel.request, ready: "" }[panel.state]
+    ?? `${panel.state}: ${panel.request}`;
+  setText($("request"), request);
+  $("request").hidden = !request;
+  $("request").className = { waiting: "warn", failed: "error", stopped: "warn", done: "ok" }[panel.state] ?? "";
+  fillBars($("acquisition-bars"), panel.bars);
+  const button = document.querySelector("[data-action=acquire]");
+  setText(button, panel.state === "stopped" || panel.state === "failed" ? "Go on" : "Acquire");
+  if (under) button.disabled = true;
+  const goal = { "goal-low": panel.magnifications?.[0], "goal-high": panel.magnifications?.[1], "goal-target": panel.target && +(100 * panel.target).toPrecision(6) };
+  for (const [id, value] of Object.entries(goal)) {
+    const input = $(id);
+    input.disabled = under;
+    // What somebody has typed stays until it is used.
+    if (value && (under || !input.dataset.typed)) { input.value = value; delete input.dataset.typed; }
+  }
+}
+// What is to be acquired; nothing where a field is empty: the node then takes its own, or says what is missing.
+function goal() {
+  const [low, high, percent] = ["goal-low", "goal-high", "goal-target"].map((id) => $(id).valueAsNumber);
+  return [low, high, percent].every(Number.isFinite) ? [low, high, percent / 100] : null;
 }
 
 function showTimeline(timeline) {
@@ -384,9 +418,10 @@ for (const button of all("[data-tool]")) {
 for (const button of all("[data-action]")) {
   button.addEventListener("click", () => {
     answer(`${button.textContent} …`, "");
-    send({ type: "act", action: button.dataset.action });
+    send({ type: "act", action: button.dataset.action, ...(button.dataset.action === "acquire" && { value: goal() }) });
   });
 }
+for (const id of ["goal-low", "goal-high", "goal-target"]) $(id).addEventListener("input", () => { $(id).dataset.typed = "yes"; });
 $("zoom-in").addEventListener("click", () => setZoom(state.zoom * 1.5, state.centre));
 $("zoom-out").addEventListener("click", () => setZoom(state.zoom / 1.5, state.centre));
 $("zoom-all").addEventListener("click", () => { state.centre = [0.5, 0.5]; setZoom(1); });
