@@ -168,7 +168,7 @@ class Viewer(SemNode):
         # Clients, and when they were made.
         self._callers: dict[str, tuple[Any, float]] = {}
         self._wanted: list[tuple[str, Any, Any, Future[Any]]] = []
-        self._graph_s = self._status_s = 0.0
+        self._graph_s = self._status_s = self._taken_s = 0.0
         self._magnification: float | None = None
         self.calibration = CalibrationInput(
             self.config, self.parameters, self.endpoints, self.reporter
@@ -324,13 +324,15 @@ class Viewer(SemNode):
     def _poll(self) -> None:
         for subscription in self._values:
             subscription.take_waiting()
-        try:
-            frame = self._images.take()
-            if frame is not None:
-                self._show(frame)
-        except NODE_ERRORS as error:
-            self.reporter.reject(error)
         now_s = time.monotonic()
+        if now_s - self._taken_s >= self.server.picture_interval_s - 0.5 * _POLL_S:
+            self._taken_s = now_s
+            try:
+                frame = self._images.take()
+                if frame is not None:
+                    self._show(frame)
+            except NODE_ERRORS as error:
+                self.reporter.reject(error)
         self._look_for_corners(now_s)
         if now_s - self._graph_s > _GRAPH_S:
             self._graph_s = now_s

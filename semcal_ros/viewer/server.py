@@ -54,11 +54,15 @@ LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names of this computer by which only its own users come in; no token is asked of them."""
 
 _PAGE = Path(__file__).parent / "page"
-# A person sees no more; the stream needs the processor.
+# A person sees no more; the stream needs the processor. So pictures are made in this part of the time at most: where
+# they are large, or where others want the processor and the stream is late, fewer are sent, down to two a second. At
+# 512 x 512 that is seven a second on processors with time to spare.
 _PICTURE_INTERVAL_S = 0.1
+_PICTURE_SHARE = 0.025
+_LONGEST_INTERVAL_S = 0.5
 _STATUS_INTERVAL_S = 0.25
 # How often a connection looks for something new: well below the interval of the pictures.
-_POLL_S = 0.02
+_POLL_S = 0.04
 # A browser that has not shown a picture for so long has lost it, or sleeps; it gets another one.
 _PATIENCE_S = 3.0
 # Messages of the page are a few hundred bytes.
@@ -114,6 +118,7 @@ class PageServer:
         # One picture at a time: pages must not take a second core from the stream.
         self.pictures = ThreadPoolExecutor(1, "view-pictures")
         self.actions = ThreadPoolExecutor(2, "view-actions")
+        self._encoding_s = 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ended: asyncio.Event | None = None
         self._thread = threading.Thread(target=self._run, name="view-server", daemon=True)
@@ -187,6 +192,16 @@ class PageServer:
     def cookie(self) -> str:
         """Name of the cookie that holds the token; cookies are shared by all ports of a host."""
         return f"semcal_view_{self.port}"
+
+    @property
+    def picture_interval_s(self) -> float:
+        """Time between two pictures of a page, s."""
+        return min(max(_PICTURE_INTERVAL_S, self._encoding_s / _PICTURE_SHARE), _LONGEST_INTERVAL_S)
+
+    def note_encoding(self, seconds: float) -> None:
+        """Take note of how long a picture has taken, the wait for the processor included."""
+        # Of the last few: one that was held up by chance must not count for seconds.
+        self._encoding_s += 0.25 * (seconds - self._encoding_s)
 
     def open_page(self, page: _Live) -> None:
         """Take note of a page."""
@@ -354,7 +369,7 @@ class _Live(websocket.WebSocketHandler):
                 if now_s - status_s >= _STATUS_INTERVAL_S:
                     status_s = now_s
                     await self._send_status()
-                if now_s - picture_s >= _PICTURE_INTERVAL_S and self._may_send(now_s):
+                if now_s - picture_s >= self._server.picture_interval_s and self._may_send(now_s):
                     picture_s = now_s
                     await self._send_picture()
                 await asyncio.sleep(_POLL_S)
@@ -384,7 +399,9 @@ class _Live(websocket.WebSocketHandler):
         age_s: float | None = time.time() - view.stamp_ns * 1e-9
         if age_s is not None and abs(age_s) > _OTHER_CLOCK_S:
             age_s = None
+        started_s = time.monotonic()
         data = await self._in_background(encode_view, view, self._wish, age_s=age_s)
+        self._server.note_encoding(time.monotonic() - started_s)
         self._waits_since_s = time.monotonic()
         await self.write_message(data, binary=True)
 
