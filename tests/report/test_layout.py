@@ -93,7 +93,12 @@ def faults(figure: Figure) -> list[str]:
         frame = legend.get_window_extent(renderer)
         for line in axes.lines:
             at = line.get_transform().transform(line.get_xydata())
-            if any(frame.contains(*point) for point in at[np.isfinite(at).all(axis=1)]):
+            at = at[np.isfinite(at).all(axis=1)]
+            if line.get_linestyle() != "None" and len(at) > 1:
+                # Also where a line runs between its points.
+                steps = np.linspace(0.0, 1.0, 20)[:, None, None]
+                at = (at[:-1] + steps * np.diff(at, axis=0)).reshape(-1, 2)
+            if any(frame.contains(*point) for point in at):
                 wrong.append(f"the legend over {line.get_label()!r}")
     for (one, first), (other, second) in combinations(boxes, 2):
         shared = Bbox.intersection(first, second)
@@ -118,6 +123,8 @@ def test_a_broken_layout_is_seen() -> None:
     assert any("over 'magnification'" in f or "'magnification' over" in f for f in faults(figure))
     axes.plot([0.0, 1.0], [0.0, 1.0], label="a line")
     axes.legend(loc="upper right")
+    # Neither end of the line lies below the legend.
+    axes.set(xlim=(0.0, 0.9), ylim=(0.0, 0.9))
     assert "the legend over 'a line'" in faults(figure)
 
 

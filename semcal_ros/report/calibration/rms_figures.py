@@ -86,8 +86,8 @@ def plot_rms(
     set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
     shown = np.concatenate([values, held, uncorrected, noise, beside])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    set_log_axis_y(axes, 0.5 * float(shown.min()), 8.0 * float(shown.max()))
-    add_legend(axes, loc="upper center", ncols=2)
+    set_log_axis_y(axes, 0.6 * float(shown.min()), 1.7 * float(shown.max()))
+    add_legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
     figure.align_ylabels([axes, lengths])
     return encode_figure(
         figure,

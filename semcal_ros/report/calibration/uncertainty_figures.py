@@ -244,12 +244,13 @@ def _plot_curves(
     positive = positive[np.isfinite(positive) & (positive > 0.0)]
     set_magnification_axis(lengths, g[0], g[-1])
     if positive.size:
-        set_log_axis_y(axes, 0.6 * float(positive.min()), 8.0 * float(positive.max()))
+        set_log_axis_y(axes, 0.6 * float(positive.min()), 1.7 * float(positive.max()))
         in_nm = np.concatenate([values * pixel_nm for values in shown])
         in_nm = in_nm[np.isfinite(in_nm) & (in_nm > 0.0)]
         set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
     mark_magnifications(lengths, model)
-    add_legend(axes, loc="upper center", ncols=1)
+    # Above: over several decades no place within is free of curves.
+    add_legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=1, borderaxespad=0.0)
     figure.align_ylabels([axes, lengths])
     worst, left = float(np.nanmax(shape)), float(np.nanmax(aligned))
     return encode_figure(
