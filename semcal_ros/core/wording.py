@@ -22,7 +22,16 @@ import unicodedata
 from collections.abc import Callable, Iterable
 from typing import SupportsIndex
 
-__all__ = ["counted", "did_you_mean", "group_by_kind", "nearest_name", "omit_numbers", "printable"]
+__all__ = [
+    "counted",
+    "did_you_mean",
+    "group_by_kind",
+    "in_nm",
+    "nearest_name",
+    "omit_numbers",
+    "printable",
+    "rounded_magnification",
+]
 
 _NUMBER = re.compile(r"-?\d[\d.]*")
 
@@ -39,6 +48,17 @@ def counted(count: SupportsIndex, one: str, many: str = "") -> str:
         ``frames are``); several get an s if nothing is given.
     """
     return f"{count} {one if count == 1 else many or one + 's'}"
+
+
+def rounded_magnification(g: float) -> str:
+    """Return a magnification without decimals, such as ``5250x``; those of photographs with three digits."""
+    return f"{g:.0f}x" if g >= 10.0 else f"{g:.3g}x"
+
+
+def in_nm(length_m: float) -> str:
+    """Return a length to two digits in nm, without an exponent; those of photographs in um."""
+    factor, unit = (1e9, "nm") if abs(length_m) < 1e-4 else (1e6, "um")
+    return f"{float(f'{factor * length_m:.2g}'):.10g} {unit}"
 
 
 def omit_numbers(text: str) -> str:

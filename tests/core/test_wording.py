@@ -18,8 +18,24 @@ from __future__ import annotations
 
 import re
 
-from semcal_ros.core.wording import counted, did_you_mean, group_by_kind, omit_numbers
+from semcal_ros.core.wording import (
+    counted,
+    did_you_mean,
+    group_by_kind,
+    in_nm,
+    omit_numbers,
+    rounded_magnification,
+)
 from tests.helpers.project import ROOT
+
+
+def test_sizes_of_photographs_have_no_exponent_either() -> None:
+    assert [rounded_magnification(g) for g in (5250.4, 100.0, 0.361969)] == [
+        "5250x",
+        "100x",
+        "0.362x",
+    ]
+    assert [in_nm(m) for m in (0.92e-6, 7.4e-5, 7.446e-3)] == ["920 nm", "74000 nm", "7400 um"]
 
 
 def test_one_thing_is_not_several() -> None:

@@ -24,6 +24,7 @@ import numpy as np
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import in_nm, rounded_magnification
 
 __all__ = ["Finding", "rank_findings"]
 
@@ -69,8 +70,7 @@ class Finding:
         cost_nm, g = self.cost(model)
         if not math.isfinite(cost_nm):
             return self.text
-        # Two digits, and no exponent.
-        return f"{self.text} (costs {float(f'{cost_nm:.2g}'):.6g} nm at {g:.0f}x)"
+        return f"{self.text} (costs {in_nm(1e-9 * cost_nm)} at {rounded_magnification(g)})"
 
 
 def rank_findings(findings: Iterable[Finding], model: CalibrationModel) -> tuple[Finding, ...]:

@@ -25,6 +25,7 @@ from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, PlannedVisit, pl
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.core.wording import rounded_magnification
 
 __all__ = ["Verdict", "judge_calibration"]
 
@@ -68,18 +69,20 @@ class Verdict:
 
     def describe(self) -> str:
         """Return how well nm per pixel is known, over which range, and under which conditions."""
-        sigma_nm, size_nm = 1e9 * self.pixel_sigma_m, 1e9 * self.pixel_size_m
+        # Pixels of photographs of a board are some tenths of a mm.
+        factor, unit = (1e9, "nm") if self.pixel_size_m < 1e-4 else (1e6, "um")
+        sigma, size = factor * self.pixel_sigma_m, factor * self.pixel_size_m
         digits = 2
-        if 0.0 < sigma_nm < math.inf:
-            digits = min(max(1 - math.floor(math.log10(sigma_nm)), 0), 6)
+        if 0.0 < sigma < math.inf:
+            digits = min(max(1 - math.floor(math.log10(sigma)), 0), 6)
         span = (
             f"from {self.low:g}x to {self.high:g}x" if self.high > self.low else f"at {self.low:g}x"
         )
         best = f"{100.0 * self.largest:.2g} % (1-sigma)" + (
             " or better" if self.high > self.low else ""
         )
-        where = f", the least at {self.at:.0f}x" if self.high > self.low else ""
-        known = f"{size_nm:.{digits}f} +- {sigma_nm:.{digits}f} nm"
+        where = f", the least at {rounded_magnification(self.at)}" if self.high > self.low else ""
+        known = f"{size:.{digits}f} +- {sigma:.{digits}f} {unit}"
         under = f" ({self.conditions})" if self.conditions else ""
         return f"nm per px is known to {best} {span}{where}: {known}{under}"
 
@@ -89,8 +92,9 @@ class Verdict:
         if visit is not None:
             tilts = " and ".join(f"{math.degrees(t):.0f}" for t in PLANNED_TILTS_RAD if t > 0.0)
             return (
-                f"to improve it most: views of the {1e6 * visit.square_m:g} um squares at {visit.magnification:.0f}x, "
-                f"flat and tilted by {tilts} degrees, bring it to {100.0 * visit.largest:.2g} % (see semcal plan)"
+                f"to improve it most: views of the {1e6 * visit.square_m:g} um squares at "
+                f"{rounded_magnification(visit.magnification)}, flat and tilted by {tilts} degrees, "
+                f"bring it to {100.0 * visit.largest:.2g} % (see semcal plan)"
             )
         if not math.isfinite(self.floor):
             return ""

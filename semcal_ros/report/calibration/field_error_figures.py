@@ -180,7 +180,10 @@ def _format_length(camera: ScanCamera, px: float) -> str:
 def _add_length_axis(axes: Axes, camera: ScanCamera) -> None:
     """Add an axis at the top that has the columns as lengths on the specimen."""
     pixel_m = camera.pixel_size_m[0]
-    unit, size_m = ("µm", 1e-6) if pixel_m * camera.width >= 1e-6 else ("nm", 1e-9)
+    width_m = pixel_m * camera.width
+    unit, size_m = ("µm", 1e-6) if width_m >= 1e-6 else ("nm", 1e-9)
+    if width_m >= 1e-2:
+        unit, size_m = "mm", 1e-3
     factor = pixel_m / size_m
     top = axes.secondary_xaxis(
         "top", functions=(partial(np.multiply, factor), partial(np.multiply, 1.0 / factor))

@@ -21,6 +21,7 @@ import shlex
 from pathlib import PurePath
 
 from semcal_ros.core.calibration.verdict import Verdict
+from semcal_ros.core.wording import rounded_magnification
 
 __all__ = ["suggest_commands"]
 
@@ -56,7 +57,7 @@ def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]
     percent = 100.0 * visit.largest
     step = 10.0 ** (math.floor(math.log10(percent)) - 1)
     target = f"{math.ceil(percent / step) * step:.2g}%"
-    views = f"views_{visit.magnification:.0f}x"
+    views = f"views_{rounded_magnification(visit.magnification)}"
     renewed = str(path.with_name(f"{path.stem}_improved{path.suffix}"))
     return [
         (

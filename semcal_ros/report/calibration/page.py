@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.wording import in_nm
 from semcal_ros.report.calibration.blink import choose_blink
 from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
@@ -195,7 +196,7 @@ def write_calibration_report(
 def _sentence(text: str) -> str:
     """What the terminal says, as a page says it; Nm would be newton metres."""
     text = text.replace("nm per px is known", "The scale (nm per px) is known", 1)
-    text = re.sub(r"(\d)x\b", r"\1×", text.replace("+-", "±").replace(" um ", " µm "))
+    text = re.sub(r"(\d)x\b", r"\1×", re.sub(r" um\b", " µm", text.replace("+-", "±")))
     return text[:1].upper() + text[1:] + "."
 
 
@@ -269,5 +270,8 @@ def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:
     ]
     if not lengths:
         return "no length known"
-    rounded = (f"{float(f'{1e9 * x:.2g}'):g}" for x in (min(lengths), max(lengths)))
-    return " to ".join(dict.fromkeys(rounded)) + " nm"
+    least, largest = (in_nm(x).replace(" um", " µm") for x in (min(lengths), max(lengths)))
+    # The unit once, if it is that of both.
+    if least.partition(" ")[2] == largest.partition(" ")[2]:
+        least = least.partition(" ")[0]
+    return largest if largest.startswith(f"{least} ") else f"{least} to {largest}"

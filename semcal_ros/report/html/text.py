@@ -49,8 +49,10 @@ def format_with_sigma(value: float, sigma: float) -> str:
 
 
 def format_length(length_m: float, sigma_m: float | None = None) -> str:
-    """Format a length in nm or µm, with two digits of its 1-sigma if it is given."""
+    """Format a length in nm or µm, with two digits of its 1-sigma if it is given; those of photographs in mm."""
     unit, factor = ("µm", 1e6) if abs(length_m) >= 1e-6 else ("nm", 1e9)
+    if abs(length_m) >= 1e-2:
+        unit, factor = "mm", 1e3
     value = factor * length_m
     if sigma_m is None or not (np.isfinite(sigma_m) and sigma_m > 0.0):
         return f"{value:#.4g}".rstrip(".") + f" {unit}"
