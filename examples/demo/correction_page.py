@@ -122,6 +122,7 @@ def write_correction_report(
             for row in rows
         ],
         "magnifications": [f"{g:g}×" for g, _, _ in rows[0].at],
+        "papers": any(row.paper_range_px for row in rows),
         "chart": [_plot_errors(rows)],
         "notes": [remove_control_characters(note) for note in notes],
         "images": encode_pictures(images),
@@ -177,7 +178,7 @@ def _format_nm(length_m: float) -> str:
 
 
 def _plot_errors(rows: Sequence[DemoRow]) -> Picture:
-    """Measured error of each stage as a bar on a logarithmic axis, the paper's as marks."""
+    """Measured error of each stage as a bar on a logarithmic axis, the paper's as marks if they are given."""
     figure = create_figure(4.2, 1.2 + 0.55 * len(rows))
     axes = figure.add_subplot()
     style_axes(axes, xlabel="RMS error (px, logarithmic)", ylabel="")
@@ -203,10 +204,13 @@ def _plot_errors(rows: Sequence[DemoRow]) -> Picture:
     # numbers.
     axes.set_yticks(places, [f"{k + 1}" for k in places], color=INK)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    # Above the plot, where no bar or mark can be.
-    add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
+    if any(papers):
+        # Above the plot, where no bar or mark can be.
+        add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
     stages = "; ".join(
-        f"{row.label}: {format_px(row.rms_px)}, paper {row.paper_text}" for row in rows
+        f"{row.label}: {format_px(row.rms_px)}"
+        + (f", paper {row.paper_text}" if row.paper_range_px else "")
+        for row in rows
     )
     return encode_figure(
         figure,

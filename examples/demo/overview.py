@@ -24,6 +24,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from semcal_ros import Calibration
+from semcal_ros.report.html.style import set_magnification_axis
 
 # Of both images, px: small enough to see single squares.
 CROP = slice(150, 406)
@@ -78,15 +79,12 @@ def _scale(axis, cal: Calibration, magnifications) -> None:
     nominal = np.array([cal.nominal_px_per_m(float(g)) for g in grid])
     ratio = nominal / np.array([c.m for c in cameras])
     sigma = ratio * np.array([np.sqrt(c.covariance[0, 0]) / c.m for c in cameras])
-    axis.plot(grid, ratio, color="C0", label="calibrated")
+    axis.plot(grid, ratio, color="C0")
     axis.fill_between(grid, ratio - 2 * sigma, ratio + 2 * sigma, alpha=0.25, color="C0")
     known = [cal.nominal_px_per_m(g) / cal.at(g).m for g in cal.magnifications]
-    axis.plot(
-        cal.magnifications, known, "o", ms=4, color="C0", label="magnifications of the recording"
-    )
+    axis.plot(cal.magnifications, known, "o", ms=4, color="C0")
     for g in magnifications:
         axis.axvline(g, color="C3", lw=0.8, ls=":")
-    axis.set_xscale("log")
-    axis.set_xlabel("magnification (dotted: replayed)", fontsize=8)
+    set_magnification_axis(axis, float(grid[0]), float(grid[-1]))
+    axis.set_xlabel("magnification (dots: recorded, dotted: replayed)", fontsize=8)
     axis.set_title("nm per pixel over its nominal value\nwith its 2-sigma interval", fontsize=9)
-    axis.legend(fontsize=7)

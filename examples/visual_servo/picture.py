@@ -58,9 +58,12 @@ def picture(path: Path, runs: Sequence[Run]) -> None:
                 xycoords=("data", "axes fraction"),
                 xytext=(2, -2),
                 textcoords="offset points",
-                fontsize=6,
+                fontsize=7,
                 rotation=90,
                 va="top",
             )
-    axes[2].legend(fontsize=7, loc="lower left")
+    # Below: errors over five decades leave no place within.
+    figure.legend(
+        *axes[2].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3
+    )
     figure.savefig(path, dpi=88)

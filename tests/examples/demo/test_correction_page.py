@@ -42,6 +42,9 @@ def test_table_has_ours_beside_the_papers(tmp_path: Path) -> None:
     cells = re.findall(r"<td>(.*?)</td>", text)
     assert cells == ["6.810 px", "7 px", "2.940 px", "3 px", "0.112 px", "0.9 to 1.45 px"]
     assert [p.name for p in tmp_path.iterdir()] == ["demo.html"]
+    alone = page_of(tmp_path, [DemoRow("raw", 6.81)], [])
+    assert re.findall(r"<td>(.*?)</td>", alone) == ["6.810 px"]
+    assert "aper" not in alone
 
 
 @pytest.mark.parametrize(
