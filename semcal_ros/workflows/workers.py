@@ -17,6 +17,12 @@
 Work is shared in the order of its items, and only a few of them are in memory at a time, however
 many there are. What comes back is the same to the last bit wherever it was computed, as long as
 the versions are the same, which is checked, and the processors round alike.
+
+On a cluster the work goes to the executor of `distributed`, not to joblib's own Dask backend. That one
+places every argument of more than 1 kB on a worker before the task that needs it, so that the images on a
+worker that is killed are lost and the command ends with a ``FutureCancelledError`` (joblib 1.5, a worker of two
+killed after 15 of 40 tasks; with the executor all 40 results came). Nor can it be told how many bytes may
+be under way.
 """
 
 from __future__ import annotations

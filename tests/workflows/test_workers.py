@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Work shared with a Dask cluster: the same bits, workers that die, clusters that do not fit."""
+"""Work shared with a Dask cluster: the same bits, workers that die, clusters that do not fit.
+
+Recordings are small, and so are the parts into which their work is divided: each command sends several.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,30 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 
 import semcal_ros
-from semcal_ros import rectify, stack
-from semcal_ros.applications.reconstruction.patches import match_points
+from semcal_ros import calibrate, reconstruct, rectify, stack
+from semcal_ros.applications.reconstruction import patches as patches_module
+from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.synthetic import Drift, drift_plan, preset
+from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.synthetic import Detector, Drift, calibration_plan, drift_plan, preset
+from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
 from semcal_ros.workflows import stack as stack_module
 from semcal_ros.workflows import workers as module
+from semcal_ros.workflows.evaluate import evaluate
 from semcal_ros.workflows.find_grid import find_views
-from semcal_ros.workflows.workers import count_bytes, open_workers
+from semcal_ros.workflows.workers import Workers, count_bytes, open_workers
 from tests.helpers.corner_boards import Board
 from tests.helpers.node_scenes import make_calibration
+from tests.helpers.semcal_runs import run
 
 G, SIZE, COUNT = 20000.0, 96, 6
 PLAN = drift_plan(
@@ -64,13 +74,6 @@ def frames() -> list[tuple[np.ndarray, float, float]]:
 
 def add(a: int, b: int) -> int:
     return a + b
-
-
-def kill_the_first_worker(mark: Path, value: float) -> float:
-    if not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return value / 3.0
 
 
 def refuse(value: int) -> int:
@@ -129,16 +132,6 @@ def test_arrays_are_counted_wherever_they_are():
     assert count_bytes([array, ("x", [array]), 5]) == 2 * array.nbytes
 
 
-def test_a_worker_killed_in_the_middle_is_survived(cluster, tmp_path):
-    mark = tmp_path / "killed"
-    with open_workers(cluster) as workers:
-        results = list(
-            workers.starmap(kill_the_first_worker, ((mark, float(k)) for k in range(20)))
-        )
-    assert mark.exists()
-    assert results == [k / 3.0 for k in range(20)]
-
-
 def test_an_error_of_the_work_is_raised_here(cluster):
     with open_workers(cluster) as workers, pytest.raises(InvalidValueError, match="no 7"):
         list(workers.starmap(refuse, [(7,)]))
@@ -163,6 +156,89 @@ def test_rectified_frames_are_the_same_to_the_last_bit(cluster, frames):
         np.testing.assert_array_equal(a.image, b.image)
 
 
+def kill_once(mark: Path, number: int, function: Any, *item: Any) -> Any:
+    """What a worker does, but the first one that comes to the third item dies over it."""
+    if number == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return function(*item)
+
+
+def test_a_command_whose_worker_is_killed_gives_the_same_pictures(
+    cluster, frames, tmp_path, monkeypatch
+):
+    mark, calibration = tmp_path / "killed", tmp_path / "cal.yaml"
+    write_simulated(tmp_path / "bag", PLAN.frames, [image for image, _, _ in frames], {})
+    make_calibration().save(calibration)
+    command = ("rectify", tmp_path / "bag", "--calibration", calibration, "--config", "virtual_sem")
+    assert run(*command, "-o", tmp_path / "here.tif") == 0
+
+    def with_a_death(self: Workers, function: Any, items: Any) -> Iterator[Any]:
+        numbered = ((mark, k, function, *item) for k, item in enumerate(items))
+        return share(self, kill_once, numbered)
+
+    share = Workers.starmap
+    monkeypatch.setattr(Workers, "starmap", with_a_death)
+    assert run(*command, "-o", tmp_path / "there.tif", "--dask", cluster) == 0
+    assert mark.exists()
+    here, there = (tifffile.imread(tmp_path / name) for name in ("here.tif", "there.tif"))
+    assert here.shape == (COUNT, SIZE, SIZE)
+    np.testing.assert_array_equal(here, there)
+
+
+def test_a_calibration_and_its_judgement_are_the_same_to_the_last_bit(cluster):
+    plan = calibration_plan(
+        preset("jsm820").with_image_size(192, 192), magnifications=(400.0, 2500.0), views=3
+    )
+    views = [(plan.render(k), frame.magnification) for k, frame in enumerate(plan.frames)]
+    here, there = (calibrate(views, method="discrete", dask=address) for address in (None, cluster))
+    assert (
+        replace(here, provenance=Provenance()).dumps()
+        == replace(there, provenance=Provenance()).dumps()
+    )
+    assert evaluate(here, views) == evaluate(here, views, dask=cluster)
+
+
+def test_a_ball_is_the_same_to_the_last_bit(cluster, monkeypatch):
+    monkeypatch.setattr(patches_module, "_POINTS_AT_ONCE", 16)
+    microscope = ball_microscope("ideal", width=512, height=192)
+    plan = ball_plan(
+        microscope,
+        frames=16,
+        interval_s=5.0,
+        magnifications=(36000.0,),
+        motion=Turning(
+            80.0,
+            rolls=1.0,
+            yaws=1.0,
+            roll_rad=0.3,
+            travel_m=(1e-7, 5e-8, 0.0),
+            centre_m=(-2e-7, 0.0, 0.0),
+        ),
+        detector=Detector(electrons=400.0),
+    )
+    images = [(plan.render(k), f.magnification, f.start_time_s) for k, f in enumerate(plan.frames)]
+    true = {"scale": 1.0, "aspect": 1.0, "px": 255.5, "py": 95.5, "ex": 255.5, "ey": 95.5}
+    functions = {
+        name: replace(function, coefficients=np.array([true.get(name, 0.0)]))
+        for name, function in make_calibration().functions.items()
+    }
+    calibration = replace(
+        make_calibration(),
+        functions=functions,
+        covariance=1e-8 * np.eye(len(functions)),
+        image_width=512,
+        image_height=192,
+    )
+    here, there = (
+        reconstruct(images, calibration=calibration, spacing_px=10.0, dask=address)
+        for address in (None, cluster)
+    )
+    assert here.structure.passes > 1
+    np.testing.assert_array_equal(here.structure.points_m, there.structure.points_m)
+    assert here.summary() == there.summary()
+
+
 def test_corners_are_the_same_to_the_last_bit(cluster):
     rng = np.random.default_rng(1)
     boards = [Board(24.0, turn_deg=8.0, width=128, height=128), Board(20.0, width=128, height=128)]
@@ -177,19 +253,6 @@ def test_corners_are_the_same_to_the_last_bit(cluster):
         assert a.name == b.name and b.image is None
         np.testing.assert_array_equal(a.detection.xy, b.detection.xy)
         np.testing.assert_array_equal(a.detection.covariance_px2, b.detection.covariance_px2)
-
-
-def test_patches_are_the_same_to_the_last_bit(cluster):
-    rng = np.random.default_rng(2)
-    scene = rng.normal(size=(8, 81))
-    patches = np.repeat(scene[None], 6, axis=0) + 0.2 * rng.normal(size=(6, 8, 81))
-    seen = rng.random((6, 8)) < 0.8
-    parts = [(patches[:, [k]], seen[:, [k]], 4) for k in range(8)]
-    with open_workers(cluster) as workers:
-        there = list(workers.starmap(match_points, parts))
-    for a, b in zip(there, parts, strict=True):
-        for x, y in zip(a, match_points(*b), strict=True):
-            np.testing.assert_array_equal(x, y)
 
 
 def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
