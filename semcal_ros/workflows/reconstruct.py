@@ -315,7 +315,7 @@ def _list_doubts(structure: Structure, timed: bool) -> list[str]:
         notes.append("the adjustment did not converge")
     if not structure.converged:
         notes.append(
-            f"measuring did not converge in {structure.passes} passes: points still moved by more "
-            "than half of their 1-sigma"
+            f"measuring did not converge in {structure.passes} passes: the surface still moved by more "
+            "than half of its 1-sigma"
         )
     return notes

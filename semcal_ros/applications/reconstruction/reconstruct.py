@@ -65,7 +65,9 @@ class StructureSettings:
     most_passes
         Largest number of times that patches are measured and adjusted.
     converged_sigma
-        The passes end when one moves the points by less than this many of their 1-sigma (RMS).
+        The passes end when one moves the points along their normals by less than this many of their 1-sigma (RMS).
+        Along the surface they may creep on: each pass puts a point where its texture is on average, and takes
+        the texture anew from there.
     least_track
         Least number of keyframes in which a feature was followed.
     least_views
@@ -122,7 +124,8 @@ class Structure:
     patch_sigma_m
         Sigma of the window in which a patch is compared, m: closer points share pixels and noise.
     passes, converged
-        Number of passes, and whether the last one moved the points by less than ``converged_sigma``.
+        Number of passes, and whether the last one moved the points along their normals by less than
+        ``converged_sigma``.
     """
 
     points_m: Array
@@ -299,15 +302,17 @@ class _Refinement:
             self.keyframes, self.log_greys, self.scan, posed, self.settings.patches, self.starmap
         )
         self._prune(self.settings.least_views)
+        adjusted = self.ids
         self._adjust()
         assert self.adjusted is not None
         rigid = self._find_rigid_points()
         self.seen = self.seen.select((self.adjusted.weights > 0.25) & rigid[self.seen.point])
         self._prune(self.settings.least_views, worst_px=self.settings.worst_sigma_px)
         self.passes += 1
-        self.converged = self._measure_change_in_sigma(before[np.isin(ids, self.ids)]) < (
-            self.settings.converged_sigma
-        )
+        kept = np.isin(ids, self.ids)
+        covariance = self.adjusted.point_covariance_m2[np.isin(adjusted, self.ids)]
+        change = self._measure_change_in_sigma(before[kept], normals[kept], covariance)
+        self.converged = change < self.settings.converged_sigma
 
     def _find_rigid_points(self) -> Mask:
         """Find the points that move with the others.
@@ -324,13 +329,13 @@ class _Refinement:
         usual = np.median(mean[count > 0])
         return np.asarray(mean <= _LARGEST_MISFIT * usual, dtype=bool)
 
-    def _measure_change_in_sigma(self, before: Array) -> float:
-        """Return the RMS change of the points over their RMS 1-sigma, after a rigid alignment."""
-        assert self.adjusted is not None
-        centred = self.points - self.points.mean(axis=0), before - before.mean(axis=0)
-        _, distance = Rotation.align_vectors(*centred)
-        own = np.trace(self.adjusted.point_covariance_m2, axis1=1, axis2=2)
-        return float(distance / np.sqrt(len(before) * np.mean(own)))
+    def _measure_change_in_sigma(self, before: Array, normals: Array, covariance: Array) -> float:
+        """Return the RMS change along the normals over the RMS 1-sigma there, after a rigid alignment."""
+        old, new = before - before.mean(axis=0), self.points - self.points.mean(axis=0)
+        turn, _ = Rotation.align_vectors(old, new)
+        change = np.sum(normals * (turn.apply(new) - old), axis=1)
+        variance = np.einsum("pi,pij,pj->p", normals, covariance, normals)
+        return float(np.sqrt(np.mean(change**2) / np.mean(variance)))
 
     def _adjust(self, tolerance: float = 1e-4) -> None:
         self.adjusted = adjust(
