@@ -208,9 +208,9 @@ def _find_chess(
         )
     if isinstance(best, CellShape):
         return best
-    corners, filled = best
+    corners, filled, is_chess = best
     chess = _judge(corners, filled, size, "chess")
-    if isinstance(chess, Rejection):
+    if isinstance(chess, Rejection) or is_chess:
         return chess
     maps = fit_local_maps(chess.ij, chess.ij, chess.xy, leave_out_self=False)
     shapes = _shapes_of(scaled, Lattice(chess.ij, chess.xy, maps.axes))
@@ -309,13 +309,14 @@ def _judge(
 
 def _best_corners(
     image: Image, size: tuple[int, int]
-) -> tuple[RefinedCorners, float] | CellShape | None:
-    """Find the best corners over all scales, and the part of the image that they cover.
+) -> tuple[RefinedCorners, float, bool] | CellShape | None:
+    """Find the best corners over all scales, the part of the image that they cover, and whether its cells were found
+    to be those of a chess board already.
 
     If a lattice fills the image and has clearly the cells of another grid, return their shape.
     """
     candidates: list[tuple[float, Lattice]] = []
-    best: tuple[RefinedCorners, float] | None = None
+    best: tuple[RefinedCorners, float, bool] | None = None
     for scale in SCALES_PX:
         lattice = grow_best_lattice(find_saddles(image, scale), size)
         if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
@@ -328,22 +329,31 @@ def _best_corners(
         clear = shapes is not None and shapes.best.misfit < CLEAR_MISFIT
         if shapes is not None and clear and not shapes.allows("chess"):
             return shapes.best
-        best = _better(best, refine_lattice(image, lattice), filled)
+        # Corners that are refined show the cells more clearly still.
+        is_chess = (
+            shapes is not None
+            and shapes.allows("chess")
+            and shapes.chess.misfit <= CHESS_MISFIT_MAX
+        )
+        best = _better(best, refine_lattice(image, lattice), filled, is_chess)
         if best is not None and best[0].quality > CONVINCING:
             return best
     for filled, lattice in candidates:
-        best = _better(best, refine_lattice(image, lattice), filled)
+        best = _better(best, refine_lattice(image, lattice), filled, False)
     return best
 
 
 def _better(
-    best: tuple[RefinedCorners, float] | None, other: RefinedCorners | None, filled: float
-) -> tuple[RefinedCorners, float] | None:
+    best: tuple[RefinedCorners, float, bool] | None,
+    other: RefinedCorners | None,
+    filled: float,
+    is_chess: bool,
+) -> tuple[RefinedCorners, float, bool] | None:
     """Return the candidate with the larger product of number of corners and quality."""
     if other is None:
         return best
     if best is None or len(other.ij) * other.quality > len(best[0].ij) * best[0].quality:
-        return other, filled
+        return other, filled, is_chess
     return best
 
 
