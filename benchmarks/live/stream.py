@@ -71,6 +71,8 @@ class Plan:
     compressed: bool = False
     #: How far the clock of the publisher is ahead, s.
     clock_ahead_s: float = 0.0
+    #: Whether the corrector takes every image, however late, instead of skipping those that waited too long.
+    every_image: bool = False
 
 
 # -- the processes ---------------------------------------------------------------------------------
@@ -234,6 +236,8 @@ def process(
         command = [sys.executable, "-m", "semcal_ros.nodes.stream_corrector", "--ros-args"]
         given = {"calibration": folder / "cal.yaml", "config": folder / "config.yaml"}
         given |= {"drift_tracking": plan.tracking}
+        if plan.every_image:
+            given["qos_overrides./sem/image_raw.subscription.depth"] = 50
         for key, value in given.items():
             command += ["-p", f"{key}:={value}"]
     else:

@@ -23,7 +23,8 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -36,6 +37,8 @@ _CARD_QUEUE = 32 * 2**20
 _PORT_QUEUE = 2**20
 # Seconds of the full rate that go out at once. The kernel's timer needs some ms.
 _BURST_S = 0.004
+_REPOSITORY = Path(__file__).resolve().parents[2]
+_RELAY = ("-m", "benchmarks.network.relay")
 _TOOLS = ("ip", "tc", "unshare", "mount", "umount")
 # Fast DDS tells machines apart by their interfaces and shares memory within one, so that each gets memory of its own.
 _OWN_MEMORY = 'mount --bind "$0" /dev/shm && exec "$@"'
@@ -67,6 +70,8 @@ class Network:
         Rate of each cable, both ways.
     multicast
         Whether the network passes multicast on.
+    loss
+        Fraction of the packets that the cable of each of these machines loses, both ways.
     stem
         What the names of the namespaces begin with: that of another process' network, to use it without making it.
     """
@@ -77,12 +82,15 @@ class Network:
         *,
         mbit_per_s: float = 1000.0,
         multicast: bool = True,
+        loss: Mapping[str, float] | None = None,
         stem: str | None = None,
     ) -> None:
         self.stem = stem or f"semcal-{os.getpid()}"
         self._switch = f"{self.stem}-switch"
         self._names = list(names)
         self._rate, self._multicast = mbit_per_s, multicast
+        self._loss = dict(loss or {})
+        self._relays: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Network:
         try:
@@ -106,17 +114,8 @@ class Network:
 
     def command(self, name: str, command: Sequence[str]) -> list[str]:
         """The command that runs another one on a machine; signals reach the latter."""
-        inside = ["ip", "netns", "exec", self._space(name)]
-        return [
-            *inside,
-            "unshare",
-            "--mount",
-            "sh",
-            "-c",
-            _OWN_MEMORY,
-            self._memory(name),
-            *command,
-        ]
+        own_memory = ["unshare", "--mount", "sh", "-c", _OWN_MEMORY, self._memory(name)]
+        return _inside(self._space(name), *own_memory, *command)
 
     def plug(self, name: str, *, connected: bool) -> None:
         """Pull the cable of a machine out of the switch, or put it in again."""
@@ -155,10 +154,16 @@ class Network:
             *(*own, "link", "add", card, "type", "veth", "peer", "name", port),
             *("netns", self._switch),
         )
-        _run("ip", "-n", self._switch, "link", "set", port, "master", "bridge", "up")
+        if self._loss.get(name):
+            self._put_relay_before(port, self._loss[name])
+        else:
+            _run("ip", "-n", self._switch, "link", "set", port, "master", "bridge", "up")
         _run(*own, "address", "add", f"{self.address(name)}/24", "dev", card)
         _run(*own, "link", "set", card, "up")
         _run(*own, "route", "add", "default", "dev", card)
+        if self._loss:
+            # Not only the packets of the machine behind the relay come to it.
+            _run(*_inside(space, sys.executable, *_RELAY, "--prepare", card))
         if not self._multicast:
             # As many managed switches and wireless networks do.
             port_of = ("ip", "-n", self._switch, "link", "set", port, "type", "bridge_slave")
@@ -171,7 +176,29 @@ class Network:
                 *("rate", rate, "burst", str(burst), "limit", str(queue)),
             )
 
+    def _put_relay_before(self, port: str, loss: float) -> None:
+        """Lead the cable of a port through a process that loses packets, and then into the switch."""
+        near, far = f"{port}-near", f"{port}-far"
+        inside = ("ip", "-n", self._switch, "link")
+        _run(*inside, "add", near, "type", "veth", "peer", "name", far)
+        _run(*inside, "set", far, "master", "bridge", "up")
+        for end in (near, port):
+            _run(*inside, "set", end, "up")
+        relay = subprocess.Popen(
+            _inside(self._switch, sys.executable, *_RELAY, port, near, "--loss", str(loss)),
+            cwd=_REPOSITORY,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._relays.append(relay)
+        assert relay.stdout is not None
+        if relay.stdout.readline() != "ready\n":
+            raise OSError("the relay does not start")
+
     def _remove(self) -> None:
+        for relay in self._relays:
+            relay.kill()
+            relay.communicate()
         for space in [*map(self._space, self._names), self._switch]:
             for pid in _try("ip", "netns", "pids", space).stdout.split():
                 _try("kill", "-9", pid)
@@ -181,6 +208,10 @@ class Network:
             Path(f"/run/{self.stem}").rmdir()
 
 
+def _inside(space: str, *command: str) -> list[str]:
+    return ["ip", "netns", "exec", space, *command]
+
+
 def _run(*command: str) -> None:
     made = _try(*command)
     if made.returncode:
@@ -188,4 +219,4 @@ def _run(*command: str) -> None:
 
 
 def _try(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, check=False, capture_output=True, text=True)
+    return subprocess.run(command, check=False, capture_output=True, text=True, cwd=_REPOSITORY)

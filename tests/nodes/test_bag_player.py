@@ -137,7 +137,7 @@ def test_the_command_hands_its_options_to_the_node(
     recording = session.with_name('2024: a "b" #1')
     if not recording.exists():
         shutil.copytree(session, recording)
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         main(["play", str(recording), *options])
     read = dict(text.split(":=", 1) for text in handed[2::2])
     values = {name: yaml.safe_load(text) for name, text in read.items()}
