@@ -58,8 +58,7 @@ Images = Sequence[NDArray[Any]]
 SIZE = 256
 DISPLAY_M = 0.12
 INTERVAL_S = 2
-# In rad; the images of the tilted specimen are made by :func:`_relief`.
-TILT = 0.2
+TILT_DEG = 12.0
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ def _relief() -> Images:
     x = np.arange(2 * SIZE) - SIZE
     seen = np.arange(SIZE) - SIZE / 2.0
     images = []
-    for tilt in (0.0, TILT):
+    for tilt in (0.0, np.radians(TILT_DEG)):
         at = x * np.cos(tilt) + height * np.sin(tilt)
         image = np.array([np.interp(seen, a, r) for a, r in zip(at, rough, strict=True)])
         noisy = 128.0 + 40.0 * image / rough.std() + rng.normal(size=image.shape)
@@ -279,7 +278,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Path], list[object]], Callable[[Path], 
     ),
     "reconstruct --tilts": (
         "relief",
-        lambda f: ["reconstruct", "--tilts", f"0,{TILT}rad", "-o", f / "heights.tif"],
+        lambda f: ["reconstruct", "--tilts", f"0deg,{TILT_DEG}deg", "-o", f / "heights.tif"],
         lambda _: [],
     ),
     "import": ("gold", lambda _: ["import"], lambda f: [f / "imported"]),

@@ -29,6 +29,7 @@ from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import Finding, Severity
 from semcal_ros.doctor.legend import explain_figures
 from semcal_ros.doctor.recording import diagnose_recording
+from semcal_ros.files.images.image_series import refuse_images
 
 __all__ = ["command"]
 
@@ -79,6 +80,7 @@ def command(
     if recording is None:
         found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
     else:
+        refuse_images(recording)
         found = diagnose_recording(recording, config, calibration)
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})

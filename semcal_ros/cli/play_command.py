@@ -23,7 +23,7 @@ from pathlib import Path
 import click
 
 from semcal_ros.cli.options import config_option
-from semcal_ros.core.errors import BagError, SemcalError
+from semcal_ros.core.errors import SemcalError
 
 __all__ = ["command"]
 
@@ -107,16 +107,9 @@ def _require_bag(recording: Path) -> None:
         It is no bag, or a damaged one.
     """
     # Imported here, as ROS below: the help need not wait for the library of bags.
-    from semcal_ros.files.bags.reader import is_bag, open_bag
-    from semcal_ros.files.images.image_file import is_image_file
+    from semcal_ros.files.bags.reader import open_bag
+    from semcal_ros.files.images.image_series import refuse_images
 
-    if recording.exists() and not is_bag(recording):
-        files = recording.iterdir() if recording.is_dir() else [recording]
-        if any(is_image_file(file) for file in files):
-            raise BagError(
-                f"{recording} has images, and no bag",
-                expected="a rosbag2 folder, or an .mcap or .db3 file",
-                do=f"make one with `semcal import {recording} BAG`, and play that",
-            )
+    refuse_images(recording)
     with open_bag(recording):
         pass

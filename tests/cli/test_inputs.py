@@ -50,7 +50,9 @@ COMMANDS: dict[str, Callable[[Path], list[object]]] = {
     "import": lambda f: ["import", "--", f / "bag"],
     # Only what is refused before ROS is loaded.
     "play": lambda _: ["play"],
+    "doctor": lambda _: ["doctor"],
 }
+BAGS_ONLY = ("play", "doctor")
 # With one image of a specimen, these have a result; the others say what they lack.
 DONE = {"info", "drift", "rectify", "stack", "import"}
 
@@ -66,8 +68,8 @@ def run(command: str, folder: Path, recording: Path) -> int:
     scale: list[object] = ["--pixel-size", "600nm"]
     if command == "import":
         return main([str(a) for a in ["import", *scale, recording, folder / "bag"]])
-    if command == "play":
-        return main(["play", str(recording)])
+    if command in BAGS_ONLY:
+        return main([command, str(recording)])
     return main([str(a) for a in [*given, *scale, recording]])
 
 
@@ -87,6 +89,28 @@ def test_one_image_is_enough_or_refused_in_one_line(
     lines = [line for line in said.splitlines() if line.startswith("semcal:")]
     assert status == 2 and len(lines) == 1, said
     assert "; " in lines[0] or "expected" in lines[0]
+    assert ("semcal import" in lines[0]) == (command in BAGS_ONLY)
+
+
+@pytest.mark.parametrize("command", BAGS_ONLY)
+def test_images_are_no_bag_and_the_command_that_makes_one_is_told(
+    command: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    each(folder / "my scans", _plain("png"))
+    for name in ("my scans", "my scans/f*.png"):
+        assert main([command, str(folder / name)]) == 2
+        assert f"`semcal import '{folder / name}' BAG`" in capsys.readouterr().err
+
+
+def test_a_folder_of_folders_names_the_one_with_images(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "day" / "notes").mkdir(parents=True)
+    assert main(["info", str(folder / "day")]) == 2
+    assert "check the path" in capsys.readouterr().err
+    each(folder / "day" / "session 2", _plain("png"))
+    assert main(["info", str(folder / "day")]) == 2
+    assert f"give one, such as {folder}/day/session 2" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", COMMANDS)

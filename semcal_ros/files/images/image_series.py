@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import glob
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,7 @@ __all__ = [
     "find_image_files",
     "group_skipped",
     "list_image_series",
+    "refuse_images",
 ]
 
 _SECOND_NS = 1_000_000_000
@@ -225,12 +227,46 @@ def find_image_files(path: Path) -> list[Path]:
     else:
         listed, what = [], f"{path} does not exist"
     if not listed:
+        instead = _name_folder_below(path) if path.is_dir() else ""
+        if not path.exists():
+            instead = name_similar_file(path)
         raise BagError(
             what,
             expected="a rosbag2 folder, an image (TIFF, PNG, JPEG, BMP), a video, or a folder or pattern of them",
-            do=("" if path.exists() else name_similar_file(path)) or "check the path",
+            do=instead or "check the path",
         )
     return sorted(listed, key=_natural)
+
+
+def _name_folder_below(path: Path) -> str:
+    """Advice where the images are in folders of the one given; empty where they are not."""
+    folders = sorted((p for p in path.iterdir() if p.is_dir()), key=_natural)
+    for folder in folders:
+        if is_bag(folder) or any(is_image_file(p) for p in folder.iterdir()):
+            return f"folders below are not read: give one, such as {folder}"
+    return ""
+
+
+def refuse_images(path: Path) -> None:
+    """Refuse images for what needs a bag, with the command that makes one; all else is for the reader of bags.
+
+    Raises
+    ------
+    BagError
+        The path is that of images, and of no bag.
+    """
+    if is_bag(path):
+        return
+    if path.is_dir():
+        files = list(path.iterdir())
+    else:
+        files = [Path(name) for name in glob.glob(str(path))] if not path.exists() else [path]
+    if any(is_image_file(file) for file in files):
+        raise BagError(
+            f"{path} has images, and no bag",
+            expected="a rosbag2 folder, or an .mcap or .db3 file",
+            do=f"make one with `semcal import {shlex.quote(str(path))} BAG`, and give that",
+        )
 
 
 def _collect(paths: Sequence[Path]) -> tuple[list[ImageFile], list[Skipped]]:
@@ -487,6 +523,9 @@ def list_image_series(
         No file is usable, or their scale is not known, or known twice.
     """
     found, skipped = _collect(paths)
+    if not found and len(paths) == 1:
+        name, reason = skipped[0].name, skipped[0].reason
+        raise BagError(reason if name in reason else f"{name}: {reason}")
     if not found:
         raise BagError(
             f"{counted(len(paths), 'image file')}, none usable, the first "

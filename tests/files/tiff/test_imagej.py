@@ -33,6 +33,7 @@ from semcal_ros.files.tiff.read import (
 )
 from tests.files.tiff.test_hitachi import hitachi_text
 from tests.files.tiff.test_tiff import fei_text, jeol_text
+from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
 
