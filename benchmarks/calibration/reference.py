@@ -25,13 +25,24 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage
+from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import Detector, VirtualMicroscope
 from semcal_ros.synthetic.laws import Constant, Law
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.grid import ChessGrid, square_for
+from semcal_ros.synthetic.stage import SimulatedStage, stage_views
 
-__all__ = ["CHANGED", "load_microscope", "sweep_magnifications", "sweep_of", "visits_of"]
+__all__ = [
+    "CHANGED",
+    "change",
+    "corners_of_sweep",
+    "corners_of_visits",
+    "load_microscope",
+    "sweep_magnifications",
+    "sweep_of",
+    "visits_of",
+]
 
 Frames = list[tuple[AnyImage, float]]
 
@@ -45,6 +56,8 @@ CHANGED: dict[str, tuple[str, float, str]] = {
 # Of the views of a visit: one axis of tilt, in any direction.
 _TILTS_RAD = tuple(math.radians(tilt) for tilt in (0.0, 20.0, 40.0))
 _HEIGHT_SIGMA_M = 1e-5
+# Of a corner, per axis: what is found in the recordings, and in drawn images.
+_CORNER_SIGMA_PX = 0.04
 
 
 @dataclass(frozen=True)
@@ -144,6 +157,26 @@ def visits_of(microscope: VirtualMicroscope, magnifications: list[float], seed: 
             pose = Pose.tilted(tilt, azimuth, turn, (*rng.uniform(-2e-5, 2e-5, 2), height))
             frames.append((_draw(microscope, pose, g, (seed, len(frames))), g))
     return frames
+
+
+def corners_of_sweep(
+    microscope: VirtualMicroscope, magnifications: list[float], seed: int
+) -> list[GridView]:
+    """As :func:`sweep_of`, without images."""
+    flat = SimulatedStage(tilts_rad=(0.0,), height_sigma_m=0.0)
+    return stage_views(
+        microscope.camera_at, magnifications, flat, noise_px=_CORNER_SIGMA_PX, seed=seed
+    )
+
+
+def corners_of_visits(
+    microscope: VirtualMicroscope, magnifications: list[float], seed: int
+) -> list[GridView]:
+    """As :func:`visits_of`, without images."""
+    any_axis = SimulatedStage(_TILTS_RAD, None, height_sigma_m=_HEIGHT_SIGMA_M)
+    return stage_views(
+        microscope.camera_at, magnifications, any_axis, noise_px=_CORNER_SIGMA_PX, seed=seed
+    )
 
 
 def _draw(microscope: VirtualMicroscope, pose: Pose, g: float, seed: tuple[int, ...]) -> AnyImage:
