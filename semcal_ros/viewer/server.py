@@ -54,13 +54,12 @@ LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names of this computer by which only its own users come in; no token is asked of them."""
 
 _PAGE = Path(__file__).parent / "page"
-# A person sees no more; the stream needs the processor. So pictures are made in this part of the time at most: where
-# they are large, or where others want the processor and the stream is late, fewer are sent, down to two a second. At
-# 512 x 512 that is seven a second on processors with time to spare.
-_PICTURE_INTERVAL_S = 0.1
+# Enough to focus by; the stream needs the processor. Pictures are made in this part of the time at most: where they are
+# large, or where others want the processor and the stream is late, fewer are sent, down to two a second.
+_PICTURE_INTERVAL_S = 0.2
 _PICTURE_SHARE = 0.025
 _LONGEST_INTERVAL_S = 0.5
-_STATUS_INTERVAL_S = 0.25
+_STATUS_INTERVAL_S = 0.4
 # How often a connection looks for something new: well below the interval of the pictures.
 _POLL_S = 0.04
 # A browser that has not shown a picture for so long has lost it, or sleeps; it gets another one.
