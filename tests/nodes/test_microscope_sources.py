@@ -25,6 +25,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,16 +47,21 @@ DISPLAY_M = 0.12
 # -- video -----------------------------------------------------------------------------------------
 
 
-def test_a_video_with_its_magnification_from_a_parameter(peer: Peer, tmp_path: Path) -> None:
+@pytest.fixture
+def film(tmp_path: Path) -> dict[str, Any]:
+    """The settings of a node that plays a film of six seconds."""
     video = VideoWriter(tmp_path / "film.mp4", (128, 96), 10.0)
     for number in range(60):
         video.write(numbered_image(number), "")
     video.finish()
     video.release()
+    return {"config": "virtual_sem", "source": "video", "video": tmp_path / "film.mp4"}
+
+
+def test_a_video_with_its_magnification_from_a_parameter(peer: Peer, film: dict[str, Any]) -> None:
     images = peer.collect(Image, "image_raw")
     values = peer.collect(Float64, "magnification", LATCHED)
-    settings = {"config": "virtual_sem", "source": "video", "video": tmp_path / "film.mp4"}
-    with running("microscope", {**settings, "field_width_m": 1e-5}) as node:
+    with running("microscope", {**film, "field_width_m": 1e-5}) as node:
         peer.wait_for(lambda: len(images) >= 2 and values, "frames")
         assert values[0].data == pytest.approx(DISPLAY_M / 1e-5)
         pixels = np.frombuffer(images[0].data, np.uint8).reshape(96, 128)
@@ -65,6 +71,20 @@ def test_a_video_with_its_magnification_from_a_parameter(peer: Peer, tmp_path: P
         peer.wait_for(lambda: values[-1].data == pytest.approx(DISPLAY_M / 2e-5), "the new one")
         assert peer.node.count_publishers("/sem/stage") == 0
         assert "stamps are those of arrival" in node.output
+
+
+def test_a_video_with_its_magnification_from_a_topic(peer: Peer, film: dict[str, Any]) -> None:
+    """Another node publishes it: the source leaves the topic alone, and its frames are taken with what is there."""
+    knob = peer.node.create_publisher(Float64, "magnification", LATCHED)
+    knob.publish(Float64(data=5000.0))
+    listener = "/sem/rectifier"
+    with running("rectifier", {"config": "virtual_sem"}):
+        peer.wait_for(lambda: peer.state(listener), "the listener")
+        with running("microscope", {**film, "publish_magnification": False}):
+            peer.wait_for(lambda: peer.state(listener).get("magnification") == "5000", "a frame")
+            knob.publish(Float64(data=6000.0))
+            peer.wait_for(lambda: peer.state(listener).get("magnification") == "6000", "the next")
+            assert peer.node.count_publishers("/sem/magnification") == 1
 
 
 def test_a_video_without_a_name() -> None:
