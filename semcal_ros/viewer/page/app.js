@@ -272,7 +272,9 @@ function drawArrow(pen, picture, ratio, width, height) {
   const wing = (turn) => [end[0] - head * Math.cos(angle + turn), end[1] - head * Math.sin(angle + turn)];
   line(pen, ratio, "#ffb86b", [[x, y], end]);
   line(pen, ratio, "#ffb86b", [wing(0.5), end, wing(-0.5)]);
-  label(pen, ratio, "drift", end[0], end[1] - 6 * ratio, "center");
+  // Beyond the tip, where it hides nothing of the arrow; the text stands on its place.
+  const [ux, uy] = [dx / length, dy / length], away = 8 * ratio, half = pen.measureText("drift").width / 2;
+  label(pen, ratio, "drift", end[0] + ux * (half + away), Math.max(end[1] + uy * 2 * away + 8 * ratio, 20 * ratio), "center");
 }
 function toScreen(picture, [x, y], canvas) {
   const [left, top, w] = picture.region, scale = canvas.width / w;
