@@ -142,6 +142,8 @@ function showCalibration(panel) {
   $("calibration").hidden = !panel;
   if (!panel) return;
   $("calibration-answer").textContent = panel.answer;
+  // The request of an acquisition stands with its buttons.
+  $("calibration-answer").hidden = panel.acquisition?.request === panel.answer;
   $("calibration-answer").className = panel.level === "ok" ? "" : panel.level;
   fillBars($("bars"), panel.running ? [...panel.bars, panel.running] : panel.bars);
   setText($("corners"), panel.overlay_text);
@@ -264,17 +266,19 @@ function drawBar(pen, picture, ratio, width, height) {
 function drawArrow(pen, picture, ratio, width, height) {
   const drift = state.header.drift_px;
   if (!drift) return;
-  const scale = width / picture.region[2];
-  const [dx, dy] = drift.map((v) => v * scale), length = Math.hypot(dx, dy);
-  if (length < 2 * ratio) return;
+  const scale = width / picture.region[2], shown = Math.hypot(...drift) * scale;
+  // A few pixels cannot be seen as an arrow: it is drawn ten or a hundred times as long, and says so.
+  const times = [1, 10, 100].find((k) => k * shown >= 16 * ratio);
+  if (!times) return;
+  const [dx, dy] = drift.map((v) => times * v * scale), length = times * shown, words = times > 1 ? `drift ×${times}` : "drift";
   const x = width / 2, y = height / 2, head = Math.min(10 * ratio, length / 2), angle = Math.atan2(dy, dx);
   const end = [x + dx, y + dy];
   const wing = (turn) => [end[0] - head * Math.cos(angle + turn), end[1] - head * Math.sin(angle + turn)];
   line(pen, ratio, "#ffb86b", [[x, y], end]);
   line(pen, ratio, "#ffb86b", [wing(0.5), end, wing(-0.5)]);
   // Beyond the tip, where it hides nothing of the arrow; the text stands on its place.
-  const [ux, uy] = [dx / length, dy / length], away = 8 * ratio, half = pen.measureText("drift").width / 2;
-  label(pen, ratio, "drift", end[0] + ux * (half + away), Math.max(end[1] + uy * 2 * away + 8 * ratio, 20 * ratio), "center");
+  const [ux, uy] = [dx / length, dy / length], away = 8 * ratio, half = pen.measureText(words).width / 2;
+  label(pen, ratio, words, end[0] + ux * (half + away), Math.max(end[1] + uy * 2 * away + 8 * ratio, 20 * ratio), "center");
 }
 function toScreen(picture, [x, y], canvas) {
   const [left, top, w] = picture.region, scale = canvas.width / w;
