@@ -47,10 +47,10 @@ from benchmarks.calibration.coverage import PRESETS, VISITS
 from benchmarks.calibration.reference import (
     CHANGED,
     change,
-    load_microscope,
-    sweep_magnifications,
     corners_of_sweep,
     corners_of_visits,
+    load_microscope,
+    sweep_magnifications,
     sweep_of,
     visits_of,
 )

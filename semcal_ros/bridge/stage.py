@@ -37,7 +37,9 @@ _STEP_RAD, _RATE_RAD_S = math.radians(10.0), math.radians(60.0)
 
 
 def read_stage(message: Any, source: StageConfig) -> StageReading:
-    """Read the angles of the joints that the configuration names; None for a joint that is missing.
+    """Read the joints that the configuration names; None for a joint that is missing.
+
+    A position that is not finite is taken for missing: what is made of a calibration is the angles.
 
     Raises
     ------
@@ -71,8 +73,16 @@ def read_stage(message: Any, source: StageConfig) -> StageReading:
             expected="finite angles in rad",
             do="check the node that publishes the stage",
         )
+    x_m, y_m = (
+        value if value is not None and math.isfinite(value) else None
+        for value in (known.get(source.x), known.get(source.y))
+    )
     return StageReading(
-        known.get(source.tilt), known.get(source.rotation), known.get(source.scan_rotation)
+        known.get(source.tilt),
+        known.get(source.rotation),
+        known.get(source.scan_rotation),
+        x_m,
+        y_m,
     )
 
 

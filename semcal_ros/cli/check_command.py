@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from typing import Any
 import click
 
 from semcal_ros.cli.grid_options import grid_options, refuse_grid_options
-from semcal_ros.cli.options import PATH, json_option
+from semcal_ros.cli.options import PATH, json_option, parse_ratio
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -40,7 +41,7 @@ from semcal_ros.core.calibration.check import CalibrationCheck, Change, Verdict
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import check
-from semcal_ros.workflows.check_specimen import check_specimen
+from semcal_ros.workflows.check_specimen import STAGE_ACCURACY, MovesCheck, check_specimen
 
 __all__ = ["command", "echo_check"]
 
@@ -54,7 +55,16 @@ _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
 @click.option(
     "--specimen",
     is_flag=True,
-    help="RECORDING shows one place of any specimen at several magnifications, not the grid: compare their scales.",
+    help="RECORDING shows one place of any specimen at several magnifications, or under moves of the stage, not the "
+    "grid: compare their scales, or the pixels with the moves.",
+)
+@click.option(
+    "--stage-accuracy",
+    callback=parse_ratio,
+    default=f"{100.0 * STAGE_ACCURACY:g}%",
+    show_default=True,
+    metavar="RATIO",
+    help="With --specimen: relative 1-sigma of a move of the stage along either of its axes.",
 )
 @json_option
 def command(
@@ -65,6 +75,7 @@ def command(
     untilted: str | tuple[str, ...],
     pattern: str,
     specimen: bool,
+    stage_accuracy: float,
     as_json: bool,
 ) -> None:
     """Whether CALIBRATION still holds, by one or more views of the grid in RECORDING.
@@ -81,7 +92,7 @@ def command(
     """
     if specimen:
         refuse_grid_options("--specimen compares images of any specimen")
-        _check_specimen(calibration, recording, config, as_json=as_json)
+        _check_specimen(calibration, recording, config, stage_accuracy, as_json=as_json)
         return
     with show_progress() as on_progress:
         done = check(
@@ -112,17 +123,32 @@ def command(
 
 
 def _check_specimen(
-    calibration: Path, recording: RecordedFiles, config: MicroscopeConfig, *, as_json: bool
+    calibration: Path,
+    recording: RecordedFiles,
+    config: MicroscopeConfig,
+    stage_accuracy: float,
+    *,
+    as_json: bool,
 ) -> None:
     with show_progress() as on_progress:
-        done = check_specimen(calibration, recording, config=config, on_progress=on_progress)
-    if as_json:
-        echo_json({"holds": done.holds, "ratios": [asdict(ratio) for ratio in done.ratios]})
-    else:
-        click.echo(
-            f"{calibration}: the scales of the magnifications "
-            + ("agree" if done.holds else "DO NOT AGREE")
+        done = check_specimen(
+            calibration,
+            recording,
+            config=config,
+            stage_accuracy=stage_accuracy,
+            on_progress=on_progress,
         )
+    if as_json:
+        echo_json(
+            {
+                "holds": done.holds,
+                "ratios": [asdict(ratio) for ratio in done.ratios],
+                "moves": [asdict(move) for move in done.moves],
+            }
+        )
+    else:
+        what = "the scales of the magnifications" if done.ratios else "pixels and stage"
+        click.echo(f"{calibration}: {what} " + ("agree" if done.holds else "DO NOT AGREE"))
         rows = [
             [
                 f"{r.low:g} to {r.high:g}",
@@ -141,11 +167,43 @@ def _check_specimen(
             ]
             for r in done.ratios
         ]
-        echo_table(["magnifications", "ratio of scales %", "aspect %", "skew %"], rows)
-        click.echo("a change that is common to all magnifications is not seen: that needs the grid")
+        if rows:
+            echo_table(["magnifications", "ratio of scales %", "aspect %", "skew %"], rows)
+            click.echo(
+                "a change that is common to all magnifications is not seen: that needs the grid"
+            )
+        _echo_moves(done.moves, stage_accuracy)
         echo_notes(done.notes)
     if not done.holds:
         sys.exit(1)
+
+
+def _echo_moves(moves: Sequence[MovesCheck], stage_accuracy: float) -> None:
+    if not moves:
+        return
+    echo_table(
+        ["magnification", "nm per px x %", "nm per px y %", "skew %", "frames", "scatter nm"],
+        [
+            [
+                f"{move.magnification:g}",
+                *(
+                    f"{100.0 * value:+.2f} +- {100.0 * sigma:.2f}"
+                    for value, sigma in (
+                        (move.found.scale_x, move.scale_sigma[0]),
+                        (move.found.scale_y, move.scale_sigma[1]),
+                        (move.found.skew, move.skew_sigma),
+                    )
+                ),
+                str(move.found.frames),
+                f"{1e9 * move.found.scatter_m:.3g}",
+            ]
+            for move in moves
+        ],
+    )
+    click.echo(
+        f"against moves of the stage, which count as true to {100.0 * stage_accuracy:g} % along each axis "
+        "(--stage-accuracy): smaller changes are not seen, nor the distortion"
+    )
 
 
 def echo_check(result: CalibrationCheck) -> None:

@@ -12,23 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What any specimen tells about a calibration, without a grid: ratios of scales and isotropy."""
+"""What any specimen tells about a calibration, without a grid: ratios of scales, and isotropy under stage moves."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.arrays import Array32
+from semcal_ros.core.arrays import Array32, check_positive
+from semcal_ros.core.calibration.stage_moves import StageIsotropy, fit_stage_moves
 from semcal_ros.core.camera.scan_camera import RectifiedCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.registration.affine import NotAlignedError, align_affine
+from semcal_ros.core.registration.register import register_pair
+from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
     ConfigSource,
@@ -41,7 +44,11 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["ScaleRatio", "SpecimenCheck", "check_specimen"]
+__all__ = ["STAGE_ACCURACY", "MovesCheck", "ScaleRatio", "SpecimenCheck", "check_specimen"]
+
+#: Relative 1-sigma of the length of a move along either axis of a stage, and of the right angle between them, where
+#: nothing else is stated. Screws without an encoder are a few tenths of a per cent off over short moves.
+STAGE_ACCURACY = 5e-3
 
 # Beyond so many sigmas something has changed: of ten numbers, one is beyond 3.3 by chance in a hundred checks.
 _SIGMAS = 3.3
@@ -49,6 +56,10 @@ _SIGMAS = 3.3
 _MOST_RATIO = 4.0
 # 1-sigma of the drift from the first to the last line of an image, px, which stretches and shears it.
 _DRIFT_PX = 0.3
+# Part of the image by which the specimen must move for more than noise to be measured.
+_LEAST_MOVE = 0.05
+# A move on a stage that is tilted by as much looks 0.1 % shorter.
+_FLAT_RAD = 0.05
 
 
 @dataclass(frozen=True)
@@ -90,8 +101,38 @@ class ScaleRatio:
 
 
 @dataclass(frozen=True)
+class MovesCheck:
+    """The pixels at one magnification against moves of the stage.
+
+    Attributes
+    ----------
+    magnification
+        Where that is.
+    found
+        Scales and skew against the stage.
+    scale_sigma, skew_sigma
+        1-sigma with which both sides know them: of either scale, and of the skew; of the scatter, the stage's accuracy
+        and the calibration.
+    """
+
+    magnification: float
+    found: StageIsotropy
+    scale_sigma: tuple[float, float]
+    skew_sigma: float
+
+    @property
+    def largest_sigmas(self) -> float:
+        """The largest of the three in its sigmas."""
+        return max(
+            abs(self.found.scale_x) / self.scale_sigma[0],
+            abs(self.found.scale_y) / self.scale_sigma[1],
+            abs(self.found.skew) / self.skew_sigma,
+        )
+
+
+@dataclass(frozen=True)
 class SpecimenCheck:
-    """Ratios between neighbouring magnifications.
+    """Ratios between neighbouring magnifications, and what moves of the stage tell at each.
 
     Attributes
     ----------
@@ -99,15 +140,20 @@ class SpecimenCheck:
         One for each pair of neighbouring magnifications, ascending.
     notes
         Notes for the user.
+    moves
+        One for each magnification at which the stage was moved enough, ascending.
     """
 
     ratios: tuple[ScaleRatio, ...]
     notes: tuple[str, ...] = ()
+    moves: tuple[MovesCheck, ...] = ()
 
     @property
     def holds(self) -> bool:
         """Whether nothing that was compared differs by more than chance explains."""
-        return all(r.largest_sigmas <= _SIGMAS for r in self.ratios if not r.reason)
+        return all(r.largest_sigmas <= _SIGMAS for r in self.ratios if not r.reason) and all(
+            move.largest_sigmas <= _SIGMAS for move in self.moves
+        )
 
 
 def check_specimen(
@@ -115,12 +161,17 @@ def check_specimen(
     source: Source,
     *,
     config: ConfigSource | None = None,
+    stage_accuracy: float = STAGE_ACCURACY,
     on_progress: OnProgress = ignore_progress,
 ) -> SpecimenCheck:
     """Compare images of one place at two or more magnifications with what a calibration says of their scales.
 
     It sees whether the scales of two magnifications have changed against each other, and with them aspect and skew.
     It does not see a change that is common to all magnifications, which needs a grid, nor the distortion.
+
+    Where the stage tells x and y, five frames and more of one magnification between which it moved by some of the
+    field, along both axes, tell the size of the pixels along x and y and the angle between them: as well as the
+    stage knows its own moves, and no better.
 
     Parameters
     ----------
@@ -131,30 +182,41 @@ def check_specimen(
         must have texture, and stay where it is, untilted.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
+    stage_accuracy
+        Relative 1-sigma of a move of the stage along either of its axes, and of the angle between these.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
     Raises
     ------
     BagError
-        If there are fewer than two magnifications, or no two of them can be compared.
+        If there are fewer than two magnifications and no moves of the stage, or no two of them can be compared.
     """
+    check_positive(stage_accuracy, "stage_accuracy =")
     model = require_calibration(calibration)
     chosen = resolve_config(config, model)
     images: dict[float, Array32] = {}
+    moves: dict[float, _Moves] = {}
     with open_source(source, chosen) as recording:
         advance = count_frames(on_progress, "reading", recording.frame_count)
         for frame in recording.frames():
             if frame.magnification not in images:
                 grey = to_gray(frame.visible, frame.encoding)
                 images[frame.magnification] = np.asarray(grey, dtype=np.float32)
+            if _tells_position(frame):
+                moves.setdefault(frame.magnification, _Moves(model)).add(frame)
             advance(1)
         notes = recording.notes
+    moved = tuple(
+        own for g in sorted(moves) if (own := moves[g].judge(g, stage_accuracy)) is not None
+    )
+    if len(images) < 2 and moved:
+        return SpecimenCheck((), notes, moved)
     if len(images) < 2:
         raise BagError(
             "images at one magnification",
             expected="one place of a specimen at two magnifications or more",
-            do="set another magnification without moving the stage",
+            do="set another magnification without moving the stage, or record its x and y while it moves",
         )
     ordered = sorted(images)
     on_progress("comparing", 0, None)
@@ -162,12 +224,65 @@ def check_specimen(
         _compare(model, (low, images[low]), (high, images[high]))
         for low, high in itertools.pairwise(ordered)
     )
-    if all(ratio.reason for ratio in ratios):
+    if all(ratio.reason for ratio in ratios) and not moved:
         raise BagError(
             f"no two magnifications that can be compared ({ratios[0].reason})",
             expected="one place of a specimen with texture, at magnifications within a factor of 4",
         )
-    return SpecimenCheck(ratios, notes)
+    return SpecimenCheck(ratios, notes, moved)
+
+
+def _tells_position(frame: RecordedFrame) -> bool:
+    own = frame.stage
+    if own is None or own.x_m is None or own.y_m is None:
+        return False
+    return abs(own.tilt_rad or 0.0) < _FLAT_RAD
+
+
+@dataclass
+class _Moves:
+    """Frames of one magnification, each registered against the first, with the positions of the stage."""
+
+    model: Calibration
+    first: Array32 | None = None
+    rows: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+
+    def add(self, frame: RecordedFrame) -> None:
+        grey = to_gray(frame.visible, frame.encoding)
+        flat = np.asarray(self.model.rectify(grey, frame.magnification), dtype=np.float32)
+        shift = np.zeros(2)
+        if self.first is None:
+            self.first = flat
+        else:
+            found = register_pair(self.first, flat)
+            if not found.accepted:
+                return
+            shift = found.shift_px
+        assert frame.stage is not None and frame.stage.x_m is not None
+        assert frame.stage.y_m is not None
+        place = (frame.stage.x_m, frame.stage.y_m)
+        self.rows.append((*place, float(shift[0]), float(shift[1]), 1e-9 * frame.stamp_ns))
+
+    def judge(self, magnification: float, stage_accuracy: float) -> MovesCheck | None:
+        """Compare them; None where the stage did not move enough."""
+        assert self.first is not None
+        height, width = self.first.shape
+        camera = self.model.at(magnification).resized(width, height).rectified
+        values = np.array(self.rows)
+        pixel_m = camera.pixel_size_m[0]
+        if np.max(np.ptp(values[:, 2:4], axis=0)) < _LEAST_MOVE * min(width, height):
+            return None
+        try:
+            found = fit_stage_moves(values[:, :2], values[:, 2:4], values[:, 4], pixel_m)
+        except InvalidValueError:
+            return None
+        stated = [s / pixel_m for s in camera.pixel_size_sigma_m]
+        scale = tuple(
+            math.sqrt(own**2 + stage_accuracy**2 + known**2)
+            for own, known in zip((found.scale_x_sigma, found.scale_y_sigma), stated, strict=True)
+        )
+        skew = math.sqrt(found.skew_sigma**2 + stage_accuracy**2 + _relative_sigmas(camera)[2] ** 2)
+        return MovesCheck(magnification, found, (scale[0], scale[1]), skew)
 
 
 def _compare(

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,9 +28,16 @@ from semcal_ros import Calibration
 from semcal_ros.core.camera.calibration_model import ScaleSigma
 from semcal_ros.core.errors import BagError
 from semcal_ros.core.registration.affine import NotAlignedError, align_affine
+from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.synthetic import Detector, RecordingPlan, preset, truth_of
+from semcal_ros.synthetic.drift import NO_DRIFT
+from semcal_ros.synthetic.plans import PlannedFrame
+from semcal_ros.synthetic.pose import Pose, rotation_about_beam
+from semcal_ros.synthetic.stage import StagePosition
 from semcal_ros.workflows.check_specimen import check_specimen
 from semcal_ros.workflows.simulate import simulate
 from tests.helpers.calibrations import DEFAULT, calibrated
+from tests.helpers.semcal_runs import run
 
 MAGNIFICATIONS = (1000.0, 2000.0, 4000.0)
 
@@ -126,3 +134,58 @@ def test_one_magnification_is_refused(calibration: Calibration) -> None:
         check_specimen(calibration, [(image, 2000.0)])
     with pytest.raises(BagError, match="5 times apart"):
         check_specimen(calibration, [(image, 1000.0), (image, 5000.0)])
+
+
+@pytest.fixture(scope="module")
+def moves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Gold on a stage that makes a small square at 2000x, and says where it is to 5 nm."""
+    folder = tmp_path_factory.mktemp("specimen") / "moves"
+    microscope, g = preset("jsm820").with_image_size(256, 256), 2000.0
+    field = microscope.nominal_pixel_size_m(g) * 256
+    rng = np.random.default_rng(1)
+    frames = []
+    for index, (x, y) in enumerate(
+        ((0.0, 0.0), (0.2, 0.0), (0.2, 0.2), (0.0, 0.2), (-0.1, 0.1), (0.1, -0.1))
+    ):
+        true = StagePosition(x_m=x * field, y_m=y * field)
+        said = StagePosition(x_m=true.x_m + 5e-9 * rng.normal(), y_m=true.y_m + 5e-9 * rng.normal())
+        # Its axes are not those of the image.
+        turned = rotation_about_beam(0.4)[:2, :2] @ [true.x_m, true.y_m]
+        pose = Pose.flat((*turned, 0.0))
+        frames.append(PlannedFrame(10.0 * index, g, pose, None, position=true, position_read=said))
+    plan = RecordingPlan(microscope, "gold", tuple(frames), NO_DRIFT, Detector(), 5)
+    images = (plan.render(index) for index in range(len(plan)))
+    write_simulated(folder, plan.frames, images, truth_of(plan))
+    return folder
+
+
+@pytest.mark.slow
+def test_moves_of_the_stage_tell_the_shape_of_the_pixels(
+    calibration: Calibration, moves: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = check_specimen(calibration, moves, config="virtual_sem")
+    (move,) = done.moves
+    assert done.holds and done.ratios == () and move.found.frames == 6
+    # What limits it is what is presumed of the stage.
+    assert move.scale_sigma == pytest.approx((5e-3, 5e-3), rel=0.2)
+    assert max(abs(move.found.scale_x), abs(move.found.scale_y), abs(move.found.skew)) < 2e-3
+    assert move.found.scatter_m < 3e-8
+    calibration.save(tmp_path / "cal.yaml")
+    options = ("--specimen", "--config", "virtual_sem", "--stage-accuracy", "0.01%")
+    assert run("check", tmp_path / "cal.yaml", moves, *options) == 0
+    out = capsys.readouterr().out
+    assert "pixels and stage agree" in out and "true to 0.01 % along each axis" in out
+    (sigma,) = re.findall(r"^ +2000 +[-+.\d]+ \+- ([.\d]+)", out, re.MULTILINE)
+    assert float(sigma) < 50.0 * move.scale_sigma[0]
+    # nm per px that are stated too large by 3 % along x and y.
+    scale = calibration.functions["scale"]
+    functions = {
+        **calibration.functions,
+        "scale": replace(scale, coefficients=scale.coefficients / 1.03),
+    }
+    off = Calibration.from_model(replace(calibration, functions=functions))
+    wrong = check_specimen(off, moves, config="virtual_sem")
+    assert not wrong.holds
+    for name in ("scale_x", "scale_y"):
+        change = getattr(wrong.moves[0].found, name) - getattr(move.found, name)
+        assert change == pytest.approx(0.03, abs=3e-4)

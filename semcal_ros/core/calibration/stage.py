@@ -71,17 +71,22 @@ class StageReading:
     ----------
     tilt_rad, rotation_rad, scan_rotation_rad
         See the module.
+    x_m, y_m
+        Position of the specimen on the stage.
     """
 
     tilt_rad: float | None = None
     rotation_rad: float | None = None
     scan_rotation_rad: float | None = None
+    x_m: float | None = None
+    y_m: float | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
             if value is not None and not np.isfinite(value):
-                raise InvalidValueError(f"{item.name} {value}", expected="a finite angle, rad")
+                expected = "a finite angle, rad" if item.name.endswith("_rad") else "finite m"
+                raise InvalidValueError(f"{item.name} {value}", expected=expected)
 
 
 @dataclass(frozen=True)

@@ -78,12 +78,14 @@ def magnification_message(config: MicroscopeConfig, magnification: float, width_
 def stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: int) -> Any:
     """Return the joints of the stage; none where they are not known, which ends the reading before."""
     own = reading or StageReading()
-    angles = {
+    joints = {
         source.tilt: own.tilt_rad,
         source.rotation: own.rotation_rad,
         source.scan_rotation: own.scan_rotation_rad,
+        source.x: own.x_m,
+        source.y: own.y_m,
     }
-    known = {joint: angle for joint, angle in angles.items() if angle is not None}
+    known = {joint: value for joint, value in joints.items() if value is not None}
     message = blank_message(STAGE_TYPE)
     fill_header(message.header, stamp_ns, "")
     message.name, message.position = list(known), list(known.values())
