@@ -26,7 +26,7 @@ from tests.helpers.listings import differences
 from tests.helpers.project import ROOT
 
 
-def follow_notebook(path: Path, folder: Path, tolerance: float, but: str = "\0") -> int:
+def follow_notebook(path: Path, folder: Path, tolerance: float, but: str = "") -> int:
     """Run a notebook in a folder, but for cells that begin with ``but``; return how many lines and pictures agree.
 
     Raises
