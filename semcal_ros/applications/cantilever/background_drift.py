@@ -22,8 +22,9 @@ move with its drift; otherwise their rims would hold the tracker back.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -34,14 +35,17 @@ from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.drift.estimates import DriftPath, DriftSettings
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.register import (
     Region,
     RegistrationSettings,
     prepare_reference,
     register,
 )
+from semcal_ros.core.wording import omit_numbers
 
-__all__ = ["Background", "follow_background"]
+__all__ = ["Background", "GroundRegion", "follow_background"]
 
 
 # The rough drift is measured in an image reduced to between 256 and 512 px along its shorter side,
@@ -49,6 +53,8 @@ __all__ = ["Background", "follow_background"]
 _FIRST_PX = 256
 # Tiles along the shorter side.
 _TILES = 4
+# A region that is further from the median moves by itself, px of the reduced image: ten times the error of the median.
+_OWN_MOTION_PX = 1.0
 # A smaller tile holds too little texture for a peak that stands out.
 _LEAST_TILE_PX = 64
 # The median of three is right even if one of them is wrong.
@@ -63,6 +69,12 @@ _CHANCE = 4.0
 # Error of the rough drift to either side, px: 0.1 px of an image reduced four times. It may
 # change the grey levels of a static edge by twice the error times the slope.
 _ROUGH_PX = 0.4
+# Passes of the tracker. Covered areas that do not move with the drift pull it towards the shift that they have, by
+# 3 nm where that is 2 px wrong, and a static edge that is compared with a place beside it seems to move. So it is
+# tracked again with the drift that was found ...
+_PASSES = 3
+# ... unless this is the shift that was used, px: a tenth of the error that is known to do harm.
+_SAME_PX = 0.15
 # A body counts as moving if at least this many of its cells change ...
 _LEAST_CELLS = 4
 # ... and at least this share of them: in a large body a few cells exceed the limit by chance.
@@ -81,6 +93,33 @@ _FILL_PX = 14.0
 
 
 @dataclass(frozen=True)
+class GroundRegion:
+    """A part of the ground that was compared with the first frame on its own.
+
+    Attributes
+    ----------
+    box_px
+        Left, top, right and bottom in the first frame.
+    failures
+        For each frame after the first, why it was not followed or does not move with the others; None where it does.
+    """
+
+    box_px: Region
+    failures: tuple[Rejection[MatchFailure] | None, ...]
+
+    @property
+    def lost(self) -> int:
+        """In how many frames it was not followed."""
+        return sum(failure is not None for failure in self.failures)
+
+    @property
+    def reason(self) -> str:
+        """The most frequent reason; empty where it was followed in all frames."""
+        kinds = Counter(omit_numbers(f.reason) for f in self.failures if f is not None)
+        return kinds.most_common(1)[0][0] if kinds else ""
+
+
+@dataclass(frozen=True)
 class Background:
     """The drift, and the part of the image that it was measured in.
 
@@ -90,10 +129,13 @@ class Background:
         Drift of all frames.
     weight
         (h, w) float32 weights of the raw pixels at zero drift: 1 where nothing moves on its own.
+    regions
+        Parts of the ground, each judged on its own in the first look at the drift.
     """
 
     path: DriftPath
     weight: Image
+    regions: tuple[GroundRegion, ...] = ()
 
 
 def follow_background(
@@ -129,27 +171,50 @@ def follow_background(
     if axis.base_seen:
         # The holder stands still.
         beam &= along > first - 0.2 * axis.half_width_m
-    rough_px = _estimate_rough_drift(grey, beam)
-    moving = _find_changes(grey, rough_px, beam)
+    shifts, regions = _estimate_rough_drift(grey, beam)
+    notify = on_frame
+    for _ in range(_PASSES):
+        background = _track(grey, times_s, plane, beam, shifts, notify)
+        found = background.path.drift_px
+        found = np.where(np.isfinite(found), found, shifts)
+        if np.max(np.abs(found - shifts)) < _SAME_PX:
+            break
+        shifts, notify = found, lambda: None
+    return replace(background, regions=regions)
+
+
+def _track(
+    images: Sequence[Image],
+    times_s: Sequence[float],
+    plane: PlaneMap,
+    beam: Mask,
+    shifts: Array,
+    on_frame: Callable[[], None],
+) -> Background:
+    """Track the drift in images whose moving areas are covered, given their shifts to some tenths of a px."""
+    moving = _find_changes(images, shifts, beam)
     weight = np.asarray(np.clip(2.0 * _soften(beam | moving) - 1.0, 0.0, 1.0), dtype=np.float32)
     history = DriftHistory()
-    texture = _find_texture(weight, float(np.max(np.abs(rough_px))))
+    texture = _find_texture(weight, float(np.max(np.abs(shifts))))
     # The plane of the undeformed specimen knows a shift alone.
     settings = DriftSettings(
         registration=RegistrationSettings(texture_region=texture), similarity=False
     )
     tracker = DriftTracker(settings, history=history)
-    for image, time_s, shift in zip(grey, times_s, rough_px, strict=True):
+    for image, time_s, shift in zip(images, times_s, shifts, strict=True):
         shifted = _shift_image(weight, shift)
         tracker.update(_cover(image, shifted), time_s, plane.camera, plane.timing)
         on_frame()
     return Background(history.smooth(), weight)
 
 
-def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
-    """Estimate the shift of each image against the first one, (n, 2) px, to about 0.1 px.
+def _estimate_rough_drift(
+    images: Sequence[Image], beam: Mask
+) -> tuple[Array, tuple[GroundRegion, ...]]:
+    """Estimate the shift of each image against the first one, (n, 2) px, to about 0.1 px, and judge its parts.
 
-    The shift is the median over the tiles: a pusher moves or covers only some of them.
+    The shift is the median over the tiles: a pusher moves or covers only some of them. Where fewer than three are
+    followed, the shift of the frame before stays.
     """
     shrink = max(1, min(beam.shape) // _FIRST_PX)
     if shrink > 1:
@@ -164,7 +229,10 @@ def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
             for p in images
         ]
         reduced = beam[: size[1] * shrink : shrink, : size[0] * shrink : shrink]
-        return np.asarray(shrink * _estimate_rough_drift(small, reduced))
+        shifts_px, regions = _estimate_rough_drift(small, reduced)
+        return shrink * shifts_px, tuple(
+            replace(r, box_px=tuple(shrink * side for side in r.box_px)) for r in regions
+        )
     height, width = beam.shape
     side = max(_LEAST_TILE_PX, min(height, width) // _TILES)
     tiles = []
@@ -174,6 +242,7 @@ def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
             if beam[part].mean() < _MOSTLY:
                 tiles.append((part, prepare_reference(_cover(images[0], _soften(beam))[part])))
     shift, shifts = np.zeros(2), [np.zeros(2)]
+    failures: list[list[Rejection[MatchFailure] | None]] = [[] for _ in tiles]
     spread = np.eye(2) * (0.2 * side) ** 2
     for image in images[1:]:
         covered = _cover(image, _shift_image(_soften(beam), shift))
@@ -185,7 +254,21 @@ def _estimate_rough_drift(images: Sequence[Image], beam: Mask) -> Array:
         if len(good) >= min(_LEAST_TILES, len(tiles)) and good:
             shift = np.asarray(np.median(np.array(good), axis=0))
         shifts.append(shift.copy())
-    return np.array(shifts)
+        for own, one in zip(failures, found, strict=True):
+            own.append(one.rejection or _find_own_motion(one.shift_px - shift))
+    regions = tuple(
+        GroundRegion((part[1].start, part[0].start, part[1].stop, part[0].stop), tuple(own))
+        for (part, _), own in zip(tiles, failures, strict=True)
+    )
+    return np.array(shifts), regions
+
+
+def _find_own_motion(against_px: Array) -> Rejection[MatchFailure] | None:
+    """Say so where a region moves against the others by more than they are known."""
+    away_px = float(np.hypot(*against_px))
+    if away_px <= _OWN_MOTION_PX:
+        return None
+    return Rejection(MatchFailure.OUTLIER, f"moves against the others by {away_px:.2g} px")
 
 
 def _find_texture(weight: Image, drift_px: float) -> Region | None:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.applications.cantilever.background_drift import follow_background
+from semcal_ros.applications.cantilever.background_drift import Background, follow_background
 from semcal_ros.applications.cantilever.bending import (
     Bending,
     Shape,
@@ -72,6 +72,8 @@ _WRONG_SHAPE = 3.0
 _LARGEST = 0.04
 # A fit beyond this many times the largest deflection has found something other than the beam.
 _ABSURD = 1.5
+# Regions of the ground that a note names at most.
+_NAMED_REGIONS = 3
 # Points of the centre line in the results, for drawing.
 _LINE_POINTS = 65
 # 1-sigma of the offset, m, where the background was not tracked: so large that the base alone
@@ -231,7 +233,7 @@ def measure_series(
     )
     _check_length(undeformed, settings.length_m, plane.camera)
     frames, shape, misfit = work.deflections(undeformed, tuple(reference), on_frame)
-    notes = _collect_notes(undeformed, frames, background.path, tuple(reference), settings)
+    notes = _collect_notes(undeformed, frames, background, tuple(reference), settings)
     notes += () if misfit is None else (misfit,)
     return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
@@ -314,10 +316,11 @@ def _compare_shapes(given: Shape, common: Shape) -> tuple[Shape, str | None]:
 def _collect_notes(
     undeformed: UndeformedBeam,
     frames: Sequence[Deflection],
-    path: DriftPath,
+    background: Background,
     reference: tuple[int, ...],
     settings: SeriesSettings,
 ) -> tuple[str, ...]:
+    path = background.path
     notes = list(undeformed.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
         notes.append(f"the beam is not found in {unseen} of {counted(len(frames), 'frame')}")
@@ -330,6 +333,7 @@ def _collect_notes(
         notes.append(
             f"no drift in {lost} of {counted(len(path), 'frame')} ({_name_reasons(path)}): {left}"
         )
+        notes.extend(_name_lost_regions(background))
     if abs(undeformed.length_m / settings.length_m - 1.0) > _MAKER_TOLERANCE:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
@@ -351,6 +355,23 @@ def _name_reasons(path: DriftPath) -> str:
         if not trusted
     )
     return "; ".join(reason for reason, _ in counts.most_common())
+
+
+def _name_lost_regions(background: Background) -> list[str]:
+    """Return which parts of the ground were not followed in most frames, and why; the worst first."""
+    lost = [r for r in background.regions if 2 * r.lost > len(r.failures)]
+    if not lost:
+        return []
+    lost.sort(key=lambda region: -region.lost)
+    named = []
+    for region in lost[:_NAMED_REGIONS]:
+        left, top, right, bottom = region.box_px
+        named.append(f"x {left} to {right}, y {top} to {bottom} px ({region.reason})")
+    more = ["..."] if len(lost) > len(named) else []
+    return [
+        f"{len(lost)} of {counted(len(background.regions), 'region')} of the ground could not be followed in most "
+        "frames: " + "; ".join(named + more)
+    ]
 
 
 class _SeriesMeasurement:
