@@ -167,7 +167,7 @@ def picture_of_error(mesh: Path, true_nm: float) -> bytes:
     figure = create_figure(9.0, 3.0)
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.08, wspace=0.08)
     axes = figure.add_subplot(1, 2, 1)
-    reach = max(3.0, float(np.percentile(np.abs(error), 98)))
+    reach = float(np.percentile(np.abs(error), 98))
     shown = axes.scatter(*vertices[:, :2].T, c=error, s=9, cmap="RdBu_r", vmin=-reach, vmax=reach)
     style_axes(axes, xlabel="X (nm)", ylabel="Y (nm)")
     axes.set_aspect("equal")
