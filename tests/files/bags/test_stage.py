@@ -84,7 +84,8 @@ def test_a_frame_has_what_the_stage_said_last_before_its_stamp(tmp_path: Path) -
         tmp_path / "bag",
         [
             image_at(0.0),
-            stage_at(1.0, tilt=0.1, rotation=0.2, scan_rotation=0.3, x=1e-3),
+            # A position that is no number spoils no angle.
+            stage_at(1.0, tilt=0.1, rotation=0.2, scan_rotation=0.3, x=1e-3, y=float("nan")),
             image_at(1.0),
             image_at(9.0),
             # By its stamp before the image; received after it.
@@ -94,8 +95,8 @@ def test_a_frame_has_what_the_stage_said_last_before_its_stamp(tmp_path: Path) -
     )
     assert [f.stage for f in frames] == [
         None,
-        StageReading(0.1, 0.2, 0.3),
-        StageReading(0.1, 0.2, 0.3),
+        StageReading(0.1, 0.2, 0.3, 1e-3),
+        StageReading(0.1, 0.2, 0.3, 1e-3),
         StageReading(0.4, -1.0, 0.0),
     ]
     assert notes == ""
