@@ -50,6 +50,9 @@ for number in range(count):
     save(folder / f"{number:05d}.tif", number, side)
     print(number, time.time_ns(), flush=True)
 """
+# What has not come so long after the last one is lost: a node that is started again needs some seconds, and more where
+# others want the processor.
+SILENT_S = 60.0
 SETTINGS = (
     "[System]\r\nSystemType=Quanta\r\n[Beam]\r\nBeam=EBeam\r\n[EBeam]\r\nHV=5000\r\n[EScan]\r\n"
 )
@@ -101,9 +104,11 @@ def main() -> None:
             time.sleep(0.1)
         command = [sys.executable, "-c", WRITER, str(folder), str(asked.count), str(asked.rate)]
         writer = subprocess.Popen([*command, str(asked.side)], stdout=subprocess.PIPE, text=True)
-        limit_s = time.monotonic() + asked.count / asked.rate + 30.0
+        seen, limit_s = 0, time.monotonic() + SILENT_S
         while len({n for n, _ in received}) < asked.count and time.monotonic() < limit_s:
             executor.spin_once(timeout_sec=0.1)
+            if len(received) > seen:
+                seen, limit_s = len(received), time.monotonic() + SILENT_S
             if asked.kill and len(received) >= asked.kill:
                 os.kill(node.pid, signal.SIGKILL)
                 node.wait()
