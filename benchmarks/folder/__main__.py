@@ -130,6 +130,8 @@ def main() -> None:
     print(
         f"{asked.count} written, {len(times)} received, {len(received) - len(times)} more than once"
     )
+    if missing := sorted(set(range(asked.count)) - set(times)):
+        print(f"missing: {', '.join(map(str, missing))}")
     print(
         f"latency: median {np.median(ms):.0f} ms, 99 % {np.percentile(ms, 99):.0f}, longest {ms.max():.0f}"
     )
