@@ -81,6 +81,11 @@ def test_tilts_to_acquire(text: str) -> None:
             "'2um' is not an angle",
         ),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--tilts", ""), "is not an angle"),
+        (("acquire", "-o", "c.yaml", "--range", "1,2", "--resume", "gone"), "does not exist"),
+        (
+            ("acquire", "-o", "c.yaml", "--range", "1,2", "--no-record", "--record", "r"),
+            "--record and --no-record",
+        ),
     ],
 )
 def test_other_texts_are_refused(

@@ -26,8 +26,10 @@ from semcal_ros.core.calibration.acquisition import (
     AcquisitionGoal,
     ViewRequest,
     find_picture_fault,
+    is_magnification_of,
     plan_survey,
     propose_visits,
+    request_of_picture,
 )
 from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
 from semcal_ros.core.calibration.stage import StageReading
@@ -60,6 +62,17 @@ def largest_error(model: CalibrationModel) -> float:
         for g in np.geomspace(*GOAL.magnification_range, 30)
     ]
     return float(np.max(np.abs(errors)))
+
+
+def test_a_recorded_picture_gets_the_request_that_it_must_have_answered() -> None:
+    stage = StageReading(tilt_rad=0.35, scan_rotation_rad=-1.2)
+    request = request_of_picture(GOAL, 7, 1234.0, stage)
+    assert request == ViewRequest(7, 1234.0, 0.35, -1.2, 10e-6)
+    assert request_of_picture(GOAL, 7, 10_100.0, None) is not None
+    for outside in (480.0, 10_300.0):
+        assert request_of_picture(GOAL, 7, outside, stage) is None
+    # A display rounds.
+    assert is_magnification_of(request, 1250.0) and not is_magnification_of(request, 1265.0)
 
 
 def test_the_survey_covers_the_range_with_all_tilts_differently_turned() -> None:
