@@ -40,6 +40,7 @@ from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,
     PlanePose,
+    TargetView,
     find_target,
     fit_pose,
 )
@@ -153,9 +154,11 @@ def live(
     goal: PlanePose,
     travel_m: tuple[float, float],
     magnifications: list[float],
-) -> Run:
-    """Servo with the nodes through all magnifications; the truth of every frame that was heard."""
-    run = Run("live nodes")
+) -> tuple[Run, list[float]]:
+    """Servo with the nodes through all magnifications: the truth of every frame that was heard, and the magnifications
+    at which the servo did not converge.
+    """
+    run, missed = Run("live nodes"), []
     suite = Suite(folder, preset, drift, seed, goal)
     try:
         suite.begin(travel_m)
@@ -165,6 +168,8 @@ def live(
             # What is told right after the change may be of the frames before it.
             suite.spin_until(lambda count=first + CHANGING: len(suite.images) >= count, STAGE_S)
             reached = suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
+            if not reached:
+                missed.append(g)
             frames = len(suite.images) - first
             held = len(suite.images) + HELD
             suite.spin_until(lambda count=held: len(suite.images) >= count, STAGE_S)
@@ -181,18 +186,19 @@ def live(
     (folder / "live.json").write_text(
         json.dumps({"magnification": run.magnification, "true_px": run.true_px}, indent=1)
     )
-    return run
+    return run, missed
 
 
 def _judged(
     run: Run, suite: Suite, microscope: VirtualMicroscope, goal: PlanePose, g: float, first: int
 ) -> None:
-    """Where the target was in the frames since the last change, by the true camera; mixed frames fail."""
+    """Where the target was in the frames since the last change, by the true microscope; mixed frames fail."""
     camera = microscope.camera_at(g)
     rectifier, plane = Rectifier("cubic"), PlaneCamera.from_camera(camera)
     for stamp in list(suite.images)[first:]:
         image = suite.images[stamp]
-        fit = fit_pose(find_target(rectifier.rectify(image, camera), NestedTarget()), plane)
+        view = find_target(rectifier.rectify(image, camera), NestedTarget())
+        fit = fit_pose(without_residual(view, microscope, g), plane)
         if not fit.accepted or abs(fit.scale - 1.0) > 0.02:
             continue
         error = fit.pose.minus(goal)
@@ -200,3 +206,15 @@ def _judged(
         run.true_error.append(error)
         run.true_px.append(float(np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2]))))
         run.images[g] = image
+
+
+def without_residual(view: TargetView, microscope: VirtualMicroscope, g: float) -> TargetView:
+    """Corners that were found in an image rectified with the parameters alone, where they are without the residual."""
+    if not view.accepted or microscope.residual.is_zero:
+        return view
+    camera = microscope.camera_at(g)
+    plane = PlaneCamera.from_camera(camera)
+    seen = plane.plane_from_px(view.xy.reshape(-1, 2))
+    raw = camera.project(np.column_stack([seen, np.zeros(len(seen))]))
+    true = camera.sem_from_ideal(microscope.undistort(g, raw))[:, :2]
+    return view.with_corners(plane.project(true).reshape(view.xy.shape))
