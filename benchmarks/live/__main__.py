@@ -55,11 +55,12 @@ def asked(command: list[str], extra: dict[str, str] | None = None) -> dict[str, 
     return json.loads(done.stdout) if done.returncode == 0 and done.stdout.strip() else None
 
 
-def callbacks(sizes: tuple[int, ...], quick: bool) -> list[list[object]]:
+def callbacks(sizes: tuple[int, ...], quick: bool, busy: bool) -> list[list[object]]:
     rows: list[list[object]] = []
     for size in sizes:
         for depth in (8, 16):
-            command = ["benchmarks.live.callback", str(size), str(depth)] + ["--quick"] * quick
+            command = ["benchmarks.live.callback", str(size), str(depth)]
+            command += ["--quick"] * quick + ["--busy"] * busy
             found = asked(command, MALLOC) or {}
             floor = found.get("floor")
             in_ms = 1e3 * floor if isinstance(floor, float) else None
@@ -101,14 +102,15 @@ def plot(rows: list[list[object]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
     kept = [row for row in rows if "mono8" in str(row[0]) and row[1] is not None]
     sizes = [int(str(row[0]).split()[0]) for row in kept]
+    styles = {"core": "--", "field": ":", "node": "-"}
     for index, name in enumerate(COLUMNS[:-1], 2):
-        style = "--" if name.startswith("core") else "-"
+        style = styles[name.partition(",")[0]]
         axes.plot(sizes, [row[index] for row in kept], style, marker="o", label=name)
     axes.axhline(1.0, color="0.5", linewidth=1.0)
     axes.set(xscale="log", xlabel="image size, px", ylabel="time over remap + copy", ylim=(0, None))
     axes.set_xticks(sizes, [str(size) for size in sizes], minor=False)
     axes.minorticks_off()
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, ncols=2)
     path.parent.mkdir(exist_ok=True)
     figure.savefig(path, dpi=120)
     print(f"plot: {path}")
@@ -117,6 +119,9 @@ def plot(rows: list[list[object]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="less of everything")
+    parser.add_argument(
+        "--busy", action="store_true", help="processor time of one thread, and nothing over DDS"
+    )
     parser.add_argument("--plot", type=Path, default=PLOT)
     options = parser.parse_args()
     try:
@@ -125,16 +130,20 @@ def main() -> None:
         print("\nLive nodes over DDS: rclpy is not installed")
         return
     sizes = SIZES[:3] if options.quick else SIZES
-    inside = callbacks(sizes, options.quick)
+    inside = callbacks(sizes, options.quick, options.busy)
     show(
         "Live, inside a process: time as ratio to cv2.remap with maps at hand and one copy",
         ["frames", "floor ms", *COLUMNS],
         inside,
-        "core: Rectifier.rectify; node: from the message that has arrived to the messages published.",
+        "core: Rectifier.rectify; field: the same with a residual field.",
+        "node: from the message that has arrived to the messages published.",
         "still: nothing changes. drift, magnification, both: they change with every frame.",
         "node, still: rectifier; node, both: stream_corrector without registration, which stands",
         "beside it. Floor ms: for orientation, on this machine at this moment.",
     )
+    if options.busy:
+        plot(inside, options.plot)
+        return
     floors = {int(str(r[0]).split()[0]): float(str(r[1])) for r in inside if "mono8" in str(r[0])}
     show(
         "Live, over DDS: mono8 from publisher to node to subscriber, three processes",
