@@ -25,6 +25,7 @@ The table is interpolated linearly at positions that OpenCV rounds to 1/32 of it
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -37,9 +38,11 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 __all__ = ["FieldTable", "tabulate_field"]
 
 # Half a pixel along the lines, where the beam settles. Down the image the knots of the field are a quarter of its
-# height apart, so that a step of a few rows does.
+# height apart, so that a step of a few rows does: two at 512. The error is as the square of the step times the second
+# derivative, which for the same field falls with the height.
 _COLUMN_PX = 0.5
 _MOST_ROWS = 256
+_STEP_AT_512 = 2.0
 # What further steps would add, px: less than half of what a map with a field may be wrong by.
 _SETTLED_PX = 0.0004
 _MAX_STEPS = 12
@@ -139,7 +142,8 @@ def tabulate_field(
         for end, count in zip(ends, size, strict=True)
     ]
     margins[1] += np.ceil(rows_beyond)
-    steps = _COLUMN_PX, max(size[1] / _MOST_ROWS, 1.0)
+    coarsest = _STEP_AT_512 * math.sqrt(size[1] / 512.0)
+    steps = _COLUMN_PX, max(min(size[1] / _MOST_ROWS, coarsest), 1.0)
     columns, rows = _lattice(size, (margins[0], margins[1]), steps)
     back_px = replace(field, coefficients=-norm * field.coefficients)
     picked, strips = None, np.zeros((1, 1), np.float32)
