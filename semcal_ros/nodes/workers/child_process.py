@@ -27,6 +27,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FunctionType
 from typing import Any
 
 __all__ = ["Channel", "ChildProcess", "ChildProcessEnded"]
@@ -55,6 +56,29 @@ class ChildProcessEnded(Exception):
         self.status = status
 
 
+class _Pickler(pickle.Pickler):
+    """Pickles objects that other threads are using.
+
+    A camera or a calibration fills its cached properties in when they are first asked for. If another thread does that
+    while its attributes are written, ``pickle`` raises "dictionary changed size during iteration".
+    """
+
+    def reducer_override(self, item: Any) -> Any:
+        kind = type(item)
+        has_default = (
+            kind.__reduce_ex__ is object.__reduce_ex__ and kind.__reduce__ is object.__reduce__
+        )
+        if not has_default or isinstance(item, type | FunctionType):
+            return NotImplemented
+        make, arguments, state, *rest = item.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+        # With slots, the attributes are the first of two dictionaries, and the second is a copy already.
+        if isinstance(state, tuple):
+            state = (state[0] and dict(state[0]), *state[1:])
+        elif isinstance(state, dict):
+            state = dict(state)
+        return make, arguments, state, *rest
+
+
 class Channel:
     """One end of a pair of pipes that carry any picklable object; for one thread at a time and direction.
 
@@ -75,7 +99,7 @@ class Channel:
 
     def send(self, item: Any) -> None:
         """Send an object; raises :class:`OSError` if the other side has ended."""
-        pickle.dump(item, self._output, protocol=pickle.HIGHEST_PROTOCOL)
+        _Pickler(self._output, protocol=pickle.HIGHEST_PROTOCOL).dump(item)
         self._output.flush()
 
     def receive(self) -> Any:

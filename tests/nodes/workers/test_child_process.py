@@ -23,6 +23,8 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,28 @@ def answer(channel: Channel) -> None:
             channel.send(request)
 
 
+@dataclass
+class Described:
+    """Something whose cached property another thread asks for while it is sent."""
+
+    name: str
+    user: Any = None
+
+    @cached_property
+    def length(self) -> int:
+        return len(self.name)
+
+
+class User:
+    """Uses a described thing at the moment at which it is pickled itself."""
+
+    def __init__(self, used: Described) -> None:
+        self.used = used
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return str, (f"{self.used.length}",)
+
+
 @pytest.fixture(scope="module")
 def process() -> Iterator[ChildProcess]:
     made = ChildProcess(answer, NICE)
@@ -93,6 +117,14 @@ def test_objects_larger_than_any_pipe_come_back_as_they_were(process: ChildProce
     sent, array, text = _ask(process, ("x" * 100, image, "ends here"))
     assert (sent, text) == ("x" * 100, "ends here")
     assert np.array_equal(array, image)
+
+
+def test_what_another_thread_uses_meanwhile_is_sent(process: ChildProcess) -> None:
+    """As the camera of a stream: without a copy of its attributes, their number changes while they are written."""
+    used = Described("gold")
+    used.user = User(used)
+    came = _ask(process, used)
+    assert (came.name, came.user, vars(used)["length"]) == ("gold", "4", 4)
 
 
 def test_it_has_one_thread_of_linear_algebra_and_little_weight(process: ChildProcess) -> None:
