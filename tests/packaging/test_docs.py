@@ -133,8 +133,8 @@ def test_every_option_is_described(command: str) -> None:
 def test_named_options_exist() -> None:
     """Options in the examples and descriptions of the command line."""
     known = {"--help", "--version"}
-    # Of `dask worker`, and of a benchmark.
-    others = {"--nthreads", "--nworkers", "--board"}
+    # Of `dask worker`, and of benchmarks.
+    others = {"--nthreads", "--nworkers", "--board", "--reference"}
     for command in COMMANDS:
         known |= _options_of(command)
     text = "".join(_text(name) for name in ("cli.md", "calibration.md", "sem_tiff.md", "paper.md"))
