@@ -36,8 +36,9 @@ import cv2
 import numpy as np
 
 from benchmarks.table import quick_from_command_line, show
-from semcal_ros.applications.reconstruction import TrackKeyframe, patches
+from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe, patches
 from semcal_ros.applications.reconstruction.appearance import compute_log_grey, prepare_appearance
+from semcal_ros.applications.reconstruction.feature_tracks import project_to_plane
 from semcal_ros.applications.reconstruction.patches import PatchSettings, PosedSurface
 from semcal_ros.applications.reconstruction.shading import Shading
 from semcal_ros.synthetic import Detector
@@ -98,6 +99,19 @@ def normalised_in_the_image() -> Iterator[None]:
 
 
 @contextmanager
+def cut_by_an_affine_map() -> Iterator[None]:
+    """Patches that are turned and foreshortened, but not bent with the surface."""
+    exact = patches._cut_patches
+
+    def flat(*given: Any) -> Any:
+        cut = exact(*given)
+        return replace(cut, bend=np.zeros_like(cut.bend))
+
+    with mock.patch.object(patches, "_cut_patches", flat):
+        yield
+
+
+@contextmanager
 def both() -> Iterator[None]:
     with shading_left_in(), smoothed_in_the_image():
         yield
@@ -140,9 +154,13 @@ def missing_percent(
     half_px: int = 7,
     slopes_deg: tuple[float, float] = (0.0, 58.0),
     scale: float = 1.0,
+    at_features: bool = False,
     **scene: Any,
 ) -> float:
-    """Part of the movement that patches of a random texture lack, per cent."""
+    """Part of the movement that patches of a random texture lack, per cent.
+
+    Points are drawn at random; ``at_features`` takes those that the tracker chooses in the middle frame instead.
+    """
     plan, images = record(seed, **scene)
     microscope = plan.microscope
     camera = microscope.camera_at(plan.frames[0].magnification)
@@ -151,8 +169,13 @@ def missing_percent(
     none = (np.empty(0, dtype=np.intp), np.empty((0, 2)), np.zeros((2, 3)))
     frames = [TrackKeyframe(k, t, images[k], camera, *none) for k, t in enumerate(times)]
     rng = np.random.default_rng(seed)
-    out = rng.normal(size=(3000, 3))
-    out /= np.linalg.norm(out, axis=1)[:, None]
+    if at_features:
+        middle = FRAMES // 2
+        out = look_for_features(images[middle], frames[middle], rotations[middle], places[middle])
+        rng.shuffle(out)
+    else:
+        out = rng.normal(size=(3000, 3))
+        out /= np.linalg.norm(out, axis=1)[:, None]
     slope = np.degrees(np.arccos(np.clip(-out @ rotations[FRAMES // 2, 2], -1.0, 1.0)))
     out = out[(slope >= slopes_deg[0]) & (slope <= slopes_deg[1])][:150]
     posed = PosedSurface(
@@ -170,6 +193,18 @@ def missing_percent(
     return float(100.0 * np.sum(moved * error) / np.sum(moved**2))
 
 
+def look_for_features(image: Any, frame: TrackKeyframe, rotation: Any, place: Any) -> Any:
+    """Directions (n, 3) from the centre of the body to the features of an image."""
+    tracker = SequenceTracker()
+    tracker.add(image, frame.camera, 0.0)
+    seen = project_to_plane(frame.camera, tracker.keyframes[0].xy) - place[:2]
+    across = seen / RADIUS_M
+    across = across[np.linalg.norm(across, axis=1) < 0.99]
+    # The field is narrow: the beam is parallel to 1e-5.
+    depth = -np.sqrt(1.0 - np.sum(across**2, axis=1))
+    return np.column_stack([across, depth]) @ rotation
+
+
 CASES: dict[str, tuple[dict[str, Any], Callable[[], Any]]] = {
     "as it is": ({}, nullcontext),
     "local mean and contrast divided out": ({}, normalised_in_the_image),
@@ -182,6 +217,8 @@ CASES: dict[str, tuple[dict[str, Any], Callable[[], Any]]] = {
     "patches of 21 px": ({"half_px": 10}, nullcontext),
     "points within 35 deg of the beam": ({"slopes_deg": (0.0, 35.0)}, nullcontext),
     "points beyond 35 deg": ({"slopes_deg": (35.0, 58.0)}, nullcontext),
+    "patches cut by an affine map alone": ({}, cut_by_an_affine_map),
+    "points that the tracker chooses": ({"at_features": True}, nullcontext),
     "calibration 0.1 % too large": ({"scale": 1.001}, nullcontext),
     "both, grains of 60 nm": ({"grain_m": 60e-9}, both),
     "local mean divided out, 60 nm": ({"grain_m": 60e-9}, normalised_in_the_image),
