@@ -307,7 +307,8 @@ class BagPlayer(SemNode):
         if outputs:
             self.reporter.warn(
                 f"the recording holds what nodes of the suite publish: {', '.join(outputs)}. If they run, it comes"
-                " twice, and a recorded calibration is used where none is in force; the default of topics, inputs, leaves it out"
+                " twice, and a recorded calibration is used where none is in force; the default, topics:=inputs, leaves"
+                " it out"
             )
 
     # -- control -----------------------------------------------------------------------------------

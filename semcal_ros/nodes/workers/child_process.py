@@ -27,6 +27,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from operator import is_
 from types import FunctionType
 from typing import Any
 
@@ -56,6 +57,10 @@ class ChildProcessEnded(Exception):
         self.status = status
 
 
+# What a class says of its own pickling, unless it leaves that to `object`.
+_REDUCERS = {name: getattr(object, name) for name in ("__reduce_ex__", "__reduce__")}
+
+
 class _Pickler(pickle.Pickler):
     """Pickles objects that other threads are using.
 
@@ -64,11 +69,8 @@ class _Pickler(pickle.Pickler):
     """
 
     def reducer_override(self, item: Any) -> Any:
-        kind = type(item)
-        has_default = (
-            kind.__reduce_ex__ is object.__reduce_ex__ and kind.__reduce__ is object.__reduce__
-        )
-        if not has_default or isinstance(item, type | FunctionType):
+        own = (getattr(type(item), name) for name in _REDUCERS)
+        if not all(map(is_, own, _REDUCERS.values())) or isinstance(item, type | FunctionType):
             return NotImplemented
         make, arguments, state, *rest = item.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
         # With slots, the attributes are the first of two dictionaries, and the second is a copy already.
