@@ -168,7 +168,6 @@ def evaluate(
         height_sigma_m=height_m,
         visit_height_sigma_m=_visit_height_sigma_m(model.statistics),
     )
-    low, high = model.magnification_range
     errors = (
         MagnificationError(
             magnification=g,
@@ -176,7 +175,7 @@ def evaluate(
             rms_px=rms,
             scale_error=scales[g].relative,
             scale_sigma=scales[g].sigma,
-            in_range=low <= g <= high,
+            in_range=model.at(g).in_range,
         )
         for g, rms in rms_by_magnification(fit).items()
     )
