@@ -67,7 +67,7 @@ def command(
     """Replay RECORDING as ROS topics, as `ros2 run semcal_ros bag_player` does.
 
     \b
-    Examples:
+    Example:
       semcal play recordings/zoom --rate 2
       semcal play recordings/session --topics all --exclude calibration
     """

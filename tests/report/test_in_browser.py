@@ -88,6 +88,7 @@ def long_words_text() -> str:
         "width": 480,
         "height": 480,
         "marks": [{"path": "M1 1l2 2", "text": "0.1 px"}],
+        "bar": {"path": "M380 460h90", "x": 470, "y": 450, "label": long_word, "type_px": 12},
     }
     return render(
         "calibration.html.j2",
