@@ -197,7 +197,12 @@ class CalibrationServer(StreamNode):
             ("update", self._update, compared),
         )
         self._answers = [
-            self.endpoints.trigger_service(f"~/{name}", handler, group, self._report_answer)
+            self.endpoints.trigger_service(
+                f"~/{name}",
+                handler,
+                group,
+                self._report_refusal if name == "acquire" else self._report_answer,
+            )
             for name, handler, group in handlers
         ]
         self.closing.callback(self._end_calibration)
@@ -226,6 +231,10 @@ class CalibrationServer(StreamNode):
 
     def _report_answer(self, success: bool, text: str) -> None:
         self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
+
+    def _report_refusal(self, success: bool, text: str) -> None:
+        if not success:
+            self._report_answer(success, text)
 
     def _report_progress(self, text: str, level: DiagnosticLevel = DiagnosticLevel.OK) -> None:
         with self._lock:
@@ -491,10 +500,13 @@ class CalibrationServer(StreamNode):
             self._acquiring = threading.Thread(
                 target=self._acquire_beside, args=(run, recorder, before), daemon=True
             )
-        self._acquiring.start()
         where = "" if before is None else f" with the views of {before}"
         where += "" if path is None else f", recorded to {path}"
-        return f"acquisition {verb}{where}; ~/progress shows it, ~/cancel ends it"
+        text = f"acquisition {verb}{where}; ~/progress shows it, ~/cancel ends it"
+        # Before the start: an acquisition that fails at once has the last word.
+        self._report_progress(text)
+        self._acquiring.start()
+        return text
 
     def _recording_to_resume(self, run: AcquisitionRun) -> Path | None:
         """The recording that a new acquisition goes on with, once."""
