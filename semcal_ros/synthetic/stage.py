@@ -72,7 +72,7 @@ class SimulatedStage:
     height_sigma_m, visit_height_sigma_m, common_height_m
         Spread of the height of a view and of a visit, and a height that all views have.
     scale_sigma
-        Spread of the relative scale of a visit: how well the magnification comes back.
+        Spread of the relative scale of a visit: how repeatable the magnification is.
     tilt_error_rad, reading_sigma_rad
         Constant error of the tilt that is read, and its scatter.
     drift_sigma_px, line_jitter_px

@@ -218,7 +218,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
         presumed = estimate_repeatability(setup, fit)
         out.append(
             Finding(
-                "scale: the views do not tell how well the magnification comes back; "
+                "scale: the views do not show how repeatable the magnification is; "
                 f"{100.0 * presumed:.2g} % is presumed. Visit some magnifications twice",
                 cost_relative=presumed,
             )

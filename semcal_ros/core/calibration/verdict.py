@@ -81,7 +81,7 @@ class Verdict:
         best = f"{100.0 * self.largest:.2g} % (1-sigma)" + (
             " or better" if self.high > self.low else ""
         )
-        where = f", the least at {rounded_magnification(self.at)}" if self.high > self.low else ""
+        where = f", least well at {rounded_magnification(self.at)}" if self.high > self.low else ""
         known = f"{size:.{digits}f} +- {sigma:.{digits}f} {unit}"
         under = f" ({self.conditions})" if self.conditions else ""
         return f"nm per px is known to {best} {span}{where}: {known}{under}"
