@@ -49,7 +49,7 @@ def result() -> CalibrationResult:
     )
     # The calibration's only warning of its own: no magnification was visited twice.
     (own,) = made.warnings
-    assert "comes back" in own
+    assert "how repeatable" in own
     return replace(made, findings=())
 
 
