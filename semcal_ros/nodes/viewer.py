@@ -176,7 +176,7 @@ class Viewer(SemNode):
         )
         self._magnifications = MagnificationInput(self.config, self.endpoints, self.reporter)
         self._conditions = ConditionsInput(self.endpoints, self.reporter)
-        group = PolledGroup()
+        self._polled = group = PolledGroup()
         self._images = ViewedImages(self.config, self.endpoints, group)
         listen = [
             (PoseWithCovarianceStamped, "drift", stream_output(100), self._on_drift),
@@ -331,6 +331,7 @@ class Viewer(SemNode):
                 self._show(frame)
         except NODE_ERRORS as error:
             self.reporter.reject(error)
+        self._polled.open_events()
         now_s = time.monotonic()
         self._timer.timer_period_ns = round(1e9 * max(_POLL_S, self.server.picture_interval_s))
         self._look_for_corners(now_s)

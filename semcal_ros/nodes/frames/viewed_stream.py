@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections import deque
@@ -24,6 +25,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import EventHandler
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
@@ -46,18 +48,34 @@ _KEPT_RAW = 6
 _KEPT_BYTES = 64 << 20
 # A corrected image that is older than the newest raw one by more belongs to a corrector that has stopped.
 _STALE_S = 3.0
+# For so long events are waited for; the executor needs some milliseconds to begin.
+_EVENTS_S = 0.02
 
 
 class PolledGroup(MutuallyExclusiveCallbackGroup):
     """Subscriptions whose messages wait until they are taken; the executor leaves them alone.
 
     An executor that woke for every image would cost a part of a core in a fast stream, for pictures that nobody sees.
-    Events of the subscriptions, such as of their quality of service, are handled as always.
+    Events of the subscriptions, such as of their quality of service, are handled just after :meth:`open_events`. At
+    other times they must not be waited for either: Fast DDS signals a message and an event by one condition, so that
+    with messages waiting the executor would not sleep at all.
     """
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._open_until_s = -math.inf
+
+    def open_events(self) -> None:
+        """Let events be handled now; call it when the messages have been taken."""
+        self._open_until_s = time.monotonic() + _EVENTS_S
+
     def can_execute(self, entity: Any) -> bool:
-        """Extend the base class: never for a subscription."""
-        return not isinstance(entity, Subscription) and super().can_execute(entity)
+        """Extend the base class: never for a subscription, seldom for an event."""
+        if isinstance(entity, Subscription):
+            return False
+        if isinstance(entity, EventHandler) and time.monotonic() > self._open_until_s:
+            return False
+        return super().can_execute(entity)
 
 
 @dataclass(frozen=True)
