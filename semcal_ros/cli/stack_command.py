@@ -19,6 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import numpy as np
 
 from semcal_ros.cli.options import (
     PATH,
@@ -37,6 +38,7 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.drift.scan_pairs import ScanPairDrift
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES
 from semcal_ros.files.recordings import RecordedFiles
@@ -66,6 +68,13 @@ __all__ = ["command"]
     help="Append a strip with a scale bar and its uncertainty below the average.",
 )
 @no_drift_option("Average the frames where they are.")
+@click.option(
+    "--scan-pairs",
+    type=float,
+    metavar="DEG",
+    help="Every second frame was scanned with the raster turned by 90 or -90 degrees (positive: it shows the specimen"
+    " turned from +x to +y): undo the drift line by line.",
+)
 @interpolation_option("cubic")
 @dask_option
 def command(
@@ -78,6 +87,7 @@ def command(
     at: float | None,
     scale_bar: bool,
     no_drift: bool,
+    scan_pairs: float | None,
     interpolation: str,
     config: MicroscopeConfig,
     dask: str | None,
@@ -103,6 +113,7 @@ def command(
             config=config,
             at=at,
             drift=not no_drift,
+            scan_pairs_deg=scan_pairs,
             interpolation=interpolation,
             video=video,
             fps=fps,
@@ -130,6 +141,8 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
         f"{result.image.frames} of {counted(len(result.used), 'frame')} averaged, "
         f"{x_nm:.6g} x {y_nm:.6g} nm per px"
     )
+    if result.scan_drift is not None:
+        _echo_scan_drift(result.scan_drift, result.camera.pixel_size_m[0])
     left_out = len(result.used) - result.image.frames
     if 2 * result.image.frames <= len(result.used):
         # Half of the frames: more of the recording is missing than is in the average.
@@ -144,3 +157,14 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
         echo_notes([f"tracking was lost: {counted(result.lost, 'frame')} after that left out"])
     if result.typical_error is not None:
         click.echo(f"standard error: {result.typical_error:.4g} grey levels (median of the pixels)")
+
+
+def _echo_scan_drift(drift: ScanPairDrift, pixel_size_m: float) -> None:
+    """Print how far each scan was displaced while it was taken."""
+    for number, sigma in enumerate(drift.sigma_px):
+        way_px = np.ptp(drift.at(number, np.linspace(0.0, 1.0, 101)), axis=0)
+        click.echo(
+            f"scan {number + 1}: drift by {way_px[0]:.2f} px in x and {way_px[1]:.2f} px in y during it"
+            f" ({1e9 * pixel_size_m * float(np.hypot(*way_px)):.3g} nm); 1-sigma of a line"
+            f" {float(np.median(sigma)):.2g} px"
+        )

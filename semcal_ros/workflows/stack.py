@@ -34,6 +34,12 @@ from semcal_ros.core.arrays import AnyImage, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath
+from semcal_ros.core.drift.scan_pairs import (
+    ScanPairDrift,
+    TurnedScan,
+    average_scans,
+    measure_scan_pairs,
+)
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.stack import Stack, StackedImage, StackSums
@@ -62,6 +68,8 @@ __all__ = ["StackResult", "stack"]
 # Frames that are added up by themselves before their sums are added to the others'. Of 8-bit
 # frames, so many have the size of their sums, which come back from a cluster.
 _FRAMES_PER_PART = 20
+# Turned scans: each is compared with all of the other kind, and all are held in memory.
+_MOST_SCANS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +98,8 @@ class StackResult:
         The configuration that was used; its ``scan`` may have been estimated from the drift.
     notes
         Notes for the user.
+    scan_drift
+        Drift during each of the scans, where they were turned against each other.
     """
 
     image: StackedImage
@@ -102,6 +112,7 @@ class StackResult:
     other_kind: int
     config: MicroscopeConfig
     notes: tuple[str, ...]
+    scan_drift: ScanPairDrift | None = None
 
     @property
     def lost(self) -> int:
@@ -170,6 +181,7 @@ def stack(
     magnification: float | None = None,
     at: float | None = None,
     drift: bool = True,
+    scan_pairs_deg: float | None = None,
     interpolation: str = "cubic",
     video: str | os.PathLike[str] | None = None,
     fps: float = 10.0,
@@ -199,6 +211,11 @@ def stack(
         The magnification whose frames are taken; None where there is only one.
     drift
         False averages the frames without shifting them.
+    scan_pairs_deg
+        90 or -90: every second frame was scanned with the raster turned by this scan rotation, where a positive one
+        turns the specimen in the image from +x towards +y. The drift is then measured line by line
+        (:mod:`~semcal_ros.core.drift.scan_pairs`), and the average shows the square that all of them do, as with no
+        scan rotation. Neither stamps nor a frame time are used; at most 12 frames, no video, no Dask.
     interpolation
         ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
     video, fps
@@ -240,6 +257,9 @@ def stack(
         at = check_positive(at, "at =")
     _check_suffix(output, IMAGE_SUFFIXES)
     _check_suffix(sigma, TIFF_SUFFIXES)
+    quarter = None
+    if scan_pairs_deg is not None:
+        quarter = _check_scan_pairs(scan_pairs_deg, drift, film_path is not None, dask is not None)
     with (
         open_workers(dask) as workers,
         open_source(source, microscope, magnification=magnification) as opened,
@@ -249,12 +269,28 @@ def stack(
             microscope,
             model,
             at=at,
-            drift=drift,
+            drift=drift and quarter is None,
             levels=film_path is not None,
             on_first=lambda frame: _check_output(output, frame),
             on_progress=on_progress,
         )
         used = _choose_usable(selection)
+        if quarter is not None:
+            average, scan_drift = _average_pairs(opened, model, selection, quarter, on_progress)
+            result = StackResult(
+                average,
+                selection.camera.rectified,
+                selection.dtype,
+                selection.stamps_ns,
+                used,
+                None,
+                {},
+                selection.other_kind,
+                selection.config,
+                opened.notes,
+                scan_drift,
+            )
+            return _save(result, output, sigma, scale_bar)
         summed = Stack(selection.size, interpolation)
         grey = _choose_video_levels(selection)
         count = len(selection.indices)
@@ -293,11 +329,61 @@ def stack(
         selection.config,
         notes,
     )
+    return _save(result, output, sigma, scale_bar)
+
+
+def _save(
+    result: StackResult,
+    output: str | os.PathLike[str] | None,
+    sigma: str | os.PathLike[str] | None,
+    scale_bar: bool,
+) -> StackResult:
     if sigma is not None:
         result.save_sigma(sigma)
     if output is not None:
         result.save(output, scale_bar=scale_bar)
     return result
+
+
+def _check_scan_pairs(scan_pairs_deg: float, drift: bool, video: bool, dask: bool) -> int:
+    """Return the scan rotation in quarters of a turn."""
+    if scan_pairs_deg not in (90.0, -90.0):
+        raise InvalidValueError(
+            f"--scan-pairs {scan_pairs_deg:g}",
+            expected="90 or -90, the scan rotation of every second frame in degrees",
+        )
+    for option, given in (("--no-drift", not drift), ("--video", video), ("--dask", dask)):
+        if given:
+            raise InvalidValueError(
+                f"--scan-pairs together with {option}", expected="one of the two"
+            )
+    return round(scan_pairs_deg / 90.0)
+
+
+def _average_pairs(
+    opened: Recording,
+    model: Calibration | None,
+    selection: FrameSelection,
+    quarter_turns: int,
+    on_progress: OnProgress,
+) -> tuple[StackedImage, ScanPairDrift]:
+    """Average scans of which every second one was turned."""
+    count = len(selection.indices)
+    if not 2 <= count <= _MOST_SCANS:
+        raise InvalidValueError(
+            f"{counted(count, 'frame')} for --scan-pairs",
+            expected=f"2 to {_MOST_SCANS} of one magnification, every second one turned",
+            do="stack parts of the recording",
+        )
+    used = np.ones(count, dtype=bool)
+    scans = [
+        TurnedScan(frame.image, quarter_turns * (frame.number % 2), frame.camera)
+        for frame in _read_chosen(opened, model, selection, used, unused_too=False)
+    ]
+    on_progress("matching scans", 0, None)
+    found = measure_scan_pairs(scans)
+    on_progress("averaging", 0, None)
+    return average_scans(scans, found), found
 
 
 def _check_suffix(output: str | os.PathLike[str] | None, suffixes: Sequence[str]) -> None:

@@ -1,0 +1,557 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Drift within scans, line by line, from scans of one place with the raster turned by 90 degrees.
+
+A specimen that drifts displaces the lines of a scan against each other: the displacement is a function of the slow
+axis alone. In a second scan whose raster is turned by 90 degrees the slow axis is the other one. With ``r`` the row
+and ``c`` the column of the specimen, the second scan is therefore displaced against the first by
+
+    m(r, c) = d_2(c) - d_1(r),
+
+which separates into the two functions but for a constant. No model of the drift is needed: neither a constant
+velocity, nor the frame time, nor that the drift goes on between the scans as it was. The idea is that of Ophus,
+Ciston and Nelson (2016), "Correcting nonlinear drift distortion of scanning probe and scanning transmission electron
+microscopies from image pairs with orthogonal scan directions", doi:10.1016/j.ultramic.2015.12.002, who move each line
+until the images agree. Here the displacements of tiles are measured with their covariance by
+:mod:`~semcal_ros.core.registration.register`, and least squares give both functions with theirs.
+
+It fails, and says so, where tiles have too little structure. It cannot tell from drift what is the same function of
+the slow axes: an angle between the scans that is not 90 degrees (one degree is a drift by 1.7 % of the width during
+each scan), and a raster whose sides differ (without a calibration). It does not see what changes between neighbouring
+lines, such as jitter: the functions are cubic splines with a knot every 48 lines.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import map_coordinates, spline_filter
+
+from semcal_ros.core.arrays import (
+    AnyImage,
+    Array,
+    Array32,
+    Indices,
+    Mask,
+    check_image,
+    invert_scaled,
+)
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.core.rectification.stack import Stack, StackedImage, find_scanned
+from semcal_ros.core.registration.normalised_correlation import (
+    CoarseReference,
+    find_coarse_peaks,
+)
+from semcal_ros.core.registration.reference import Region, RegistrationSettings
+from semcal_ros.core.registration.register import register_pair
+from semcal_ros.core.registration.tiles import Pyramid
+from semcal_ros.core.wording import counted
+
+__all__ = ["ScanPairDrift", "TurnedScan", "average_scans", "measure_scan_pairs"]
+
+# Sides of tiles, px: of those that are searched, which need enough structure for a peak, and of those that are
+# compared pixel by pixel, which are the smaller the less the drift changes within.
+_SEARCHED_PX, _COMPARED_PX = 64, 32
+# Three rows of tiles; with fewer, there is no function of the slow axis.
+_LEAST_SIDE_PX = 3 * _SEARCHED_PX
+# Lines from knot to knot, which a row of the smaller tiles tells with ease; and what a minute of solving allows.
+_KNOT_PX, _MAX_KNOTS = 48, 32
+# Smoothing before gradients are taken, and pixels at the edge of a tile that it spoils.
+_SMOOTH_PX, _RIM_PX = 1.0, 3
+# The displacement is taken out and what is left is measured again until it stays where it is.
+_MAX_ROUNDS = 12
+_STILL_PX = 0.003
+# Steps of the fixed point by which the line of a displaced pixel is found; each gains the slope of the displacement,
+# which is well below a tenth.
+_LINE_STEPS = 4
+# Pixels between those of a tile over which its place on the slow axis is averaged.
+_SPARSE = 4
+# 1-sigma of a shift that is only searched for, px; how many times the median tiles may be off; and heights of peaks
+# that may be periods of a lattice, of the highest.
+_COARSE_PX, _FAR, _PERIODIC = 1.0, 4.0, 0.8
+# How much the drift is taken to bend at a knot, px: far more than tiles tell it to, so that it decides only where no
+# tile was measured, and the drift goes on there in a straight line with such an uncertainty.
+_BEND_PX = 2.0
+# Of the mean over the first scan, which is zero by definition, px.
+_ZERO_PX = 1e-4
+# Corrected scans whose whole images are farther apart are not, px.
+_SAME_PLACE_PX = 0.5
+# Pixels that a cubic interpolation takes beyond the two nearest ones.
+_REACH_PX = 1
+_OTHER_SENSE = "try the other sense of rotation, -90 instead of 90 or the reverse"
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedScan:
+    """One scan.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels as they were scanned: the rows are the lines.
+    quarter_turns
+        Scan rotation in units of 90 degrees. A positive one turns the specimen in the image from +x towards +y.
+    camera
+        Camera of the image, or None for raw pixels.
+    """
+
+    image: AnyImage
+    quarter_turns: int
+    camera: ScanCamera | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPairDrift:
+    """Drift during n scans, each at k knots along its slow axis.
+
+    All displacements are in the square that all scans show, turned as with no scan rotation; positive ones move the
+    specimen towards +x and +y. Their zero is the mean over the first scan.
+
+    Attributes
+    ----------
+    progress
+        (k,) knots, as the part of the scan's lines that came before. Displacements are cubic splines through them.
+    displacement_px
+        (n, k, 2) displacement of the specimen.
+    covariance_px2
+        (n, k, 2, n, k, 2) its covariance, from the scatter of the tiles.
+    tiles
+        Number of tiles that were compared.
+    """
+
+    progress: Array
+    displacement_px: Array
+    covariance_px2: Array
+    tiles: int
+
+    @property
+    def sigma_px(self) -> Array:
+        """(n, k, 2) 1-sigma of the displacements."""
+        size = self.displacement_px.size
+        variances = np.diagonal(self.covariance_px2.reshape(size, size))
+        return np.sqrt(variances).reshape(self.displacement_px.shape)
+
+    def at(self, scan: int, progress: Array) -> Array:
+        """Return the displacements (..., 2) of a scan at parts of its lines (...)."""
+        return np.asarray(CubicSpline(self.progress, self.displacement_px[scan])(progress))
+
+
+def measure_scan_pairs(scans: Sequence[TurnedScan]) -> ScanPairDrift:
+    """Measure the drift during scans of one place with turned rasters.
+
+    Parameters
+    ----------
+    scans
+        Two or more, of one size and magnification; some must be turned by an odd number of quarters against others.
+
+    Returns
+    -------
+    ScanPairDrift
+        The drift of each scan.
+
+    Raises
+    ------
+    InvalidValueError
+        If the images differ in size or are too small, no two of them are turned against each other, or they do not
+        match.
+    """
+    rasters = _prepare(scans)
+    side = rasters[0].map_x.shape[0]
+    if side < _LEAST_SIDE_PX:
+        raise InvalidValueError(
+            f"scans that share {side} x {side} px",
+            expected=f"at least {_LEAST_SIDE_PX} px along each side",
+        )
+    pairs = [
+        (i, j)
+        for i, first in enumerate(scans)
+        for j, second in enumerate(scans)
+        if first.quarter_turns % 2 == 0 and second.quarter_turns % 2 == 1
+    ]
+    if len({index for pair in pairs for index in pair}) < len(scans):
+        turns = ", ".join(f"{90 * (scan.quarter_turns % 4)}" for scan in scans)
+        raise InvalidValueError(
+            f"scans turned by {turns} degrees", expected="some that are turned by 90 against others"
+        )
+    # Of a tall frame, the square shows only the middle lines.
+    lines = np.concatenate([raster.map_y.ravel() for raster in rasters]) / scans[0].image.shape[0]
+    count = min(side // _KNOT_PX, _MAX_KNOTS)
+    knots = lines.min() + (np.arange(count) + 0.5) / count * np.ptp(lines)
+    drift = np.zeros((len(scans), count, 2))
+
+    def warp() -> list[_Warped]:
+        return [_warp(raster, knots, own) for raster, own in zip(rasters, drift, strict=True)]
+
+    # The whole images first, to some pixels, since they are distorted; then tiles that are searched, near where they
+    # should be; and least squares.
+    warped = warp()
+    for number in range(1, len(scans)):
+        drift[number] = _measure_offset(warped[0], warped[number], number)
+    drift = _search(warp(), pairs, knots, drift)
+    for _ in range(_MAX_ROUNDS):
+        found = _refine(warp(), pairs, knots, drift)
+        change = float(np.abs(found.displacement_px - drift).max())
+        drift = found.displacement_px
+        if change < _STILL_PX:
+            break
+    _check(warp(), pairs)
+    return found
+
+
+def average_scans(scans: Sequence[TurnedScan], drift: ScanPairDrift) -> StackedImage:
+    """Average scans without their drift: the square that all of them show, with no scan rotation.
+
+    Parameters
+    ----------
+    scans, drift
+        The scans, and what :func:`measure_scan_pairs` found of them.
+
+    Returns
+    -------
+    StackedImage
+        Mean, standard error, and number of scans in each pixel.
+    """
+    rasters = _prepare(scans)
+    side = rasters[0].map_x.shape[0]
+    stack = Stack((side, side))
+    for raster, own in zip(rasters, drift.displacement_px, strict=True):
+        warped = _warp(raster, drift.progress, own)
+        stack.add(warped.image, warped.valid)
+    return stack.result()
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """A scan as (h, w) coefficients of a cubic spline, and where it shows each pixel of the common square: (s, s) raw
+    columns and rows.
+    """
+
+    coefficients: Array32
+    map_x: Array32
+    map_y: Array32
+
+
+@dataclass(frozen=True, eq=False)
+class _Warped:
+    """A scan in the common square without the drift known so far.
+
+    ``image`` and ``valid`` are (s, s); ``progress`` is the part of the lines that came before each pixel.
+    """
+
+    image: Array32
+    valid: Mask
+    progress: Array32
+
+
+def _prepare(scans: Sequence[TurnedScan]) -> list[_Raster]:
+    if len(scans) < 2:
+        raise InvalidValueError(f"{len(scans)} scan", expected="two or more")
+    rectifier = Rectifier("cubic")
+    rasters = []
+    for number, scan in enumerate(scans, 1):
+        image = check_image(scan.image)
+        if image.ndim != 2 or image.shape != scans[0].image.shape:
+            raise InvalidValueError(
+                f"scan {number} of shape {image.shape}",
+                expected=f"a grey image of shape {scans[0].image.shape[:2]}",
+            )
+        height, width = image.shape
+        maps = rectifier.maps((width, height), scan.camera)
+        # A raster turned by +90 degrees shows the specimen turned from +x towards +y, which numpy calls -1.
+        x, y = (_middle_square(np.rot90(one, scan.quarter_turns)) for one in maps)
+        coefficients = spline_filter(
+            image.astype(np.float32), order=3, output=np.float32, mode="nearest"
+        )
+        rasters.append(_Raster(coefficients, x, y))
+    return rasters
+
+
+def _middle_square(values: Array32) -> Array32:
+    height, width = values.shape
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    return np.ascontiguousarray(values[top : top + side, left : left + side])
+
+
+def _weigh_knots(knots: Array, progress: Array32) -> Array:
+    """Weights (..., k) of the knots of a cubic spline at places (...)."""
+    return np.asarray(CubicSpline(knots, np.eye(len(knots)))(progress))
+
+
+def _warp(raster: _Raster, knots: Array, displacement_px: Array) -> _Warped:
+    """Resample a scan once, at the raw pixels where it shows the specimen without its drift."""
+    height, width = raster.coefficients.shape
+    side = raster.map_x.shape[0]
+    rows, cols = np.indices((side, side), dtype=np.float32)
+    x, y = raster.map_x, raster.map_y
+    spline = CubicSpline(knots, displacement_px)
+    for _ in range(_LINE_STEPS if displacement_px.any() else 0):
+        moved = spline(_progress(x, y, raster)).astype(np.float32)
+        at_x, at_y = cols + moved[..., 0], rows + moved[..., 1]
+        x, y = (_sample_map(one, at_x, at_y) for one in (raster.map_x, raster.map_y))
+    # OpenCV rounds positions to 1/32 px, which is more than the displacements are known to.
+    image = map_coordinates(raster.coefficients, [y, x], order=3, mode="nearest", prefilter=False)
+    valid = find_scanned(x, y, (width, height), _REACH_PX)
+    return _Warped(image, valid, _progress(x, y, raster))
+
+
+def _progress(x: Array32, y: Array32, raster: _Raster) -> Array32:
+    """The part of the scan before raw pixels; the flyback, a fraction of one line, is not known here."""
+    height, width = raster.coefficients.shape
+    return np.asarray((y + x / width) / height, dtype=np.float32)
+
+
+def _sample_map(values: Array32, at_x: Array32, at_y: Array32) -> Array32:
+    """A smooth map at places between and beyond its pixels, to first order."""
+    side = values.shape[0]
+    x0 = np.clip(np.rint(at_x), 0, side - 1).astype(np.intp)
+    y0 = np.clip(np.rint(at_y), 0, side - 1).astype(np.intp)
+    by_y, by_x = (np.asarray(slope) for slope in np.gradient(values))
+    moved = values[y0, x0] + by_x[y0, x0] * (at_x - x0) + by_y[y0, x0] * (at_y - y0)
+    return moved.astype(np.float32)
+
+
+def _find_valid_rectangle(valid: Mask) -> Region:
+    """A rectangle of valid pixels, empty where there is none: edges are taken off where most is missing."""
+    left, top, right, bottom = 0, 0, valid.shape[1], valid.shape[0]
+    while right > left and bottom > top:
+        part = ~valid[top:bottom, left:right]
+        missing = part[:, 0].mean(), part[0].mean(), part[:, -1].mean(), part[-1].mean()
+        if not part.any():
+            return left, top, right, bottom
+        edge = int(np.argmax(missing))
+        left, top = left + (edge == 0), top + (edge == 1)
+        right, bottom = right - (edge == 2), bottom - (edge == 3)
+    return 0, 0, 0, 0
+
+
+def _measure_offset(first: _Warped, other: _Warped, number: int) -> Array:
+    """Offset (2,) of a whole scan from the first one to some pixels, without regard to how they are distorted."""
+    cut = []
+    for scan in (first, other):
+        region = _find_valid_rectangle(scan.valid)
+        left, top, right, bottom = region
+        cut.append((np.array([left, top], dtype=np.float64), scan.image[top:bottom, left:right]))
+    reference = CoarseReference(Pyramid(cut[0][1]), RegistrationSettings().min_overlap)
+    peaks = find_coarse_peaks(reference, Pyramid(cut[1][1]), cut[0][0] - cut[1][0])
+    if not peaks:
+        raise InvalidValueError(
+            f"no shift at which scan {number + 1} shows what scan 1 does",
+            expected="scans of one place that are turned by what is said",
+            do=_OTHER_SENSE,
+        )
+    return np.array(peaks[0].shift_px) + cut[1][0] - cut[0][0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Tiles:
+    """What t tiles tell of the shift of their second scan against the first.
+
+    ``information`` (t, 2, 2) is the matrix of their normal equations, ``right`` (t, 2) the right side; ``scans`` (t, 2)
+    are the two, ``weights`` (t, 2, k) those of the knots of either in the mean over the tile.
+    """
+
+    information: Array
+    right: Array
+    scans: Indices
+    weights: Array
+
+    def design(self, scans: int) -> Array:
+        """(t, n k) the shift as a difference of displacements at knots."""
+        count, _, knots = self.weights.shape
+        design = np.zeros((count, scans, knots))
+        numbers = np.arange(count)
+        design[numbers, self.scans[:, 1]] += self.weights[:, 1]
+        design[numbers, self.scans[:, 0]] -= self.weights[:, 0]
+        return design.reshape(count, -1)
+
+
+def _look_at_tiles(
+    warped: Sequence[_Warped],
+    pairs: Sequence[tuple[int, int]],
+    side: int,
+    knots: Array,
+    look: Callable[[Array32, Array32], tuple[Array, Array] | None],
+) -> _Tiles:
+    """Let ``look`` compare the tiles of all pairs; what it gives are normal matrix and right side."""
+    found = []
+    whole = warped[0].image.shape[0]
+    edges = (whole % side) // 2 + side * np.arange(whole // side)
+    for (i, j), top, left in itertools.product(pairs, edges, edges):
+        part = slice(top, top + side), slice(left, left + side)
+        both = warped[i], warped[j]
+        if not all(one.valid[part].all() for one in both):
+            continue
+        told = look(both[0].image[part], both[1].image[part])
+        if told is None:
+            continue
+        sparse = tuple(slice(one.start, one.stop, _SPARSE) for one in part)
+        means = [_weigh_knots(knots, one.progress[sparse]).mean(axis=(0, 1)) for one in both]
+        found.append((*told, (i, j), means))
+    if not found:
+        raise InvalidValueError(
+            "no part of the scans that both show with the same structure",
+            expected="scans of one place that are turned by what is said",
+            do=_OTHER_SENSE,
+        )
+    information, right, scans, weights = (np.array(one) for one in zip(*found, strict=True))
+    return _Tiles(information, right, scans, weights)
+
+
+def _search_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None:
+    """The shift of a tile to a pixel, however much it is strained; None where no shift stands out."""
+    reference = CoarseReference(Pyramid(first), RegistrationSettings().min_overlap)
+    peaks = find_coarse_peaks(reference, Pyramid(second), np.zeros(2))
+    near = [peak for peak in peaks if peak.significant]
+    if not near:
+        return None
+    # On a lattice all periods are about as high.
+    high = [peak for peak in near if peak.correlation > _PERIODIC * near[0].correlation]
+    best = min(high, key=lambda peak: math.hypot(*peak.shift_px))
+    information = np.eye(2) / _COARSE_PX**2
+    return information, information @ np.array(best.shift_px)
+
+
+def _compare_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None:
+    """Normal equations of Lucas and Kanade for a tile, gain and offset taken out; None where it shows nothing.
+
+    The matrix is of products of the gradients of one image with those of the other, to which noise adds nothing on
+    average; the right side, with the mean of both gradients, is zero on average where the images agree.
+    """
+    inner = slice(_RIM_PX, -_RIM_PX), slice(_RIM_PX, -_RIM_PX)
+    greys, slopes = [], []
+    for image in (first, second):
+        smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTH_PX)
+        grey = (smooth[inner] - smooth[inner].mean()).ravel()
+        spread = float(np.sqrt(np.mean(grey**2)))
+        if spread == 0.0:
+            return None
+        greys.append(grey / spread)
+        slopes.append(np.stack([one[inner].ravel() for one in np.gradient(smooth)[::-1]]) / spread)
+    # What an offset or a gain would explain tells nothing of a shift.
+    common = greys[0] + greys[1]
+    common /= np.linalg.norm(common)
+    slopes = [one - one.mean(axis=1, keepdims=True) for one in slopes]
+    slopes = [one - np.outer(one @ common, common) for one in slopes]
+    left = greys[0] - greys[1]
+    variance = float(np.mean(left**2))
+    cross = slopes[0] @ slopes[1].T
+    # Of a shift by d, the second image is the first one less its slope times d.
+    return 0.5 * (cross + cross.T) / variance, 0.5 * (slopes[0] + slopes[1]) @ left / variance
+
+
+def _solve(tiles: _Tiles, drift: Array) -> tuple[Array, Array, Array]:
+    """Least squares for the displacements (n, k, 2), with what tiles tell beyond ``drift``.
+
+    Returns
+    -------
+    The displacements (n k, 2), the inverse of the normal matrix (n k, 2, n k, 2), and what is left of the right sides
+    of the tiles (t, 2).
+    """
+    scans, count = drift.shape[:2]
+    unknowns = scans * count
+    design, prior = tiles.design(scans), _prior_information(scans, count)
+    normal = np.einsum("tu,tab,tv->uavb", design, tiles.information, design, optimize=True) + prior
+    known = drift.reshape(unknowns, 2)
+    right = np.einsum("tu,ta->ua", design, tiles.right) - np.einsum("uavb,vb->ua", prior, known)
+    inverse = invert_scaled(normal.reshape(2 * unknowns, -1))
+    change = (inverse @ right.ravel()).reshape(unknowns, 2)
+    left = tiles.right - np.einsum(
+        "tab,tu,ub->ta", tiles.information, design, change, optimize=True
+    )
+    return known + change, inverse.reshape(unknowns, 2, unknowns, 2), left
+
+
+def _search(
+    warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]], knots: Array, drift: Array
+) -> Array:
+    """The drift (n, k, 2) to a fraction of a pixel, from tiles that are searched one by one."""
+    tiles = _look_at_tiles(warped, pairs, _SEARCHED_PX, knots, _search_tile)
+    while True:
+        found, _, left = _solve(tiles, drift)
+        # Of the searched tiles, what is left in units of their sigma.
+        far = np.hypot(*left.T) * _COARSE_PX
+        near = far <= max(_FAR * float(np.median(far)), _COARSE_PX)
+        if near.all():
+            return found.reshape(drift.shape)
+        tiles = _Tiles(*(getattr(tiles, name.name)[near] for name in fields(tiles)))
+
+
+def _refine(
+    warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]], knots: Array, drift: Array
+) -> ScanPairDrift:
+    """One step of Gauss and Newton for the drift."""
+    tiles = _look_at_tiles(warped, pairs, _COMPARED_PX, knots, _compare_tile)
+    found, inverse, left = _solve(tiles, drift)
+    scans, count = drift.shape[:2]
+    unknowns = scans * count
+    freedom = len(left) - unknowns
+    if freedom < unknowns:
+        raise InvalidValueError(
+            f"{counted(len(left), 'tile')} of {_COMPARED_PX} px that both scans show",
+            expected=f"at least {2 * unknowns} for {counted(unknowns, 'displacement')}",
+            do="take pictures that overlap by more",
+        )
+    # From the scatter of the tiles, which knows of all that the tiles do not: noise that interpolation has made
+    # dependent, structure that differs, drift that is no function of the slow axis (White 1980, doi:10.2307/1912934).
+    scores = np.einsum("tu,ta->tua", tiles.design(scans), left).reshape(len(left), -1)
+    meat = scores.T @ scores * (len(left) / freedom) + _prior_information(scans, count).reshape(
+        2 * unknowns, -1
+    )
+    flat = inverse.reshape(2 * unknowns, -1)
+    return ScanPairDrift(
+        knots,
+        found.reshape(drift.shape),
+        (flat @ meat @ flat).reshape(scans, count, 2, scans, count, 2),
+        len(left),
+    )
+
+
+def _prior_information(scans: int, count: int) -> Array:
+    """(n k, 2, n k, 2) information on bends at the knots, and on the mean over the first scan."""
+    unknowns = scans * count
+    bends = np.diff(np.eye(count), n=2, axis=0) / _BEND_PX
+    one = np.kron(np.eye(scans), bends.T @ bends)
+    mean = np.zeros(unknowns)
+    mean[:count] = 1.0 / count / _ZERO_PX
+    one += np.outer(mean, mean)
+    return np.einsum("uv,ab->uavb", one, np.eye(2))
+
+
+def _check(warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]]) -> None:
+    """Refuse scans that do not match as they are now corrected."""
+    for i, j in pairs:
+        first, second = warped[i], warped[j]
+        left, top, right, bottom = _find_valid_rectangle(first.valid & second.valid)
+        part = slice(top, bottom), slice(left, right)
+        found = register_pair(
+            first.image[part], second.image[part], guess_covariance=np.diag([1.0, 1.0])
+        )
+        # It need not be accepted: what little is left between lines is no shift of the whole, and may not converge.
+        same = found.correlation >= RegistrationSettings().min_correlation
+        if not (same and math.hypot(*found.shift_px) < _SAME_PLACE_PX):
+            raise InvalidValueError(
+                f"scans {i + 1} and {j + 1} do not match, corrected as well as they can be: {found.reason}",
+                expected="scans of one place that are turned by what is said",
+                do=_OTHER_SENSE,
+            )
