@@ -26,8 +26,8 @@ from semcal_ros.cli.options import (
     PATH,
     config_option,
     output_option,
-    parse_angles_or_degrees,
     parse_ratio,
+    parse_tilts,
     require_folder,
 )
 from semcal_ros.config.config import load_config
@@ -84,7 +84,7 @@ def _wait_for_enter(text: str) -> None:
     "--tilts",
     default="0deg,20deg,40deg",
     show_default=True,
-    callback=parse_angles_or_degrees,
+    callback=parse_tilts,
     metavar="ANGLE,...",
     help="Tilts of each visit; a bare number is in degrees.",
 )

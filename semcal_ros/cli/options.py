@@ -42,10 +42,9 @@ __all__ = [
     "output_option",
     "overwrite_option",
     "parse_angle",
-    "parse_angles",
-    "parse_angles_or_degrees",
     "parse_lengths",
     "parse_ratio",
+    "parse_tilts",
     "require_folder",
     "squares_option",
 ]
@@ -161,23 +160,16 @@ def parse_angle(
     return found
 
 
-def parse_angles(
+def parse_tilts(
     context: click.Context, parameter: click.Parameter, text: str | None
 ) -> tuple[float, ...] | None:
-    """Callback of an option for angles with their units, such as ``0deg,6deg,12deg``; in rad."""
+    """Callback of an option for angles such as ``0,20deg``, whose bare numbers are degrees; in rad."""
     if text is None:
         return None
-    found = (parse_angle(context, parameter, part) for part in text.split(","))
-    return tuple(angle for angle in found if angle is not None)
-
-
-def parse_angles_or_degrees(
-    context: click.Context, parameter: click.Parameter, text: str
-) -> tuple[float, ...]:
-    """Callback of an option for angles such as ``0,20deg``, whose bare numbers are degrees; in rad."""
     parts = [part.strip() for part in text.split(",")]
     stated = (part if plain_number(part) is None else f"{part}deg" for part in parts)
-    return parse_angles(context, parameter, ",".join(stated)) or ()
+    found = (parse_angle(context, parameter, part) for part in stated)
+    return tuple(angle for angle in found if angle is not None)
 
 
 overwrite_option = click.option(

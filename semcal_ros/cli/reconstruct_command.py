@@ -30,7 +30,7 @@ from semcal_ros.cli.options import (
     dask_option,
     output_option,
     parse_angle,
-    parse_angles,
+    parse_tilts,
 )
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
@@ -53,9 +53,10 @@ __all__ = ["command"]
 )
 @click.option(
     "--tilts",
-    callback=parse_angles,
+    callback=parse_tilts,
     metavar="ANGLE,...",
-    help="Tilts of two or three images, such as 0deg,6deg,12deg, instead of those of the stage: measures heights.",
+    help="Tilts of two or three images, such as 0deg,6deg,12deg (bare numbers are degrees), instead of those of the"
+    " stage: measures heights.",
 )
 @click.option(
     "--tilt-axis",

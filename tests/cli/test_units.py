@@ -25,7 +25,7 @@ import pytest
 from semcal_ros.cli.acquire_command import command as acquire
 from semcal_ros.cli.doctor_command import command as doctor
 from semcal_ros.cli.drift_command import command as drift
-from semcal_ros.cli.options import parse_angles_or_degrees
+from semcal_ros.cli.options import parse_tilts
 from semcal_ros.cli.reconstruct_command import command as reconstruct
 from tests.helpers.semcal_runs import refused
 
@@ -63,9 +63,11 @@ def test_defaults_are_what_they_were(command: click.Command) -> None:
 
 
 @pytest.mark.parametrize("text", ["0,20,40", "0deg,20deg,40deg", "0, 20 deg, 40"])
-def test_tilts_to_acquire(text: str) -> None:
-    (parameter,) = (p for p in acquire.params if "--tilts" in p.opts)
-    found = parse_angles_or_degrees(click.Context(acquire), parameter, text)
+@pytest.mark.parametrize("command", [acquire, reconstruct])
+def test_bare_tilts_are_degrees(command: click.Command, text: str) -> None:
+    (parameter,) = (p for p in command.params if "--tilts" in p.opts)
+    assert parameter.callback is parse_tilts
+    found = parse_tilts(click.Context(command), parameter, text)
     assert found == pytest.approx([0.0, math.radians(20.0), math.radians(40.0)])
 
 
