@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -28,6 +29,7 @@ from semcal_ros.cli.options import (
     interpolation_option,
     no_drift_option,
     output_option,
+    parse_tilts,
 )
 from semcal_ros.cli.output import (
     echo_nominal_unit,
@@ -46,6 +48,21 @@ from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.stack import StackResult, stack
 
 __all__ = ["command"]
+
+# 1-sigma of the drift beyond which the average is visibly blurred, px.
+_UNKNOWN_PX = 1.0
+
+
+def parse_scan_pairs(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> float | None:
+    """Callback of ``--scan-pairs``; in degrees."""
+    angles = parse_tilts(context, parameter, text)
+    if angles is None:
+        return None
+    if len(angles) != 1:
+        raise click.BadParameter(f"{text!r} is not one angle such as 90")
+    return math.degrees(angles[0])
 
 
 @click.command("stack")
@@ -70,10 +87,10 @@ __all__ = ["command"]
 @no_drift_option("Average the frames where they are.")
 @click.option(
     "--scan-pairs",
-    type=float,
-    metavar="DEG",
-    help="Every second frame was scanned with the raster turned by 90 or -90 degrees (positive: it shows the specimen"
-    " turned from +x to +y): undo the drift line by line.",
+    metavar="ANGLE",
+    callback=parse_scan_pairs,
+    help="Of 2 to 12 frames, every second one was scanned with a scan rotation of 90 or -90 degrees (90: it shows the"
+    " specimen turned clockwise): undo the drift within the scans, and average the square that all show.",
 )
 @interpolation_option("cubic")
 @dask_option
@@ -155,16 +172,28 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
         )
     elif result.lost:
         echo_notes([f"tracking was lost: {counted(result.lost, 'frame')} after that left out"])
-    if result.typical_error is not None:
+    if result.scan_drift is not None:
+        # Of two values each, the median of the scatter would be a third too small.
+        error = result.image.standard_error
+        rms = float(np.sqrt(np.nanmean(np.square(error))))
+        click.echo(f"standard error: {rms:.4g} grey levels (RMS of the pixels)")
+    elif result.typical_error is not None:
         click.echo(f"standard error: {result.typical_error:.4g} grey levels (median of the pixels)")
 
 
 def _echo_scan_drift(drift: ScanPairDrift, pixel_size_m: float) -> None:
     """Print how far each scan was displaced while it was taken."""
+    lines = np.linspace(drift.progress[0], drift.progress[-1], 101)
     for number, sigma in enumerate(drift.sigma_px):
-        way_px = np.ptp(drift.at(number, np.linspace(0.0, 1.0, 101)), axis=0)
+        way_px = np.ptp(drift.at(number, lines), axis=0)
+        x_nm, y_nm = 1e9 * pixel_size_m * way_px
         click.echo(
-            f"scan {number + 1}: drift by {way_px[0]:.2f} px in x and {way_px[1]:.2f} px in y during it"
-            f" ({1e9 * pixel_size_m * float(np.hypot(*way_px)):.3g} nm); 1-sigma of a line"
-            f" {float(np.median(sigma)):.2g} px"
+            f"scan {number + 1}: drift within {way_px[0]:.2f} px in x and {way_px[1]:.2f} px in y"
+            f" ({x_nm:.3g} and {y_nm:.3g} nm) from {lines[0]:.0%} to {lines[-1]:.0%} of its lines;"
+            f" 1-sigma {float(np.median(sigma)):.2g} px in the median, {float(sigma.max()):.2g} px at most"
+        )
+    if float(drift.sigma_px.max()) > _UNKNOWN_PX:
+        click.echo(
+            "warning: parts of the scans have too little structure to tell their drift; look at the average there",
+            err=True,
         )

@@ -81,7 +81,8 @@ class StackResult:
     image
         Mean, standard error, and number of frames in each pixel.
     camera
-        Camera of the average: the ``rectified`` one of the first frame; nominal without a calibration.
+        Camera of the average: the ``rectified`` one of the first frame; nominal without a calibration. Of scan pairs,
+        the average is the square in the middle of its image.
     dtype
         Type of the grey levels of the recording.
     stamps_ns
@@ -89,7 +90,7 @@ class StackResult:
     used
         (n,) bool: whether the frame is in the average.
     path
-        Drift of the n frames; None where it was left in.
+        Drift of the n frames; None where it was left in, or is that of scan pairs.
     states
         Number of frames by the kind of drift known live, the most frequent first.
     other_kind
@@ -259,7 +260,15 @@ def stack(
     _check_suffix(sigma, TIFF_SUFFIXES)
     quarter = None
     if scan_pairs_deg is not None:
-        quarter = _check_scan_pairs(scan_pairs_deg, drift, film_path is not None, dask is not None)
+        others = {
+            "--no-drift": not drift,
+            "--video": film_path is not None,
+            "--dask": dask is not None,
+            "--interpolation": interpolation != "cubic",
+        }
+        quarter = _check_scan_pairs(
+            scan_pairs_deg, [name for name, given in others.items() if given]
+        )
     with (
         open_workers(dask) as workers,
         open_source(source, microscope, magnification=magnification) as opened,
@@ -345,18 +354,17 @@ def _save(
     return result
 
 
-def _check_scan_pairs(scan_pairs_deg: float, drift: bool, video: bool, dask: bool) -> int:
-    """Return the scan rotation in quarters of a turn."""
-    if scan_pairs_deg not in (90.0, -90.0):
+def _check_scan_pairs(scan_pairs_deg: float, others: Sequence[str]) -> int:
+    """Return the scan rotation in quarters of a turn; ``others`` are options that do not go with it."""
+    if abs(abs(scan_pairs_deg) - 90.0) > 1e-9:
         raise InvalidValueError(
             f"--scan-pairs {scan_pairs_deg:g}",
             expected="90 or -90, the scan rotation of every second frame in degrees",
         )
-    for option, given in (("--no-drift", not drift), ("--video", video), ("--dask", dask)):
-        if given:
-            raise InvalidValueError(
-                f"--scan-pairs together with {option}", expected="one of the two"
-            )
+    if others:
+        raise InvalidValueError(
+            f"--scan-pairs together with {others[0]}", expected="one of the two"
+        )
     return round(scan_pairs_deg / 90.0)
 
 
@@ -373,11 +381,15 @@ def _average_pairs(
         raise InvalidValueError(
             f"{counted(count, 'frame')} for --scan-pairs",
             expected=f"2 to {_MOST_SCANS} of one magnification, every second one turned",
-            do="stack parts of the recording",
+        )
+    if selection.other_kind:
+        raise InvalidValueError(
+            f"--scan-pairs with {counted(selection.other_kind, 'frame')} of another size or encoding",
+            expected="frames of one kind, every second one turned",
         )
     used = np.ones(count, dtype=bool)
     scans = [
-        TurnedScan(frame.image, quarter_turns * (frame.number % 2), frame.camera)
+        TurnedScan(frame.image, quarter_turns * (frame.number % 2), frame.camera, frame.mask)
         for frame in _read_chosen(opened, model, selection, used, unused_too=False)
     ]
     on_progress("matching scans", 0, None)
@@ -427,6 +439,7 @@ class _Frame(NamedTuple):
     camera: ScanCamera
     drift: RasterDrift | None
     used: bool
+    mask: Mask | None = None
 
 
 def _read_chosen(
@@ -445,7 +458,7 @@ def _read_chosen(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        yield _Frame(number, grey, camera, drift, bool(used[number]))
+        yield _Frame(number, grey, camera, drift, bool(used[number]), frame.mask)
 
 
 def add_part(

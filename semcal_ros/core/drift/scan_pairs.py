@@ -43,7 +43,7 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import map_coordinates, minimum_filter, spline_filter
 
 from semcal_ros.core.arrays import (
     AnyImage,
@@ -78,20 +78,31 @@ _LEAST_SIDE_PX = 3 * _SEARCHED_PX
 _KNOT_PX, _MAX_KNOTS = 48, 32
 # Smoothing before gradients are taken, and pixels at the edge of a tile that it spoils.
 _SMOOTH_PX, _RIM_PX = 1.0, 3
+# Gradients that two tiles must have in common, of all that they have: noise alone has 0.1 by chance in a tile of
+# 26 x 26 px after that smoothing. In one direction alone, a quarter of it.
+_COMMON_SLOPE = 0.3
+# Least mean square of the difference of two tiles of variance 1: that of the rounding to 8 bits.
+_LEAST_VARIANCE = 1e-6
 # The displacement is taken out and what is left is measured again until it stays where it is.
-_MAX_ROUNDS = 12
+_MAX_ROUNDS, _FREE_ROUNDS = 12, 2
 _STILL_PX = 0.003
+# Where little is known, it may wander within what is known of it.
+_SETTLED_SIGMAS = 0.5
+# Displacement from line to line beyond which scans are not compared: a twentieth of the width in a fifth of a scan.
+_FASTEST = 0.25
 # Steps of the fixed point by which the line of a displaced pixel is found; each gains the slope of the displacement,
 # which is well below a tenth.
 _LINE_STEPS = 4
 # Pixels between those of a tile over which its place on the slow axis is averaged.
-_SPARSE = 4
+_SPARSE = 8
 # 1-sigma of a shift that is only searched for, px; how many times the median tiles may be off; and heights of peaks
 # that may be periods of a lattice, of the highest.
 _COARSE_PX, _FAR, _PERIODIC = 1.0, 4.0, 0.8
 # How much the drift is taken to bend at a knot, px: far more than tiles tell it to, so that it decides only where no
 # tile was measured, and the drift goes on there in a straight line with such an uncertainty.
 _BEND_PX = 2.0
+# Part of a tile's residual that the fit leaves it at least: what a knot is told by one tile alone has no residual.
+_LEAST_FREEDOM = 0.02
 # Of the mean over the first scan, which is zero by definition, px.
 _ZERO_PX = 1e-4
 # Corrected scans whose whole images are farther apart are not, px.
@@ -99,6 +110,14 @@ _SAME_PLACE_PX = 0.5
 # Pixels that a cubic interpolation takes beyond the two nearest ones.
 _REACH_PX = 1
 _OTHER_SENSE = "try the other sense of rotation, -90 instead of 90 or the reverse"
+_WHY_NOT = (
+    "look whether both scans show one place, are turned by 90 degrees in the sense that is said,"
+    " and are no lattice"
+)
+
+
+#: A tile: the two scans that are compared, and its top and left, px.
+_Place = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +132,14 @@ class TurnedScan:
         Scan rotation in units of 90 degrees. A positive one turns the specimen in the image from +x towards +y.
     camera
         Camera of the image, or None for raw pixels.
+    mask
+        (h, w) true where the image may be used, or None for all of it. Pixels that are no number never are.
     """
 
     image: AnyImage
     quarter_turns: int
     camera: ScanCamera | None = None
+    mask: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +230,39 @@ def measure_scan_pairs(scans: Sequence[TurnedScan]) -> ScanPairDrift:
     for number in range(1, len(scans)):
         drift[number] = _measure_offset(warped[0], warped[number], number)
     drift = _search(warp(), pairs, knots, drift)
-    for _ in range(_MAX_ROUNDS):
-        found = _refine(warp(), pairs, knots, drift)
+    allowed: set[_Place] | None = None
+    for number in range(_MAX_ROUNDS):
+        found, compared = _refine(warp(), pairs, knots, drift, allowed)
+        # A tile at the edge that came and went with each step would keep it from settling.
+        if number >= _FREE_ROUNDS:
+            allowed = compared
         change = float(np.abs(found.displacement_px - drift).max())
         drift = found.displacement_px
+        _check_speed(found, side)
         if change < _STILL_PX:
             break
+    if change > _SETTLED_SIGMAS * float(found.sigma_px.max()) + _STILL_PX:
+        raise InvalidValueError(
+            f"displacements that still change by {change:.2g} px after {_MAX_ROUNDS} rounds",
+            expected="scans with enough structure in all parts",
+            do=_WHY_NOT,
+        )
     _check(warp(), pairs)
     return found
+
+
+def _check_speed(drift: ScanPairDrift, side: int) -> None:
+    """Refuse a drift that no specimen has, and for which the lines would not be found."""
+    lines = np.diff(drift.progress) * side / np.ptp(drift.progress)
+    known = drift.sigma_px.max(axis=2) < _BEND_PX
+    speeds = np.abs(np.diff(drift.displacement_px, axis=1)).max(axis=2) / lines
+    fastest = float(np.max(speeds, where=known[:, 1:] & known[:, :-1], initial=0.0))
+    if fastest > _FASTEST:
+        raise InvalidValueError(
+            f"a drift by {fastest:.2g} px from line to line",
+            expected=f"at most {_FASTEST:g} px",
+            do=_WHY_NOT,
+        )
 
 
 def average_scans(scans: Sequence[TurnedScan], drift: ScanPairDrift) -> StackedImage:
@@ -242,13 +289,18 @@ def average_scans(scans: Sequence[TurnedScan], drift: ScanPairDrift) -> StackedI
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """A scan as (h, w) coefficients of a cubic spline, and where it shows each pixel of the common square: (s, s) raw
-    columns and rows.
+    """A scan as (h, w) coefficients of a cubic spline, which of its pixels may be used, and where it shows each pixel
+    of the common square: (s, s) raw columns and rows, each with its derivatives by row and column. ``offset`` (x, y) is
+    what the middle of these maps lacks to that of the frame, 0 or 0.5 px.
     """
 
     coefficients: Array32
+    usable: Mask
     map_x: Array32
     map_y: Array32
+    slopes_x: tuple[Array32, Array32]
+    slopes_y: tuple[Array32, Array32]
+    offset: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,11 +331,41 @@ def _prepare(scans: Sequence[TurnedScan]) -> list[_Raster]:
         maps = rectifier.maps((width, height), scan.camera)
         # A raster turned by +90 degrees shows the specimen turned from +x towards +y, which numpy calls -1.
         x, y = (_middle_square(np.rot90(one, scan.quarter_turns)) for one in maps)
-        coefficients = spline_filter(
-            image.astype(np.float32), order=3, output=np.float32, mode="nearest"
+        usable = np.isfinite(image)
+        if scan.mask is not None:
+            usable &= scan.mask
+        if not usable.any():
+            raise InvalidValueError(f"scan {number} without a pixel that may be used")
+        # The filter is recursive: one pixel that is no number would spoil all.
+        grey = image.astype(np.float32)
+        grey[~usable] = np.median(grey[usable])
+        coefficients = spline_filter(grey, order=3, output=np.float32, mode="nearest")
+        tall, wide = np.rot90(maps[0], scan.quarter_turns).shape
+        rasters.append(
+            _Raster(
+                coefficients,
+                _shrink(usable),
+                x,
+                y,
+                _differentiate(x),
+                _differentiate(y),
+                (0.5 * ((wide - len(x)) % 2), 0.5 * ((tall - len(x)) % 2)),
+            )
         )
-        rasters.append(_Raster(coefficients, x, y))
     return rasters
+
+
+def _shrink(usable: Mask) -> Mask:
+    """Pixels whose neighbours, which an interpolation takes, may be used, too."""
+    if usable.all():
+        return usable
+    side = 2 * (_REACH_PX + 1) + 1
+    return np.asarray(minimum_filter(usable, size=side, mode="nearest"))
+
+
+def _differentiate(values: Array32) -> tuple[Array32, Array32]:
+    by_row, by_col = np.gradient(values)
+    return np.asarray(by_row, dtype=np.float32), np.asarray(by_col, dtype=np.float32)
 
 
 def _middle_square(values: Array32) -> Array32:
@@ -293,11 +375,6 @@ def _middle_square(values: Array32) -> Array32:
     return np.ascontiguousarray(values[top : top + side, left : left + side])
 
 
-def _weigh_knots(knots: Array, progress: Array32) -> Array:
-    """Weights (..., k) of the knots of a cubic spline at places (...)."""
-    return np.asarray(CubicSpline(knots, np.eye(len(knots)))(progress))
-
-
 def _warp(raster: _Raster, knots: Array, displacement_px: Array) -> _Warped:
     """Resample a scan once, at the raw pixels where it shows the specimen without its drift."""
     height, width = raster.coefficients.shape
@@ -305,13 +382,20 @@ def _warp(raster: _Raster, knots: Array, displacement_px: Array) -> _Warped:
     rows, cols = np.indices((side, side), dtype=np.float32)
     x, y = raster.map_x, raster.map_y
     spline = CubicSpline(knots, displacement_px)
-    for _ in range(_LINE_STEPS if displacement_px.any() else 0):
-        moved = spline(_progress(x, y, raster)).astype(np.float32)
+    for _ in range(_LINE_STEPS if displacement_px.any() or any(raster.offset) else 0):
+        moved = (spline(_progress(x, y, raster)) + raster.offset).astype(np.float32)
         at_x, at_y = cols + moved[..., 0], rows + moved[..., 1]
-        x, y = (_sample_map(one, at_x, at_y) for one in (raster.map_x, raster.map_y))
+        x = _sample_map(raster.map_x, raster.slopes_x, at_x, at_y)
+        y = _sample_map(raster.map_y, raster.slopes_y, at_x, at_y)
     # OpenCV rounds positions to 1/32 px, which is more than the displacements are known to.
     image = map_coordinates(raster.coefficients, [y, x], order=3, mode="nearest", prefilter=False)
     valid = find_scanned(x, y, (width, height), _REACH_PX)
+    if not raster.usable.all():
+        nearest = (
+            np.clip(np.rint(at), 0, top - 1).astype(np.intp)
+            for at, top in ((y, height), (x, width))
+        )
+        valid &= raster.usable[tuple(nearest)]
     return _Warped(image, valid, _progress(x, y, raster))
 
 
@@ -321,14 +405,15 @@ def _progress(x: Array32, y: Array32, raster: _Raster) -> Array32:
     return np.asarray((y + x / width) / height, dtype=np.float32)
 
 
-def _sample_map(values: Array32, at_x: Array32, at_y: Array32) -> Array32:
+def _sample_map(
+    values: Array32, slopes: tuple[Array32, Array32], at_x: Array32, at_y: Array32
+) -> Array32:
     """A smooth map at places between and beyond its pixels, to first order."""
-    side = values.shape[0]
-    x0 = np.clip(np.rint(at_x), 0, side - 1).astype(np.intp)
-    y0 = np.clip(np.rint(at_y), 0, side - 1).astype(np.intp)
-    by_y, by_x = (np.asarray(slope) for slope in np.gradient(values))
-    moved = values[y0, x0] + by_x[y0, x0] * (at_x - x0) + by_y[y0, x0] * (at_y - y0)
-    return moved.astype(np.float32)
+    last = values.shape[0] - 1
+    x0 = np.clip(np.rint(at_x), 0, last).astype(np.intp)
+    y0 = np.clip(np.rint(at_y), 0, last).astype(np.intp)
+    by_row, by_col = (slope[y0, x0] for slope in slopes)
+    return values[y0, x0] + by_col * (at_x - x0) + by_row * (at_y - y0)
 
 
 def _find_valid_rectangle(valid: Mask) -> Region:
@@ -368,13 +453,15 @@ class _Tiles:
     """What t tiles tell of the shift of their second scan against the first.
 
     ``information`` (t, 2, 2) is the matrix of their normal equations, ``right`` (t, 2) the right side; ``scans`` (t, 2)
-    are the two, ``weights`` (t, 2, k) those of the knots of either in the mean over the tile.
+    are the two, ``weights`` (t, 2, k) those of the knots of either in the mean over the tile, ``place`` (t,) numbers
+    where in the square the tile lies.
     """
 
     information: Array
     right: Array
     scans: Indices
     weights: Array
+    place: Indices
 
     def design(self, scans: int) -> Array:
         """(t, n k) the shift as a difference of displacements at knots."""
@@ -392,12 +479,23 @@ def _look_at_tiles(
     side: int,
     knots: Array,
     look: Callable[[Array32, Array32], tuple[Array, Array] | None],
-) -> _Tiles:
-    """Let ``look`` compare the tiles of all pairs; what it gives are normal matrix and right side."""
+    allowed: set[_Place] | None = None,
+) -> tuple[_Tiles, set[_Place]]:
+    """Let ``look`` compare the tiles of all pairs, or of those that are allowed; what it gives are normal matrix and
+    right side.
+
+    Returns
+    -------
+    The tiles that could be compared, and which they are.
+    """
     found = []
+    # Weights of the knots: the spline through the unit vectors.
+    weigh = CubicSpline(knots, np.eye(len(knots)))
     whole = warped[0].image.shape[0]
     edges = (whole % side) // 2 + side * np.arange(whole // side)
-    for (i, j), top, left in itertools.product(pairs, edges, edges):
+    for (i, j), top, left in itertools.product(pairs, edges.tolist(), edges.tolist()):
+        if allowed is not None and (i, j, top, left) not in allowed:
+            continue
         part = slice(top, top + side), slice(left, left + side)
         both = warped[i], warped[j]
         if not all(one.valid[part].all() for one in both):
@@ -405,17 +503,19 @@ def _look_at_tiles(
         told = look(both[0].image[part], both[1].image[part])
         if told is None:
             continue
-        sparse = tuple(slice(one.start, one.stop, _SPARSE) for one in part)
-        means = [_weigh_knots(knots, one.progress[sparse]).mean(axis=(0, 1)) for one in both]
-        found.append((*told, (i, j), means))
+        sparse = tuple(slice(one.start + _SPARSE // 2, one.stop, _SPARSE) for one in part)
+        means = [weigh(one.progress[sparse]).mean(axis=(0, 1)) for one in both]
+        found.append((*told, (i, j), means, (top, left)))
     if not found:
         raise InvalidValueError(
             "no part of the scans that both show with the same structure",
             expected="scans of one place that are turned by what is said",
             do=_OTHER_SENSE,
         )
-    information, right, scans, weights = (np.array(one) for one in zip(*found, strict=True))
-    return _Tiles(information, right, scans, weights)
+    information, right, scans, weights, places = (np.array(one) for one in zip(*found, strict=True))
+    _, place = np.unique(places, axis=0, return_inverse=True)
+    used = {(*pair, *where) for _, _, pair, _, where in found}
+    return _Tiles(information, right, scans, weights, place.ravel()), used
 
 
 def _search_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None:
@@ -454,10 +554,18 @@ def _compare_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None
     slopes = [one - one.mean(axis=1, keepdims=True) for one in slopes]
     slopes = [one - np.outer(one @ common, common) for one in slopes]
     left = greys[0] - greys[1]
-    variance = float(np.mean(left**2))
+    variance = max(float(np.mean(left**2)), _LEAST_VARIANCE)
     cross = slopes[0] @ slopes[1].T
+    own = math.sqrt(float(np.sum(slopes[0] ** 2)) * float(np.sum(slopes[1] ** 2)))
+    if not float(np.trace(cross)) > _COMMON_SLOPE * own:
+        return None
+    # Along an edge, or by chance across it, nothing is known of the shift; that is never less than nothing.
+    values, vectors = np.linalg.eigh(0.5 * (cross + cross.T))
+    known = vectors * (values > _COMMON_SLOPE * own / 4.0)
+    information = (known * values) @ known.T
     # Of a shift by d, the second image is the first one less its slope times d.
-    return 0.5 * (cross + cross.T) / variance, 0.5 * (slopes[0] + slopes[1]) @ left / variance
+    right = known @ known.T @ (0.5 * (slopes[0] + slopes[1]) @ left)
+    return information / variance, right / variance
 
 
 def _solve(tiles: _Tiles, drift: Array) -> tuple[Array, Array, Array]:
@@ -486,7 +594,7 @@ def _search(
     warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]], knots: Array, drift: Array
 ) -> Array:
     """The drift (n, k, 2) to a fraction of a pixel, from tiles that are searched one by one."""
-    tiles = _look_at_tiles(warped, pairs, _SEARCHED_PX, knots, _search_tile)
+    tiles, _ = _look_at_tiles(warped, pairs, _SEARCHED_PX, knots, _search_tile)
     while True:
         found, _, left = _solve(tiles, drift)
         # Of the searched tiles, what is left in units of their sigma.
@@ -498,10 +606,14 @@ def _search(
 
 
 def _refine(
-    warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]], knots: Array, drift: Array
-) -> ScanPairDrift:
-    """One step of Gauss and Newton for the drift."""
-    tiles = _look_at_tiles(warped, pairs, _COMPARED_PX, knots, _compare_tile)
+    warped: Sequence[_Warped],
+    pairs: Sequence[tuple[int, int]],
+    knots: Array,
+    drift: Array,
+    allowed: set[_Place] | None,
+) -> tuple[ScanPairDrift, set[_Place]]:
+    """One step of Gauss and Newton for the drift, and the tiles that it rests on."""
+    tiles, used = _look_at_tiles(warped, pairs, _COMPARED_PX, knots, _compare_tile, allowed)
     found, inverse, left = _solve(tiles, drift)
     scans, count = drift.shape[:2]
     unknowns = scans * count
@@ -513,18 +625,26 @@ def _refine(
             do="take pictures that overlap by more",
         )
     # From the scatter of the tiles, which knows of all that the tiles do not: noise that interpolation has made
-    # dependent, structure that differs, drift that is no function of the slow axis (White 1980, doi:10.2307/1912934).
-    scores = np.einsum("tu,ta->tua", tiles.design(scans), left).reshape(len(left), -1)
-    meat = scores.T @ scores * (len(left) / freedom) + _prior_information(scans, count).reshape(
-        2 * unknowns, -1
-    )
+    # dependent, structure that differs, drift that is no function of the slow axis. What a tile has pulled the
+    # solution towards itself is undone (the HC3 of MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7), and
+    # tiles at one place, which share the noise of a scan, count as one (Liang and Zeger 1986,
+    # doi:10.1093/biomet/73.1.13).
+    design = tiles.design(scans)
+    fitted = np.einsum("tu,uavb,tv->tab", design, inverse, design, optimize=True)
+    free = np.eye(2) - tiles.information @ fitted
+    undone = np.linalg.solve(free + _LEAST_FREEDOM * np.eye(2), left[..., None])[..., 0]
+    scores = np.einsum("tu,ta->tua", design, undone).reshape(len(left), -1)
+    places = np.zeros((tiles.place.max() + 1, scores.shape[1]))
+    np.add.at(places, tiles.place, scores)
+    meat = places.T @ places + _prior_information(scans, count).reshape(2 * unknowns, -1)
     flat = inverse.reshape(2 * unknowns, -1)
-    return ScanPairDrift(
+    result = ScanPairDrift(
         knots,
         found.reshape(drift.shape),
         (flat @ meat @ flat).reshape(scans, count, 2, scans, count, 2),
         len(left),
     )
+    return result, used
 
 
 def _prior_information(scans: int, count: int) -> Array:

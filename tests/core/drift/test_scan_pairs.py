@@ -63,7 +63,8 @@ def test_the_drift_is_found_within_its_uncertainty():
         ]
         found = measure_scan_pairs(scans)
         error = found.displacement_px - truth_at(drifts, found.progress)
-        assert np.sqrt(np.mean(error**2)) < 0.08
+        # The outer knots are told by few tiles.
+        assert np.sqrt(np.mean(error[:, 1:-1] ** 2)) < 0.06
         # Its mean over the first scan is zero by definition.
         ratios.append(error[1] / found.sigma_px[1])
     spread = float(np.sqrt(np.mean(np.square(np.concatenate(ratios)))))
