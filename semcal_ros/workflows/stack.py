@@ -214,9 +214,10 @@ def stack(
         False averages the frames without shifting them.
     scan_pairs_deg
         90 or -90: every second frame was scanned with the raster turned by this scan rotation, where a positive one
-        turns the specimen in the image from +x towards +y. The drift is then measured line by line
+        turns the specimen in the image from +x towards +y. The drift within the scans is then measured
         (:mod:`~semcal_ros.core.drift.scan_pairs`), and the average shows the square that all of them do, as with no
-        scan rotation. Neither stamps nor a frame time are used; at most 12 frames, no video, no Dask.
+        scan rotation. Neither stamps nor a frame time are used; at most 12 frames, no
+        video, no Dask, no other interpolation.
     interpolation
         ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
     video, fps

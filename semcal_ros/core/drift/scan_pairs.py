@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Drift within scans, line by line, from scans of one place with the raster turned by 90 degrees.
+"""Drift within scans, from scans of one place with the raster turned by 90 degrees.
 
 A specimen that drifts displaces the lines of a scan against each other: the displacement is a function of the slow
 axis alone. In a second scan whose raster is turned by 90 degrees the slow axis is the other one. With ``r`` the row
@@ -20,8 +20,8 @@ and ``c`` the column of the specimen, the second scan is therefore displaced aga
 
     m(r, c) = d_2(c) - d_1(r),
 
-which separates into the two functions but for a constant. No model of the drift is needed: neither a constant
-velocity, nor the frame time, nor that the drift goes on between the scans as it was. The idea is that of Ophus,
+which separates into the two functions but for a constant. Nothing is assumed of the drift but that it is smooth:
+neither a constant velocity, nor the frame time, nor that the drift goes on between the scans as it was. The idea is that of Ophus,
 Ciston and Nelson (2016), "Correcting nonlinear drift distortion of scanning probe and scanning transmission electron
 microscopies from image pairs with orthogonal scan directions", doi:10.1016/j.ultramic.2015.12.002, who move each line
 until the images agree. Here the displacements of tiles are measured with their covariance by
@@ -30,7 +30,7 @@ until the images agree. Here the displacements of tiles are measured with their 
 It fails, and says so, where tiles have too little structure. It cannot tell from drift what is the same function of
 the slow axes: an angle between the scans that is not 90 degrees (one degree is a drift by 1.7 % of the width during
 each scan), and a raster whose sides differ (without a calibration). It does not see what changes between neighbouring
-lines, such as jitter: the functions are cubic splines with a knot every 48 lines.
+lines, such as jitter: the functions are cubic splines with a knot every 48 lines, 32 at most.
 """
 
 from __future__ import annotations

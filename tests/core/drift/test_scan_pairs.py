@@ -153,6 +153,63 @@ def test_a_wrong_angle_looks_like_drift():
     assert slopes[1] == pytest.approx([0.0, turned], abs=0.05 * turned)
 
 
+def test_where_there_is_no_structure_the_sigma_is_large():
+    """Two fifths of the rows are empty: what their columns and the other rows do not tell, nobody knows."""
+    whole, drifts = surface(5), [wandering(np.random.default_rng(k)) for k in (1, 2)]
+
+    def shown(x: Array, y: Array) -> Array:
+        return np.asarray(whole(x, y) * (y > -40.0))
+
+    scans = [
+        TurnedScan(scan(shown, drift, (384, 384), 90.0 * k), k) for k, drift in enumerate(drifts)
+    ]
+    found = measure_scan_pairs(scans)
+    error = found.displacement_px - truth_at(drifts, found.progress)
+    # The mean over the first scan, and with it all displacements, depends on the unknown part.
+    assert found.sigma_px.max() > 0.5
+    assert np.sqrt(np.mean((error / np.maximum(found.sigma_px, 1e-3)) ** 2)) < 2.0
+    lines = np.diff(found.displacement_px[0, 4:], axis=0) - np.diff(
+        drifts[0](found.progress[4:]), axis=0
+    )
+    assert np.abs(lines).max() < 0.2
+
+
+def test_masked_pixels_and_those_that_are_no_number_do_not_count():
+    shown = surface(5)
+    images = [
+        scan(shown, drift, (320, 320), 90.0 * k, 1.0).astype(np.float32)
+        for k, drift in enumerate(SMOOTH)
+    ]
+    mask = np.ones((320, 320), dtype=bool)
+    mask[100:160, 200:260] = False
+    images[0][~mask] = 3e4
+    images[1][20, 30] = np.nan
+    scans = [TurnedScan(images[0], 0, None, mask), TurnedScan(images[1], 1)]
+    found = measure_scan_pairs(scans)
+    assert np.abs(found.displacement_px - truth_at(SMOOTH, found.progress)).max() < 0.05
+    average = average_scans(scans, found)
+    assert np.nanmax(average.mean) < 256.0
+    assert (average.count == 1).sum() > 60 * 60
+
+
+def test_odd_sides_turn_about_the_middle_of_the_frame():
+    """Otherwise a scan that stands still would be half a pixel off."""
+    shown = surface(6)
+    scans = [TurnedScan(scan(shown, still, (321, 256), 90.0 * k, 1.0), k) for k in (0, 1)]
+    found = measure_scan_pairs(scans)
+    assert np.abs(found.displacement_px).max() < 0.03
+
+
+def test_a_lattice_that_was_not_turned_is_refused():
+    """A chess board looks the same when it is turned; its rows then seem to run away."""
+    rows, cols = np.indices((300, 300), dtype=float)
+    along, across = cols + 0.1 * rows, rows - 0.1 * cols
+    board = 128.0 + 80.0 * np.sign(np.sin(along / 6.0) * np.sin(across / 6.0))
+    image = np.clip(board + np.random.default_rng(0).normal(0.0, 5.0, board.shape), 0, 255)
+    with pytest.raises(InvalidValueError):
+        measure_scan_pairs([TurnedScan(image.astype(np.uint8), k) for k in (0, 1)])
+
+
 def test_what_does_not_match_is_refused():
     shown, size = surface(8), (256, 256)
     first = TurnedScan(scan(shown, still, size, 0.0), 0)
