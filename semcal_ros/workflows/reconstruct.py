@@ -32,6 +32,7 @@ from semcal_ros.applications.reconstruction import (
     measure_ball,
 )
 from semcal_ros.applications.reconstruction import reconstruct as reconstruct_structure
+from semcal_ros.applications.reconstruction.factorization import LEAST_COMMON
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.arrays import check_positive
@@ -212,7 +213,9 @@ def reconstruct(
             outside = _track(opened, model, tracker, on_progress)
             notes = list(opened.notes)
             on_progress("reading keyframes", 0, None)
-            chosen = _read_images(opened, _spread_evenly(tracker.finish(), keyframes))
+            shown, empty = _leave_out_empty(tracker.finish())
+            notes += empty
+            chosen = _read_images(opened, _spread_evenly(shown, keyframes))
         structure = reconstruct_structure(
             chosen,
             microscope.scan,
@@ -243,6 +246,23 @@ def _track(
         tracker.add(grey, camera, start_time_s(frame, first_ns, opened.config))
         advance(1)
     return outside
+
+
+def _leave_out_empty(keyframes: list[TrackKeyframe]) -> tuple[list[TrackKeyframe], list[str]]:
+    """Leave out keyframes with too few points to be linked to others, and say so.
+
+    They would take the places of others among the keyframes that are used: a specimen that has left the field makes a
+    keyframe of every frame.
+    """
+    shown = [keyframe for keyframe in keyframes if len(keyframe.ids) >= LEAST_COMMON]
+    empty = [keyframe.index for keyframe in keyframes if len(keyframe.ids) < LEAST_COMMON]
+    if not shown or not empty:
+        return keyframes, []
+    note = (
+        f"{counted(len(empty), 'keyframe')} with fewer than {LEAST_COMMON} points left out, the first of them frame"
+        f" {empty[0] + 1}: was the specimen in view?"
+    )
+    return shown, [note]
 
 
 def _spread_evenly(keyframes: list[TrackKeyframe], most: int) -> list[TrackKeyframe]:

@@ -37,8 +37,7 @@ from semcal_ros.applications.reconstruction import patches as patches_module
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.bags.simulated import write_simulated
-from semcal_ros.synthetic import Detector, Drift, calibration_plan, drift_plan, preset
-from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan
+from semcal_ros.synthetic import Drift, calibration_plan, drift_plan, preset
 from semcal_ros.workflows import stack as stack_module
 from semcal_ros.workflows import workers as module
 from semcal_ros.workflows.evaluate import evaluate
@@ -47,6 +46,7 @@ from semcal_ros.workflows.workers import Workers, count_bytes, open_workers
 from tests.helpers.corner_boards import Board
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import run
+from tests.helpers.turning_ball import turning_ball
 
 G, SIZE, COUNT = 20000.0, 96, 6
 PLAN = drift_plan(
@@ -201,35 +201,7 @@ def test_a_calibration_and_its_judgement_are_the_same_to_the_last_bit(cluster):
 
 def test_a_ball_is_the_same_to_the_last_bit(cluster, monkeypatch):
     monkeypatch.setattr(patches_module, "_POINTS_AT_ONCE", 16)
-    microscope = ball_microscope("ideal", width=512, height=192)
-    plan = ball_plan(
-        microscope,
-        frames=16,
-        interval_s=5.0,
-        magnifications=(36000.0,),
-        motion=Turning(
-            80.0,
-            rolls=1.0,
-            yaws=1.0,
-            roll_rad=0.3,
-            travel_m=(1e-7, 5e-8, 0.0),
-            centre_m=(-2e-7, 0.0, 0.0),
-        ),
-        detector=Detector(electrons=400.0),
-    )
-    images = [(plan.render(k), f.magnification, f.start_time_s) for k, f in enumerate(plan.frames)]
-    true = {"scale": 1.0, "aspect": 1.0, "px": 255.5, "py": 95.5, "ex": 255.5, "ey": 95.5}
-    functions = {
-        name: replace(function, coefficients=np.array([true.get(name, 0.0)]))
-        for name, function in make_calibration().functions.items()
-    }
-    calibration = replace(
-        make_calibration(),
-        functions=functions,
-        covariance=1e-8 * np.eye(len(functions)),
-        image_width=512,
-        image_height=192,
-    )
+    images, calibration = turning_ball()
     here, there = (
         reconstruct(images, calibration=calibration, spacing_px=10.0, dask=address)
         for address in (None, cluster)

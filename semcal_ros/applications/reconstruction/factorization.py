@@ -31,15 +31,14 @@ from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["AffineStructure", "factorize"]
+__all__ = ["LEAST_COMMON", "AffineStructure", "factorize"]
 
 
 # Numbers of successive views that are tried as the first block: short ones share more points, long
 # ones turn further.
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
-# Points that all views of a block share: four times the rank, so that the other singular values
-# show the noise.
-_LEAST_COMMON = 12
+LEAST_COMMON = 12
+"""Points that all views of a block share: four times the rank, so that the other singular values show the noise."""
 # Points in a view: twice the four unknowns of each row of its camera.
 _LEAST_IN_VIEW = 8
 # Two affine views leave the relief open.
@@ -106,7 +105,7 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
         for first in range(0, n_views - length + 1, max(1, length // 4)):
             views = np.arange(first, first + length)
             points = np.flatnonzero(tracks.seen[views].all(axis=0))
-            if len(points) < _LEAST_COMMON:
+            if len(points) < LEAST_COMMON:
                 continue
             table = _centre_rows(tracks.xy_m[np.ix_(views, points)])
             values = np.linalg.svd(table, compute_uv=False)
@@ -119,7 +118,7 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
                 best = (score, views, points, relief)
     if best is None:
         raise StructureError(
-            f"no {_LEAST_VIEWS} of {n_views} views share {_LEAST_COMMON} points",
+            f"no {_LEAST_VIEWS} of {n_views} views share {LEAST_COMMON} points",
             expected="a sequence in which points can be followed from view to view",
             do="record slower movements or more texture",
         )

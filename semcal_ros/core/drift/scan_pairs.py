@@ -21,13 +21,14 @@ and ``c`` the column of the specimen, the second scan is therefore displaced aga
     m(r, c) = d_2(c) - d_1(r),
 
 which separates into the two functions but for a constant. Nothing is assumed of the drift but that it is smooth:
-neither a constant velocity, nor the frame time, nor that the drift goes on between the scans as it was. The idea is that of Ophus,
-Ciston and Nelson (2016), "Correcting nonlinear drift distortion of scanning probe and scanning transmission electron
-microscopies from image pairs with orthogonal scan directions", doi:10.1016/j.ultramic.2015.12.002, who move each line
-until the images agree. Here the displacements of tiles are measured with their covariance by
-:mod:`~semcal_ros.core.registration.register`, and least squares give both functions with theirs.
+neither a constant velocity, nor the frame time, nor that the drift goes on between the scans as it was. The idea is
+that of Ophus, Ciston and Nelson (2016), "Correcting nonlinear drift distortion of scanning probe and scanning
+transmission electron microscopies from image pairs with orthogonal scan directions",
+doi:10.1016/j.ultramic.2015.12.002, who move each line until the images agree. Here tiles of the images
+are searched for in each other, and least squares over all pixels then give both functions at once.
 
-It fails, and says so, where tiles have too little structure. It cannot tell from drift what is the same function of
+It fails, and says so, where most tiles have too little structure; where some have, the uncertainty is large. On a
+lattice, it cannot tell whether a scan was turned at all. It cannot tell from drift what is the same function of
 the slow axes: an angle between the scans that is not 90 degrees (one degree is a drift by 1.7 % of the width during
 each scan), and a raster whose sides differ (without a calibration). It does not see what changes between neighbouring
 lines, such as jitter: the functions are cubic splines with a knot every 48 lines, 32 at most.
