@@ -108,7 +108,11 @@ _ROWS_RATIO = 2.0
 # By how many standard deviations the common information must exceed what chance gives: once in a
 # million images of noise.
 _CHANCE = 5.0
-_FEATURELESS = "featureless in one direction: no more gradient in common there than by chance"
+# A strained specimen, which has structure, has as little of it in common.
+_FEATURELESS = (
+    "one direction is not determined (no more gradient in common than by chance):"
+    " featureless there, or strained"
+)
 
 
 @dataclass(frozen=True)
