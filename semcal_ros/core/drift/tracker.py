@@ -513,13 +513,15 @@ class DriftTracker:
         keyframe = track.store[candidate.key]
         velocity = state.keyframe_state(candidate.key)[2:]
         remaining = np.append(velocity, np.zeros(2))
+        removed = keyframe.removed + remaining
         if (
             candidate.rescaled
             or keyframe.averaged > 1
             or not exceeds_tolerance(remaining, keyframe.frame)
+            # A stage that jumped, or a wrong match: no velocity that a scan could be freed from.
+            or not _is_removable(removed, keyframe.frame)
         ):
             return False
-        removed = keyframe.removed + remaining
         image, region = self._corrector.corrected_image(keyframe.frame, removed, keyframe.turn)
         corrected = make_keyframe(
             keyframe.frame, removed, image, region, keyframe.time_s, keyframe.turn

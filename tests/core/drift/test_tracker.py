@@ -29,6 +29,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.keyframe_store import Candidate
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.failures import MatchFailure
@@ -181,6 +182,24 @@ def test_a_jump_along_one_axis_is_a_move_of_the_stage(jump: tuple[float, float])
     assert update.rejection is not None
     # 70 of 160 px is more than 0.3 of the width.
     assert update.rejection.status is MatchFailure.STAGE_MOVE
+
+
+def test_an_absurd_velocity_is_not_taken_out_of_a_keyframe() -> None:
+    """Seen with a stage that steps fast under a charging specimen: the tracker raised "drift of 5.5e+03 px/s"."""
+    run = Run((0.0, 0.0))
+    run.step(0)
+    track = run.tracker._track
+    assert track is not None
+    (key,) = track.filter.state.keys
+
+    class Absurd:
+        """The keyframe moved by 20 000 px in a second."""
+
+        def keyframe_state(self, _key: int) -> np.ndarray:
+            return np.array([0.0, 0.0, 2e-3, 2e-3])
+
+    candidate = Candidate(key, 1.0, 1.0)
+    assert not run.tracker._correct_keyframe(track, candidate, Absurd())  # type: ignore[arg-type]  # all that is asked
 
 
 def test_goes_on_at_another_place_after_a_while() -> None:
