@@ -286,7 +286,9 @@ def stack(
         )
         used = _choose_usable(selection)
         if quarter is not None:
-            average, scan_drift = _average_pairs(opened, model, selection, quarter, on_progress)
+            average, scan_drift = _average_pairs(
+                opened, model, selection, used, quarter, on_progress
+            )
             result = StackResult(
                 average,
                 selection.camera.rectified,
@@ -373,10 +375,11 @@ def _average_pairs(
     opened: Recording,
     model: Calibration | None,
     selection: FrameSelection,
+    used: Mask,
     quarter_turns: int,
     on_progress: OnProgress,
 ) -> tuple[StackedImage, ScanPairDrift]:
-    """Average scans of which every second one was turned."""
+    """Average scans, all of which are used, and of which every second one was turned."""
     count = len(selection.indices)
     if not 2 <= count <= _MOST_SCANS:
         raise InvalidValueError(
@@ -388,10 +391,9 @@ def _average_pairs(
             f"--scan-pairs with {counted(selection.other_kind, 'frame')} of another size or encoding",
             expected="frames of one kind, every second one turned",
         )
-    used = np.ones(count, dtype=bool)
     scans = [
         TurnedScan(frame.image, quarter_turns * (frame.number % 2), frame.camera, frame.mask)
-        for frame in _read_chosen(opened, model, selection, used, unused_too=False)
+        for frame in _read_chosen(opened, model, selection, used, unused_too=False, masks=True)
     ]
     on_progress("matching scans", 0, None)
     found = measure_scan_pairs(scans)
@@ -449,8 +451,11 @@ def _read_chosen(
     selection: FrameSelection,
     used: Mask,
     unused_too: bool,
+    masks: bool = False,
 ) -> Iterator[_Frame]:
-    """Read the chosen frames, of which a video shows those, too, that are not used."""
+    """Read the chosen frames, of which a video shows those, too, that are not used; with masks where they are wanted,
+    which a frame would else carry to the workers for nothing.
+    """
     number_of = {index: number for number, index in enumerate(selection.indices)}
     for index, frame in enumerate(opened.frames()):
         number = number_of.get(index)
@@ -459,7 +464,7 @@ def _read_chosen(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        yield _Frame(number, grey, camera, drift, bool(used[number]), frame.mask)
+        yield _Frame(number, grey, camera, drift, bool(used[number]), frame.mask if masks else None)
 
 
 def add_part(

@@ -435,8 +435,7 @@ def _measure_offset(first: _Warped, other: _Warped, number: int) -> Array:
     """Offset (2,) of a whole scan from the first one to some pixels, without regard to how they are distorted."""
     cut = []
     for scan in (first, other):
-        region = _find_valid_rectangle(scan.valid)
-        left, top, right, bottom = region
+        left, top, right, bottom = _find_valid_rectangle(scan.valid)
         cut.append((np.array([left, top], dtype=np.float64), scan.image[top:bottom, left:right]))
     reference = CoarseReference(Pyramid(cut[0][1]), RegistrationSettings().min_overlap)
     peaks = find_coarse_peaks(reference, Pyramid(cut[1][1]), cut[0][0] - cut[1][0])
@@ -569,17 +568,17 @@ def _compare_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None
     return information / variance, right / variance
 
 
-def _solve(tiles: _Tiles, drift: Array) -> tuple[Array, Array, Array]:
+def _solve(tiles: _Tiles, design: Array, prior: Array, drift: Array) -> tuple[Array, Array, Array]:
     """Least squares for the displacements (n, k, 2), with what tiles tell beyond ``drift``.
+
+    ``design`` (t, n k) is that of the tiles, ``prior`` (n k, 2, n k, 2) the information that is there without them.
 
     Returns
     -------
     The displacements (n k, 2), the inverse of the normal matrix (n k, 2, n k, 2), and what is left of the right sides
     of the tiles (t, 2).
     """
-    scans, count = drift.shape[:2]
-    unknowns = scans * count
-    design, prior = tiles.design(scans), _prior_information(scans, count)
+    unknowns = design.shape[1]
     normal = np.einsum("tu,tab,tv->uavb", design, tiles.information, design, optimize=True) + prior
     known = drift.reshape(unknowns, 2)
     right = np.einsum("tu,ta->ua", design, tiles.right) - np.einsum("uavb,vb->ua", prior, known)
@@ -596,8 +595,10 @@ def _search(
 ) -> Array:
     """The drift (n, k, 2) to a fraction of a pixel, from tiles that are searched one by one."""
     tiles, _ = _look_at_tiles(warped, pairs, _SEARCHED_PX, knots, _search_tile)
+    scans, count = drift.shape[:2]
+    prior = _prior_information(scans, count)
     while True:
-        found, _, left = _solve(tiles, drift)
+        found, _, left = _solve(tiles, tiles.design(scans), prior, drift)
         # Of the searched tiles, what is left in units of their sigma.
         far = np.hypot(*left.T) * _COARSE_PX
         near = far <= max(_FAR * float(np.median(far)), _COARSE_PX)
@@ -615,9 +616,10 @@ def _refine(
 ) -> tuple[ScanPairDrift, set[_Place]]:
     """One step of Gauss and Newton for the drift, and the tiles that it rests on."""
     tiles, used = _look_at_tiles(warped, pairs, _COMPARED_PX, knots, _compare_tile, allowed)
-    found, inverse, left = _solve(tiles, drift)
     scans, count = drift.shape[:2]
     unknowns = scans * count
+    design, prior = tiles.design(scans), _prior_information(scans, count)
+    found, inverse, left = _solve(tiles, design, prior, drift)
     freedom = len(left) - unknowns
     if freedom < unknowns:
         raise InvalidValueError(
@@ -630,14 +632,13 @@ def _refine(
     # solution towards itself is undone (the HC3 of MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7), and
     # tiles at one place, which share the noise of a scan, count as one (Liang and Zeger 1986,
     # doi:10.1093/biomet/73.1.13).
-    design = tiles.design(scans)
     fitted = np.einsum("tu,uavb,tv->tab", design, inverse, design, optimize=True)
     free = np.eye(2) - tiles.information @ fitted
     undone = np.linalg.solve(free + _LEAST_FREEDOM * np.eye(2), left[..., None])[..., 0]
     scores = np.einsum("tu,ta->tua", design, undone).reshape(len(left), -1)
     places = np.zeros((tiles.place.max() + 1, scores.shape[1]))
     np.add.at(places, tiles.place, scores)
-    meat = places.T @ places + _prior_information(scans, count).reshape(2 * unknowns, -1)
+    meat = places.T @ places + prior.reshape(2 * unknowns, -1)
     flat = inverse.reshape(2 * unknowns, -1)
     result = ScanPairDrift(
         knots,
