@@ -30,6 +30,7 @@ from semcal_ros.applications.cantilever import (
     Series,
     SeriesSettings,
     compare_series,
+    describe_disagreement,
     group_frames,
     measure_series,
 )
@@ -255,7 +256,9 @@ def measure_cantilever(
         notes.append(f"the configuration has no scan: frames are instants; {GIVE_FRAME_TIME}")
     if not all(one.camera.in_range for one in series):
         notes.append("frames outside the calibrated range")
-    agreement = compare_series([one.measured for one in series], poses)
+    compared = [one.measured for one in series]
+    agreement = compare_series(compared, poses)
+    notes += describe_disagreement(compared, agreement)
     return CantileverMeasurement(tuple(series), agreement, poses, tuple(notes))
 
 

@@ -21,6 +21,7 @@ from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.repeatability import (
     Repeatability,
     compare_series,
+    describe_disagreement,
     group_frames,
 )
 from semcal_ros.applications.cantilever.series import (
@@ -39,6 +40,7 @@ __all__ = [
     "SeriesSettings",
     "Strip",
     "compare_series",
+    "describe_disagreement",
     "find_strip",
     "group_frames",
     "measure_series",

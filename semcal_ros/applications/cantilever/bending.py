@@ -41,6 +41,7 @@ __all__ = [
     "Bending",
     "Shape",
     "evaluate_bending",
+    "expect_point_load",
     "fit_bending",
     "fit_common_shape",
     "locate_end",
@@ -54,6 +55,10 @@ SHAPES = ("free", "beam", "parabola")
 _TURN_RAD = 1e-5
 # Prior mean and 1-sigma of an unknown shape: both the parabola and the end-loaded beam are likely.
 _PRIOR = (-0.25, 0.35)
+# Mean and 1-sigma of c of a beam that is loaded at one place in the outer fifth of its length, all places alike, and
+# the probability that it is, before anything is seen: as likely as not.
+_POINT_LOAD = (-0.59, 0.06)
+_POINT_LOAD_PROBABILITY = 0.5
 # Keeps divisions from zero, m^2: far below any variance, which is at least 1e-26 (see the prior).
 _TINY = 1e-30
 # Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
@@ -171,6 +176,35 @@ def fit_common_shape(
     single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
     relative = float(np.sqrt((excess - 1.0) / max(along, _TINY))) * single
     return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
+
+
+def expect_point_load(fitted: Shape) -> Shape:
+    """Combine a fitted shape with what is known of beams that are pushed.
+
+    Before anything is seen, the beam is as likely as not loaded at one place in the outer fifth of its length; if it is
+    not, its shape is as unknown as :func:`fit_common_shape` assumes. The result has the mean and the 1-sigma of both
+    posteriors together. So a shape that contradicts a point load, such as a parabola, stays as it was fitted.
+
+    Parameters
+    ----------
+    fitted
+        Shape from :func:`fit_common_shape`.
+    """
+    seen = max(fitted.sigma, 1e-6) ** 2
+    mean, sigma = _POINT_LOAD
+    share = seen / (seen + sigma**2)
+    loaded, loaded_variance = fitted.value + share * (mean - fitted.value), share * sigma**2
+    # The fitted shape holds the broad prior already. Its evidence is that of the frames alone under that prior.
+    evidence = [
+        float(np.exp(-0.5 * (fitted.value - m) ** 2 / (seen + s**2)) / np.sqrt(seen + s**2))
+        for m, s in (_POINT_LOAD, _PRIOR)
+    ]
+    weight = _POINT_LOAD_PROBABILITY * evidence[0]
+    weight /= max(weight + (1.0 - _POINT_LOAD_PROBABILITY) * evidence[1], _TINY)
+    value = weight * loaded + (1.0 - weight) * fitted.value
+    variance = weight * (loaded_variance + (loaded - value) ** 2)
+    variance += (1.0 - weight) * (seen + (fitted.value - value) ** 2)
+    return Shape(value, float(np.sqrt(variance)), fitted.relative)
 
 
 def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count: int) -> float:

@@ -49,6 +49,16 @@ _LARGEST_WIDTH = 0.35
 # Strength of a dark strip over that of a bright one. Between a bright beam and another body lies a dark strip, of which
 # one edge is the beam's own.
 _DARK = 0.7
+# Strips of each kind that are looked at, and the angle between two that are not the same one: a pusher may show more
+# contrast than the beam and lies across it.
+_CANDIDATES = 3
+_APART_RAD = np.deg2rad(10.0)
+# A strip other than the strongest bright and the strongest dark one is taken only if it has the length that is known,
+# and at least this part of the strength of the strongest.
+_LEAST_STRENGTH = 0.3
+# Tolerance of that length: the maker's 3 %, and as much for a calibration that is not good. A tapered tip makes the
+# strip shorter by up to its width.
+_SAME_LENGTH = 0.06
 # The strip extends as far as its edges are at least this strong, relative to their 90 % quantile.
 _EDGE_SHARE = 0.35
 # Of the shorter side: shorter gaps in the edges are dirt or texture and not an end.
@@ -109,8 +119,11 @@ def find_strip(
     *,
     base_px: ArrayLike | None = None,
     tip_px: ArrayLike | None = None,
+    length_px: float | None = None,
 ) -> Strip:
     """Find a cantilever on a darker ground, or on a clearly brighter one.
+
+    The strongest strip is taken, or, if several have two ends in view, one that has the length of the cantilever.
 
     Parameters
     ----------
@@ -119,6 +132,8 @@ def find_strip(
     base_px, tip_px
         (2,) raw pixels of the two ends of the centre line, good to a few pixels; they may lie
         outside the image where the end is out of view. None finds them.
+    length_px
+        Length of the cantilever in pixels, to tell it from other bodies; None if it is not known.
 
     Raises
     ------
@@ -137,7 +152,7 @@ def find_strip(
         )
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
     if base_px is None or tip_px is None:
-        is_dark, found = _find_strongest(smooth)
+        is_dark, found = _choose_strip(smooth, None if length_px is None else length_px / shrink)
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
         is_dark, found = _follow_clicks(smooth, clicks[0], clicks[1])
@@ -183,28 +198,52 @@ def _widen(sums: Array) -> Array:
     return np.asarray(np.convolve(sums, np.ones(3), mode="same"), dtype=np.float64)
 
 
-def _find_strongest(smooth: Array) -> tuple[bool, Strip]:
-    """Find the strongest strip that has ends, bright or dark: whether it is dark, and the strip.
+def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
+    """Find the strip that has the known length, or else the strongest that has ends: whether it is dark, and the strip.
 
     Between a beam and a pusher of the same kind lies a strip of the other, with edges as strong; it
     is short.
     """
-    refusals = []
+    refusals: list[InvalidValueError] = []
+    strongest: dict[bool, tuple[bool, Strip]] = {}
+    first_seen: set[bool] = set()
+    most = 0.0
     for is_dark, angle, point in _search_lines(smooth):
+        is_first = is_dark not in first_seen
+        first_seen.add(is_dark)
         signed = -smooth if is_dark else smooth
         strength, *line = _find_pair_near(_prepare_lines(signed), angle, point)
-        if strength <= 0.0:
+        strength *= _DARK if is_dark else 1.0
+        most = max(most, strength)
+        if strength <= 0.0 or not (is_first or strength > _LEAST_STRENGTH * most):
             continue
         try:
-            return is_dark, _find_ends(signed, *line)
+            found = _find_ends(signed, *line)
         except InvalidValueError as error:
-            refusals.append(error)
+            if is_first:
+                refusals.append(error)
+            continue
+        if length_px is not None and _has_length(found, length_px):
+            return is_dark, found
+        if is_first:
+            strongest[is_dark] = is_dark, found
+    for choice in strongest.values():
+        return choice
     # Of the stronger one.
     raise refusals[0] if refusals else _no_strip()
 
 
+def _has_length(strip: Strip, length_px: float) -> bool:
+    """Whether both ends of a strip are in view, as far apart as those of the cantilever."""
+    if not (strip.base_seen and strip.tip_seen):
+        return False
+    excess = float(np.hypot(*(strip.tip_px - strip.base_px))) - length_px
+    tolerance = _SAME_LENGTH * length_px
+    return -tolerance - 2.0 * strip.half_width_px < excess < tolerance
+
+
 def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
-    """Find the strongest bright and dark strips in any direction in a small image, the stronger first.
+    """Find the strongest bright and dark strips of several directions in a small image, the strongest first.
 
     Of each: whether it is dark, its direction, and a point on it.
     """
@@ -214,7 +253,7 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
-    best = {False: (0.0, 0.0, 0.0), True: (0.0, 0.0, 0.0)}
+    pairs: list[tuple[float, bool, float, float]] = []
     # Half a turn is enough: in the opposite direction the two edges only change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
         sums, first = lines.across(float(turn))
@@ -222,15 +261,17 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
         for dark, edges in ((False, wide), (True, -wide)):
             strength, low, up = _find_best_pair(edges, -edges, _LEAST_WIDTH_PX // shrink + 1, high)
             strength *= _DARK if dark else 1.0
-            if strength > best[dark][0]:
-                best[dark] = strength, float(turn), 0.5 * (low + up) + first
+            pairs.append((strength, dark, float(turn), 0.5 * (low + up) + first))
     middle = 0.5 * (np.array(size) - 1.0)
-    found = []
-    for dark, (strength, angle, offset) in sorted(best.items(), key=lambda one: -one[1][0]):
-        if strength > 0.0:
-            across = np.array([-np.sin(angle), np.cos(angle)])
-            point = middle + (offset - float(across @ middle)) * across
-            found.append((dark, angle, (point + 0.5) * shrink - 0.5))
+    found: list[tuple[bool, float, Array]] = []
+    for strength, dark, angle, offset in sorted(pairs, key=lambda pair: -pair[0]):
+        alike = [turn for other, turn, _ in found if other == dark]
+        apart = [abs((angle - turn + 0.5 * np.pi) % np.pi - 0.5 * np.pi) for turn in alike]
+        if strength <= 0.0 or len(alike) == _CANDIDATES or min(apart, default=np.pi) < _APART_RAD:
+            continue
+        across = np.array([-np.sin(angle), np.cos(angle)])
+        point = middle + (offset - float(across @ middle)) * across
+        found.append((dark, angle, (point + 0.5) * shrink - 0.5))
     return found
 
 

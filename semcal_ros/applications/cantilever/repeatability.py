@@ -26,7 +26,14 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Repeatability", "compare_series", "group_frames"]
+__all__ = ["Repeatability", "compare_series", "describe_disagreement", "group_frames"]
+
+# Spread over what the sigmas predict from which a note says so: of three magnifications, chance makes one in 500 exceed
+# it even if the errors of all poses are the same.
+_LARGE_SPREAD = 2.5
+# Ratio of the widths at two magnifications from which they are those of two bodies: focus widens a beam of some
+# 50 px by a few per cent.
+_OTHER_WIDTH = 1.15
 
 
 @dataclass(frozen=True)
@@ -124,6 +131,35 @@ def compare_series(series: Sequence[Series], poses: int | None = None) -> Repeat
         _compute_rms(known_spread),
         _compute_rms(np.sqrt(np.mean(sigma**2, axis=0))) if len(series) > 1 else float("nan"),
     )
+
+
+def describe_disagreement(series: Sequence[Series], found: Repeatability) -> list[str]:
+    """Return notes where the magnifications did not measure the same thing.
+
+    Parameters
+    ----------
+    series, found
+        One series per magnification, and the comparison of them.
+    """
+    notes = []
+    widths = np.array([2.0 * one.undeformed.axis.half_width_m for one in series])
+    if widths.max() > _OTHER_WIDTH * widths.min():
+        listed = ", ".join(
+            f"{1e6 * width:.3g} um at {one.magnification:g}x"
+            for width, one in zip(widths, series, strict=True)
+        )
+        notes.append(
+            f"the beam is {listed} wide: not all of these are the same body. Look at --strip, or give base and tip"
+        )
+    if found.rms_spread_m > _LARGE_SPREAD * found.expected_spread_m:
+        away = found.deflection_m - np.nanmedian(found.deflection_m, axis=0)
+        row, column = np.unravel_index(int(np.nanargmax(np.abs(away))), away.shape)
+        notes.append(
+            f"the magnifications differ by {1e9 * found.rms_spread_m:.2g} nm RMS where their sigmas predict "
+            f"{1e9 * found.expected_spread_m:.2g} nm, most at {found.magnifications[row]:g}x in pose {column + 1}, by "
+            f"{1e9 * away[row, column]:+.2g} nm: were the poses the same?"
+        )
+    return notes
 
 
 def _average_poses(

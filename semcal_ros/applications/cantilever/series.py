@@ -28,6 +28,7 @@ from semcal_ros.applications.cantilever.bending import (
     Bending,
     Shape,
     evaluate_bending,
+    expect_point_load,
     fit_bending,
     fit_common_shape,
     locate_end,
@@ -72,6 +73,10 @@ _WRONG_SHAPE = 3.0
 _LARGEST = 0.04
 # A fit beyond this many times the largest deflection has found something other than the beam.
 _ABSURD = 1.5
+# Median distance, px, by which the end of the strip lies elsewhere along it than in the reference, from which it is not
+# the end of a clamped beam: bent by a 25th of its length, that one comes back by a thousandth of it. The brightness of
+# the middle shows the end to 2 px. A pusher moves by its gap and the deflection.
+_SLIP_PX = 5.0
 # Regions of the ground that a note names at most.
 _NAMED_REGIONS = 3
 # Points of the centre line in the results, for drawing.
@@ -221,7 +226,12 @@ def measure_series(
             expected="its length in m, such as 35e-6",
             do="check --length",
         )
-    strip = find_strip(images[0], base_px=settings.base_px, tip_px=settings.tip_px)
+    strip = find_strip(
+        images[0],
+        base_px=settings.base_px,
+        tip_px=settings.tip_px,
+        length_px=settings.length_m / plane.pixel_m,
+    )
     if strip.is_dark:
         images = [_invert(image) for image in images]
     rough = _extend_to_apex(_make_rough_axis(strip, plane, settings.length_m), plane, images[0])
@@ -232,9 +242,8 @@ def measure_series(
         rough, [work.sample(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
     _check_length(undeformed, settings.length_m, plane.camera)
-    frames, shape, misfit = work.deflections(undeformed, tuple(reference), on_frame)
-    notes = _collect_notes(undeformed, frames, background, tuple(reference), settings)
-    notes += () if misfit is None else (misfit,)
+    frames, shape, doubts = work.deflections(undeformed, tuple(reference), on_frame)
+    notes = _collect_notes(undeformed, frames, background, tuple(reference), settings) + doubts
     return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
 
@@ -408,15 +417,17 @@ class _SeriesMeasurement:
 
     def deflections(
         self, undeformed: UndeformedBeam, reference: tuple[int, ...], on_frame: Callable[[], None]
-    ) -> tuple[list[Deflection], Shape, str | None]:
+    ) -> tuple[list[Deflection], Shape, tuple[str, ...]]:
         """Measure all frames in the order of time, each starting from the last; fit their shape.
 
-        Also returns a remark where the frames do not bend as the shape that was given.
+        Also returns remarks: where the frames do not bend as the shape that was given, or what was measured is not a
+        clamped beam.
         """
-        edges, free = [], []
+        edges, free, ends_m = [], [], []
         terms = np.zeros(2)
         for frame in range(len(self._images)):
             samples = self.sample(undeformed.axis, frame)
+            ends_m.append(self._find_end(samples, undeformed))
             terms = np.zeros(2) if frame in reference else self._nearby(samples, undeformed, terms)
             edges.append(self._edges(samples, undeformed, terms))
             free.append(self._bending(frame, edges[-1], undeformed, reference, None))
@@ -427,9 +438,35 @@ class _SeriesMeasurement:
         others = [f for k, f in enumerate(free) if k not in reference]
         own = [free[k].covariance[1, 1] for k in reference]
         common = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
-        shape, misfit = (common, None) if shape is None else _compare_shapes(shape, common)
+        shape, misfit = (
+            (expect_point_load(common), None) if shape is None else _compare_shapes(shape, common)
+        )
         bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
-        return [self._result(k, one, undeformed) for k, one in enumerate(bent)], shape, misfit
+        doubts = [misfit, self._describe_slip(np.array(ends_m), undeformed, reference)]
+        results = [self._result(k, one, undeformed) for k, one in enumerate(bent)]
+        return results, shape, tuple(doubt for doubt in doubts if doubt is not None)
+
+    def _find_end(self, samples: PixelSamples, undeformed: UndeformedBeam) -> float:
+        """Find roughly where the strip ends in a frame, m; NaN if its end is out of view."""
+        axis = undeformed.axis
+        if not axis.end_seen:
+            return float("nan")
+        return find_apex(samples, axis.visible_m[1], axis.half_width_m, self._plane.pixel_m)
+
+    def _describe_slip(
+        self, ends_m: Array, undeformed: UndeformedBeam, reference: tuple[int, ...]
+    ) -> str | None:
+        """Return a remark if the end moves along the strip, as that of a pusher does."""
+        others = np.delete(ends_m, reference)
+        if not (undeformed.axis.end_seen and others.size):
+            return None
+        slip_m = others - np.mean(ends_m[list(reference)])
+        if not np.median(np.abs(slip_m)) > _SLIP_PX * self._plane.pixel_m:
+            return None
+        return (
+            f"the end of what was measured moves along it, by {1e6 * np.median(np.abs(slip_m)):.2g} um in half of the "
+            "frames, and that of a clamped beam does not: is it the pusher? Look at --strip, or give base and tip"
+        )
 
     def _nearby(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> Array:
         """Find a bending to start from: the one with most contrast along the beam's edges."""

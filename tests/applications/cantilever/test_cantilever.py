@@ -25,16 +25,24 @@ import pytest
 from semcal_ros.applications.cantilever import (
     SeriesSettings,
     compare_series,
+    describe_disagreement,
     find_strip,
     group_frames,
     measure_series,
 )
-from semcal_ros.applications.cantilever.bending import Shape, fit_bending, locate_end, parse_shape
+from semcal_ros.applications.cantilever.bending import (
+    Shape,
+    expect_point_load,
+    fit_bending,
+    locate_end,
+    parse_shape,
+)
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
 from semcal_ros.synthetic.specimens.cantilever import CantileverScene, cantilever_plan
+from semcal_ros.synthetic.specimens.cantilever_random import random_cantilever
 
 LENGTH = 35e-6
 DRIFT = Drift(velocity_m_s=(6e-9, -4e-9), settling_m=(60e-9, 90e-9), wander_m=10e-9, seed=4)
@@ -168,6 +176,52 @@ def test_an_uncertain_shape_makes_the_deflection_uncertain_by_what_it_would_chan
     assert added == pytest.approx(abs(change), rel=0.1, abs=0.0)
 
 
+@pytest.mark.parametrize("load", [0.85, 0.9, 1.0])
+def test_the_shape_of_a_point_load_is_pulled_towards_those_of_point_loads(load):
+    """A beam that is pushed at a has the third order -1 / (3 a - 1)."""
+    u = np.linspace(0.0, load, 50)
+    bent = 3.0 * load * u**2 - u**3
+    fitted = np.linalg.lstsq(np.stack([u**2, u**3 - u**2], axis=1), bent, rcond=None)[0]
+    true = fitted[1] / fitted[0]
+    assert true == pytest.approx(-1.0 / (3.0 * load - 1.0), rel=1e-9)
+    for error in (-0.06, 0.06):
+        expected = expect_point_load(Shape(true + error, 0.06))
+        assert abs(expected.value - true) < 2.0 * expected.sigma
+        # More than that of the fit only where it may as well be no point load.
+        assert expected.sigma < 0.066
+        # -0.59 is the mean of loads anywhere in the outer fifth.
+        assert abs(expected.value + 0.59) < abs(true + error + 0.59)
+
+
+def test_a_shape_that_is_no_point_load_stays():
+    for value in (0.0, -1.0):
+        expected = expect_point_load(Shape(value, 0.05, 0.01))
+        assert expected.value == pytest.approx(value, abs=1e-3)
+        assert expected.sigma == pytest.approx(0.05, rel=0.02)
+        assert expected.relative == 0.01
+    # Nothing seen: as likely as not a point load, so still vague.
+    vague = expect_point_load(Shape(-0.25, 0.35))
+    assert vague.sigma > 0.25
+
+
+def test_the_sigma_of_an_expected_shape_is_honest():
+    """Half of the beams have a point load, the others any shape; frames tell it to 0.03 to 0.2."""
+    rng = np.random.default_rng(8)
+    deviations = []
+    for number in range(4000):
+        loaded = number % 2 == 0
+        true = -1.0 / (3.0 * rng.uniform(0.8, 1.0) - 1.0) if loaded else rng.normal(-0.25, 0.35)
+        noise = rng.uniform(0.03, 0.2)
+        # As the fit to the frames does: their noise, and a broad prior.
+        share = noise**2 / (noise**2 + 0.35**2)
+        seen = true + rng.normal(0.0, noise)
+        fitted = Shape(seen + share * (-0.25 - seen), noise * np.sqrt(1.0 - share))
+        expected = expect_point_load(fitted)
+        deviations.append((expected.value - true) / expected.sigma)
+    # 4000 deviates: their RMS is good to 1 to 2 %. The load's distribution is uniform, and taken for a normal one.
+    assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1.0, abs=0.07)
+
+
 def test_a_mean_over_frames_keeps_what_they_share():
     """Four frames of a pose, each with noise of 1 nm and an error of the scale of 1 nm."""
     frame = SimpleNamespace(
@@ -236,6 +290,65 @@ def test_clicks_say_where_it_is():
     assert (
         abs(dx * y - dy * x) / np.hypot(dx, dy) < 2.5
     )  # across the beam it is found, not taken from the click
+
+
+def random_plan(seed, magnification, pushes):
+    """A random scene with both ends and a pusher in view."""
+    drawn = random_cantilever(seed, base_in_view=True)
+    plan = cantilever_plan(
+        scope(1024, 0.4),
+        scene=drawn.scene,
+        largest_deflection_m=drawn.largest_deflection_m,
+        rotation_rad=drawn.rotation_rad,
+        magnifications=(magnification,),
+        pushes=pushes,
+        seed=seed,
+    )
+    return drawn.scene, plan
+
+
+@pytest.mark.parametrize(
+    ("seed", "magnification"), [(14, 6450.0), (43, 6450.0), (63, 6450.0), (82, 8890.0)]
+)
+def test_a_body_of_more_contrast_is_not_taken_for_the_cantilever(seed, magnification):
+    """A pusher, or the edge of the holder and another one, may be a stronger strip: the length tells."""
+    scene, plan = random_plan(seed, magnification, (0.0,))
+    truth, image = plan.truth()["frames"][0], plan.render(0)
+    length_px = float(np.hypot(*np.subtract(truth["end_px"], truth["base_px"])))
+    # The maker's 3 %, either way.
+    for stated_px in (0.97 * length_px, 1.03 * length_px):
+        strip = find_strip(image, length_px=stated_px)
+        assert strip.base_seen and strip.tip_seen
+        # To be refined later, over 14 px.
+        assert np.hypot(*(strip.base_px - truth["base_px"])) < 9.0
+        width_px = scene.width_m / scene.length_m * length_px
+        assert 2.0 * strip.half_width_px == pytest.approx(width_px, rel=0.1)
+    # Without the length it is the other body, or this test shows nothing.
+    other = find_strip(image)
+    assert not (other.base_seen and other.tip_seen)
+
+
+def test_what_moves_along_itself_is_no_clamped_beam():
+    scene, plan = random_plan(14, 6450.0, (0.0, 0.4, 1.0))
+    images = [plan.render(k) for k in range(3)]
+    times = [frame.start_time_s for frame in plan.frames]
+    camera, timing = plan.microscope.camera_at(6450.0), plan.microscope.timing
+    other = find_strip(images[0])
+    taken = {"the beam": {}, "the pusher": {"base_px": other.base_px, "tip_px": other.tip_px}}
+    told = {
+        name: [
+            note
+            for note in measure_series(
+                images, times, camera, timing, SeriesSettings(scene.length_m, **ends)
+            ).notes
+            if "moves along it" in note
+        ]
+        for name, ends in taken.items()
+    }
+    assert told["the beam"] == []
+    # It comes closer by its gap of 600 nm, and by the deflection.
+    assert len(told["the pusher"]) == 1
+    assert "is it the pusher?" in told["the pusher"][0]
 
 
 def test_pictures_without_a_cantilever_are_refused():
@@ -446,3 +559,38 @@ def test_the_spread_is_that_of_the_poses():
     assert table.expected_spread_m == pytest.approx(np.sqrt(np.mean(table.sigma_m[:, 1] ** 2)))
     with pytest.raises(InvalidValueError, match="different numbers of frames"):
         compare_series([series[0], replace(series[1], frames=series[1].frames[:1])])
+
+
+def test_magnifications_that_measured_different_things_are_told():
+    """One of three follows another body, which does not bend."""
+
+    def series(magnification, width_m, deflections_m):
+        frames = tuple(
+            SimpleNamespace(
+                deflection_m=value,
+                sigma_m=1.5e-9,
+                noise_m=1.2e-9,
+                by_length_m=value,
+                by_length_sigma_m=1.5e-9,
+            )
+            for value in deflections_m
+        )
+        axis = SimpleNamespace(half_width_m=0.5 * width_m)
+        return SimpleNamespace(
+            magnification=magnification, frames=frames, undeformed=SimpleNamespace(axis=axis)
+        )
+
+    alike = [
+        series(6450.0, 2.5e-6, [0.0, 51e-9, 101e-9]),
+        series(7760.0, 2.52e-6, [0.0, 50e-9, 98e-9]),
+        series(8890.0, 2.6e-6, [0.0, 52e-9, 100e-9]),
+    ]
+    assert describe_disagreement(alike, compare_series(alike)) == []
+    other = [series(6450.0, 5.3e-6, [0.0, 1e-9, 0.0]), *alike[1:]]
+    width, spread = describe_disagreement(other, compare_series(other))
+    assert width.startswith("the beam is 5.3 um at 6450x, 2.52 um at 7760x, 2.6 um at 8890x wide")
+    # Standard deviations of (1, 50, 52) and (0, 98, 100): 28.9 and 57.2 nm, RMS 45.3 nm.
+    assert "differ by 45 nm RMS where their sigmas predict 1.5 nm" in spread
+    assert "most at 6450x in pose 3, by -98 nm" in spread
+    # One magnification has nothing to differ from.
+    assert describe_disagreement(alike[:1], compare_series(alike[:1])) == []
