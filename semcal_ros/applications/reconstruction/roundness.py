@@ -47,6 +47,13 @@ _LEAST_IN_WINDOW = 5.0
 _FALSE_ALARM = 0.005
 # Residuals beyond this many robust sigma of their surroundings count as this many (Huber).
 _HUBER = 2.5
+# Constant of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
+# doi:10.1080/03610927708827533), the sigma of normal noise over the median of its size, and rounds of either loss.
+_TUKEY = 4.685
+_MEDIAN_TO_SIGMA = 1.4826
+_ROUNDS = 10
+# Keeps a division from zero where a point alone decides a fit.
+_LEAST_FREEDOM = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +159,24 @@ class _SphereResiduals:
         return np.asarray(self.sharing * (noise + self.rough * rows @ rows.T))
 
     def fit(self, design: Array) -> tuple[Array, Array]:
-        """Fit (n, k) functions to the heights robustly: (k,) solution and the (k, n) rows that give it."""
+        """Fit (n, k) functions to the heights robustly: (k,) solution and the (k, n) rows that give it.
+
+        A point is judged by its distance from the fit without it: at the rim of what is seen, one wrong point bends a
+        quadric so far that it leaves little residual itself.
+        """
         weight = np.ones(len(self.height))
-        for _ in range(10):
+        for turn in range(2 * _ROUNDS):
             rows = np.linalg.solve((design * weight[:, None]).T @ design, design.T * weight)
+            leverage = np.einsum("nk,kn->n", design, rows)
             error = np.abs(self.height - design @ (rows @ self.height))
-            limit = _HUBER * max(mad_sigma(error), 1e-15)
-            weight = limit / np.maximum(error, limit)
+            error /= np.maximum(1.0 - leverage, _LEAST_FREEDOM)
+            if turn < _ROUNDS:
+                limit = _HUBER * max(mad_sigma(error), 1e-15)
+                weight = limit / np.maximum(error, limit)
+            else:
+                # What is far off by then counts for nothing.
+                limit = _TUKEY * max(_MEDIAN_TO_SIGMA * float(np.median(error)), 1e-15)
+                weight = np.maximum(1.0 - (error / limit) ** 2, 0.0) ** 2
         solution = np.asarray(rows @ self.height, dtype=np.float64)
         return solution, np.asarray(rows, dtype=np.float64)
 

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,12 @@ from semcal_ros.applications.reconstruction import (
     adjust,
     fit_sphere,
 )
-from semcal_ros.applications.reconstruction.roundness import Roundness, measure_roundness
+from semcal_ros.applications.reconstruction.roundness import (
+    Roundness,
+    _quadrics,
+    _SphereResiduals,
+    measure_roundness,
+)
 from tests.helpers.structure_scenes import RADIUS_M, ball_scene
 
 
@@ -109,3 +116,23 @@ def test_what_holds_the_ball_is_not_a_bump():
     found, _ = examined(heights, seed=3, points=250)
     assert found.is_ball
     assert found.points < 250
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_wrong_point_far_from_the_others_is_no_ellipsoid(seed):
+    """It bends a quadric so far towards itself that its own residual is small."""
+    rng = np.random.default_rng(seed)
+    cosine, turn = rng.uniform(0.5, 1.0, 130), rng.uniform(0.0, 2.0 * np.pi, 130)
+    sine = np.sqrt(1.0 - cosine**2)
+    out = np.column_stack([sine * np.cos(turn), sine * np.sin(turn), -cosine])
+    # On the outline of the ball, 19 % of whose radius are 86 nm.
+    out = np.vstack([out, [-0.55, -0.815, 0.18]])
+    height = np.append(rng.normal(0.0, 1.5e-9, 130), 81e-9)
+    design = np.column_stack([out, np.ones(len(out)), _quadrics(out)])
+    residuals = SimpleNamespace(height=height)
+    solution, rows = _SphereResiduals.fit(residuals, design)
+    left = height - design @ solution
+    assert left[-1] > 60e-9
+    np.testing.assert_allclose(rows[:, -1], 0.0, atol=1e-12)
+    # 130 points of 1.5 nm tell nine unknowns.
+    assert np.std(design[:-1] @ solution) < 1.5e-9
