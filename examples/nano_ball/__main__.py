@@ -19,7 +19,7 @@ calibrated, the ball is reconstructed with that calibration and compared with th
 seen.
 
     .venv/bin/python -m examples.nano_ball            # 2000 frames of 2048 x 320 px, some minutes and 1.4 GB
-    .venv/bin/python -m examples.nano_ball --only-looks --seeds 60   # balls of 60 other looks, half an hour
+    .venv/bin/python -m examples.nano_ball --only-looks --seeds 60   # balls of 60 other looks, an hour
     .venv/bin/python -m examples.nano_ball --quick    # 40 frames of two thirds of a turn to and fro
 """
 
@@ -200,7 +200,9 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--seeds", type=int, help="number of balls of other looks besides (default 5; quick: none)"
+        "--seeds",
+        type=int,
+        help="number of balls of other looks besides, from --seed on (default 5; quick: none)",
     )
     parser.add_argument("--only-looks", action="store_true", help="only the balls of other looks")
     parser.add_argument("--output", type=Path, default=Path("nano_ball_output"))
@@ -210,7 +212,7 @@ def main() -> None:
     out, images = given.output, given.images or given.output
     out.mkdir(parents=True, exist_ok=True)
     seeds = given.seeds if given.seeds is not None else (0 if given.quick else 5)
-    looks = compare_looks(seeds) if seeds else {}
+    looks = compare_looks(seeds, given.seed) if seeds else {}
     if given.only_looks:
         report(out / "looks.json", looks)
         return

@@ -20,7 +20,7 @@ of the ball: with the 1-sigma that its interval assumes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,9 @@ from semcal_ros.synthetic.specimens.ball import draw_ball_plan
 
 # Two pixel sizes: 138 and 112 px across the ball.
 PIXELS_M = (6.5e-9, 8e-9)
-# The longest recording once in six: it takes some minutes.
-FRAMES = (100, 100, 160, 100, 100, 400)
+FRAMES = (100, 180, 330, 600, 1100, 2000)
+# The field has just room for the ball and its movement: a longer recording drifts as far as one of this many frames.
+DRIFTING_FRAMES = 100
 # As many as the tracker finds in 100 frames or more; the time grows with their number.
 MOST_KEYFRAMES = 60
 # 3 % longer across the beam, and a tenth of the radius high: to be told from a ball.
@@ -48,6 +49,7 @@ class Look:
     """What came out for one seed; errors in per cent of the diameter."""
 
     seed: int
+    frames: int
     body: str
     texture: str
     grain_nm: float
@@ -63,7 +65,10 @@ def reconstruct_look(seed: int, body: str = "ball") -> Look | str:
     """Reconstruct one recording with the true camera; the reason if that fails."""
     frames, pixel_m = FRAMES[seed % len(FRAMES)], PIXELS_M[seed % len(PIXELS_M)]
     given = OTHER_BODIES.get(body, {})
-    plan = draw_ball_plan(seed, frames=frames, pixel_m=pixel_m, drift=drift_preset("slow"), **given)
+    slow = drift_preset("slow")
+    x_m_s, y_m_s = (v * min(1.0, DRIFTING_FRAMES / frames) for v in slow.velocity_m_s)
+    drift = replace(slow, velocity_m_s=(x_m_s, y_m_s))
+    plan = draw_ball_plan(seed, frames=frames, pixel_m=pixel_m, drift=drift, **given)
     tracker = SequenceTracker()
     for index, frame in enumerate(plan.frames):
         camera = plan.microscope.camera_at(frame.magnification)
@@ -81,17 +86,17 @@ def reconstruct_look(seed: int, body: str = "ball") -> Look | str:
     round_ = found.roundness
     name = plan.specimen.texture_name
     return Look(
-        seed, body, name, 1e9 * plan.specimen.grain_m * (4.0 if name == "noise" else 1.0),
+        seed, frames, body, name, 1e9 * plan.specimen.grain_m * (4.0 if name == "noise" else 1.0),
         int(np.count_nonzero(found.sphere.inliers)), 100.0 * (found.diameter_m / true - 1.0),
         100.0 * found.sigma_m / true, low <= true <= high, round_.is_ball,
         f"{round_.kind} {1e9 * round_.height_m:+.1f} +- {1e9 * round_.height_sigma_m:.1f} nm",
     )  # fmt: skip
 
 
-def compare_looks(seeds: int) -> dict[str, Any]:
-    """Reconstruct a ball for every seed, and both other bodies for every fifth; print and summarise."""
+def compare_looks(seeds: int, first: int = 0) -> dict[str, Any]:
+    """Reconstruct a ball for every seed from the first, and both other bodies for every fifth; print and summarise."""
     made, failed = [], []
-    for seed in range(seeds):
+    for seed in range(first, first + seeds):
         for body in ("ball", *(OTHER_BODIES if seed % 5 == 0 else ())):
             look = reconstruct_look(seed, body)
             if isinstance(look, str):
@@ -100,8 +105,8 @@ def compare_looks(seeds: int) -> dict[str, Any]:
                 continue
             made.append(look)
             print(
-                f"seed {seed:2d}  {body:13}  {look.texture:8} {look.grain_nm:3.0f} nm  {look.points:4d} points  "
-                f"{look.error_percent:+.2f} +- {look.sigma_percent:.2f} %  "
+                f"seed {seed:2d}  {look.frames:4d} frames  {body:13}  {look.texture:8} {look.grain_nm:3.0f} nm  "
+                f"{look.points:4d} points  {look.error_percent:+.2f} +- {look.sigma_percent:.2f} %  "
                 f"{'held' if look.held else 'NOT HELD'}  {'ball' if look.is_ball else 'no ball'}: "
                 f"{look.departure}",
                 flush=True,

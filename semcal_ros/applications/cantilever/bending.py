@@ -45,6 +45,7 @@ __all__ = [
     "fit_bending",
     "fit_common_shape",
     "locate_end",
+    "locate_load",
     "parse_shape",
 ]
 
@@ -55,10 +56,19 @@ SHAPES = ("free", "beam", "parabola")
 _TURN_RAD = 1e-5
 # Prior mean and 1-sigma of an unknown shape: both the parabola and the end-loaded beam are likely.
 _PRIOR = (-0.25, 0.35)
-# Mean and 1-sigma of c of a beam that is loaded at one place in the outer fifth of its length, all places alike, and
-# the probability that it is, before anything is seen: as likely as not.
-_POINT_LOAD = (-0.59, 0.06)
+# Where a beam is loaded if nothing shows the place: in the outer fifth of its length.
+_OUTER = (0.8, 1.0)
+# 1-sigma of c of a beam that is pushed at a known place: its section is not the same everywhere, and what pushes it is
+# no point. A load that is 3 % of the length elsewhere changes c by as much.
+_POINT_LOAD_SIGMA = 0.03
+# Probability that a beam is loaded at one place, before anything is seen: as likely as not.
 _POINT_LOAD_PROBABILITY = 0.5
+# Nearest place to the base that can be told from a load at it: there, c grows beyond all limits.
+_LEAST_LOAD = 0.4
+# Frames in which the beam is bent by this part of the largest deflection show what it is pushed by ...
+_PUSHED = 0.3
+# ... where both edges are unusable in at least this part of them.
+_HIDDEN = 0.5
 # Keeps divisions from zero, m^2: far below any variance, which is at least 1e-26 (see the prior).
 _TINY = 1e-30
 # Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
@@ -178,10 +188,37 @@ def fit_common_shape(
     return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
 
 
-def expect_point_load(fitted: Shape) -> Shape:
+def locate_load(u: Array, frames: Sequence[Bending]) -> tuple[float, float]:
+    """Locate where the beam is pushed: the first and last place, as fractions of the length.
+
+    What pushes a beam hides its edge there. Where nothing is hidden, it is pushed somewhere in its outer fifth.
+
+    Parameters
+    ----------
+    u
+        (blocks,) arc length of the blocks over the length.
+    frames
+        Fits of the frames that are not references.
+    """
+    seen = [f for f in frames if np.isfinite(f.deflection_m)]
+    size = np.array([abs(f.deflection_m) for f in seen])
+    pushed = [f for f, d in zip(seen, size, strict=True) if d >= _PUSHED * size.max()]
+    if len(pushed) < 2 or len(u) < 2:
+        return _OUTER
+    hidden = np.mean([~f.used.any(axis=1) for f in pushed], axis=0) >= _HIDDEN
+    block = float(u[1] - u[0])
+    places = np.flatnonzero(hidden)
+    # One block alone may be dirt; beside what is hidden, a neighbour is left out, too (see :mod:`.edges`).
+    if len(places) < 2:
+        return _OUTER
+    last = float(u[places[-1]]) - 0.5 * block if places[-1] < len(u) - 1 else 1.0
+    return min(float(u[places[0]]) + 0.5 * block, last), last
+
+
+def expect_point_load(fitted: Shape, load: tuple[float, float] = _OUTER) -> Shape:
     """Combine a fitted shape with what is known of beams that are pushed.
 
-    Before anything is seen, the beam is as likely as not loaded at one place in the outer fifth of its length; if it is
+    Before anything is seen, the beam is as likely as not loaded at one place; if it is
     not, its shape is as unknown as :func:`fit_common_shape` assumes. The result has the mean and the 1-sigma of both
     posteriors together. So a shape that contradicts a point load, such as a parabola, stays as it was fitted.
 
@@ -189,15 +226,19 @@ def expect_point_load(fitted: Shape) -> Shape:
     ----------
     fitted
         Shape from :func:`fit_common_shape`.
+    load
+        First and last place of the load, as fractions of the length, all places between them alike.
     """
     seen = max(fitted.sigma, 1e-6) ** 2
-    mean, sigma = _POINT_LOAD
+    places = np.linspace(*np.maximum(load, _LEAST_LOAD), 101)
+    shapes = -1.0 / (3.0 * places - 1.0)
+    mean, sigma = float(shapes.mean()), float(np.hypot(shapes.std(), _POINT_LOAD_SIGMA))
     share = seen / (seen + sigma**2)
     loaded, loaded_variance = fitted.value + share * (mean - fitted.value), share * sigma**2
     # The fitted shape holds the broad prior already. Its evidence is that of the frames alone under that prior.
     evidence = [
         float(np.exp(-0.5 * (fitted.value - m) ** 2 / (seen + s**2)) / np.sqrt(seen + s**2))
-        for m, s in (_POINT_LOAD, _PRIOR)
+        for m, s in ((mean, sigma), _PRIOR)
     ]
     weight = _POINT_LOAD_PROBABILITY * evidence[0]
     weight /= max(weight + (1.0 - _POINT_LOAD_PROBABILITY) * evidence[1], _TINY)

@@ -32,6 +32,7 @@ from semcal_ros.applications.cantilever.bending import (
     fit_bending,
     fit_common_shape,
     locate_end,
+    locate_load,
     parse_shape,
 )
 from semcal_ros.applications.cantilever.edges import EdgeFit, find_unchanged_width, fit_edges
@@ -438,9 +439,12 @@ class _SeriesMeasurement:
         others = [f for k, f in enumerate(free) if k not in reference]
         own = [free[k].covariance[1, 1] for k in reference]
         common = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
-        shape, misfit = (
-            (expect_point_load(common), None) if shape is None else _compare_shapes(shape, common)
-        )
+        misfit = None
+        if shape is None:
+            u = undeformed.model.centres_m / self._settings.length_m
+            shape = expect_point_load(common, locate_load(u, others))
+        else:
+            shape, misfit = _compare_shapes(shape, common)
         bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
         doubts = [misfit, self._describe_slip(np.array(ends_m), undeformed, reference)]
         results = [self._result(k, one, undeformed) for k, one in enumerate(bent)]

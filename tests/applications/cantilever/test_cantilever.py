@@ -35,6 +35,7 @@ from semcal_ros.applications.cantilever.bending import (
     expect_point_load,
     fit_bending,
     locate_end,
+    locate_load,
     parse_shape,
 )
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
@@ -189,8 +190,13 @@ def test_the_shape_of_a_point_load_is_pulled_towards_those_of_point_loads(load):
         assert abs(expected.value - true) < 2.0 * expected.sigma
         # More than that of the fit only where it may as well be no point load.
         assert expected.sigma < 0.066
-        # -0.59 is the mean of loads anywhere in the outer fifth.
-        assert abs(expected.value + 0.59) < abs(true + error + 0.59)
+        # The mean of loads anywhere in the outer fifth: the integral of c over it.
+        mean = -np.log(2.0 / 1.4) / 3.0 / 0.2
+        assert abs(expected.value - mean) < abs(true + error - mean)
+        # A place that is known tells more.
+        known = expect_point_load(Shape(true + error, 0.06), (load, load))
+        assert abs(known.value - true) < 0.5 * 0.06
+        assert known.sigma < expected.sigma
 
 
 def test_a_shape_that_is_no_point_load_stays():
@@ -220,6 +226,35 @@ def test_the_sigma_of_an_expected_shape_is_honest():
         deviations.append((expected.value - true) / expected.sigma)
     # 4000 deviates: their RMS is good to 1 to 2 %. The load's distribution is uniform, and taken for a normal one.
     assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1.0, abs=0.07)
+
+
+def hidden_frames(deflections_m, hidden):
+    """Fits in which both edges of some of 40 blocks are hidden while the beam is pushed."""
+    frames = []
+    for d in deflections_m:
+        used = np.ones((40, 2), dtype=bool)
+        used[hidden if d > 50e-9 else []] = False
+        # Ground beside one edge, in every frame.
+        used[11, 0] = False
+        frames.append(SimpleNamespace(deflection_m=d, used=used))
+    return frames
+
+
+def test_the_load_is_where_something_hides_the_edges():
+    u = (np.arange(40) + 0.5) / 42.0
+    pushes = [20e-9, 100e-9, 250e-9, 180e-9, 0.0]
+    # From a place to the last block: as far as the free end. The neighbour of what is hidden is left out, too.
+    first, last = locate_load(u, hidden_frames(pushes, [36, 37, 38, 39]))
+    assert first == pytest.approx(37.0 / 42.0, abs=1e-12)
+    assert last == 1.0
+    # A needle.
+    first, last = locate_load(u, hidden_frames(pushes, [29, 30, 31]))
+    assert first == pytest.approx(30.0 / 42.0, abs=1e-12)
+    assert last == pytest.approx(31.0 / 42.0, abs=1e-12)
+    # One block is dirt; nothing hidden, nothing known; nor is it in a single frame.
+    for frames in (hidden_frames(pushes, [30]), hidden_frames(pushes, []), []):
+        assert locate_load(u, frames) == (0.8, 1.0)
+    assert locate_load(u, hidden_frames([250e-9], [36, 37, 38])) == (0.8, 1.0)
 
 
 def test_a_mean_over_frames_keeps_what_they_share():
@@ -326,6 +361,29 @@ def test_a_body_of_more_contrast_is_not_taken_for_the_cantilever(seed, magnifica
     # Without the length it is the other body, or this test shows nothing.
     other = find_strip(image)
     assert not (other.base_seen and other.tip_seen)
+
+
+def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
+    """The inner corner of the pusher touches the beam at 0.916 of its length."""
+    scene, plan = random_plan(1, 7760.0, (0.0, 0.3, 0.6, 1.0))
+    located = []
+
+    def remember(u, frames):
+        located.append(locate_load(u, frames))
+        return located[-1]
+
+    monkeypatch.setattr("semcal_ros.applications.cantilever.series.locate_load", remember)
+    camera, timing = plan.microscope.camera_at(7760.0), plan.microscope.timing
+    images = [plan.render(k) for k in range(4)]
+    times = [frame.start_time_s for frame in plan.frames]
+    found = measure_series(images, times, camera, timing, SeriesSettings(scene.length_m))
+    assert scene.load == pytest.approx(0.917, abs=1e-3)
+    # Two thirds of a block.
+    assert located[0][0] == pytest.approx(scene.load, abs=0.012)
+    assert located[0][1] == 1.0
+    assert found.shape.value == pytest.approx(
+        -1.0 / (3.0 * scene.load - 1.0), abs=3.0 * found.shape.sigma
+    )
 
 
 def test_what_moves_along_itself_is_no_clamped_beam():
