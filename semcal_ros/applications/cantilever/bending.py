@@ -230,7 +230,8 @@ def expect_point_load(fitted: Shape, load: tuple[float, float] = _OUTER) -> Shap
         First and last place of the load, as fractions of the length, all places between them alike.
     """
     seen = max(fitted.sigma, 1e-6) ** 2
-    places = np.linspace(*np.maximum(load, _LEAST_LOAD), 101)
+    first, last = (max(place, _LEAST_LOAD) for place in load)
+    places = np.linspace(first, last, 101)
     shapes = -1.0 / (3.0 * places - 1.0)
     mean, sigma = float(shapes.mean()), float(np.hypot(shapes.std(), _POINT_LOAD_SIGMA))
     share = seen / (seen + sigma**2)
