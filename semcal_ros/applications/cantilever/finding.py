@@ -20,7 +20,7 @@ derivative). Texture averages out; a strip leaves a rising and a falling line cl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -53,6 +53,9 @@ _DARK = 0.7
 # contrast than the beam and lies across it.
 _CANDIDATES = 3
 _APART_RAD = np.deg2rad(10.0)
+# Of the edges of two beams side by side, all alike, the outer two must not be taken for one beam: edges between two
+# others count if they have this part of their strength. A bright rim leaves less inside a beam.
+_ALIKE = 0.8
 # A strip other than the strongest bright and the strongest dark one is taken only if it has the length that is known,
 # and at least this part of the strength of the strongest.
 _LEAST_STRENGTH = 0.3
@@ -68,6 +71,8 @@ _LEAST_LENGTH = 0.2
 # An end closer to the border counts as out of view: the mean along the strip reaches 4 px beyond
 # its end, and the outer 3 px are not searched.
 _BORDER_PX = 7.0
+# Index beyond any line.
+_NOWHERE = 1 << 30
 _GIVE_CLICKS = "give two points on its centre line, the base and the free end, as base and tip"
 
 
@@ -85,6 +90,8 @@ class Strip:
         Whether each end is an end of the cantilever and not the place where it leaves the image.
     is_dark
         Whether the strip is darker than what lies beside it.
+    rivals
+        Number of other strips that have the length of the cantilever, too.
     """
 
     base_px: Array
@@ -93,6 +100,7 @@ class Strip:
     base_seen: bool
     tip_seen: bool
     is_dark: bool = False
+    rivals: int = 0
 
 
 @dataclass(frozen=True)
@@ -163,6 +171,7 @@ def find_strip(
         found.base_seen,
         found.tip_seen,
         is_dark,
+        found.rivals,
     )
 
 
@@ -183,14 +192,34 @@ def _prepare_lines(smooth: Array) -> _Lines:
 
 
 def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
-    """Find a rising line and a falling line after it, of which the weaker one is strongest."""
+    """Find a rising and a falling line after it, of which the weaker one is strongest, with no such pair between."""
     best = (0.0, 0, 0)
     for width in range(low, min(high, len(rise) - 1)):
         pair = np.minimum(rise[:-width], fall[width:])
         first = int(np.argmax(pair))
         if pair[first] > best[0]:
             best = (float(pair[first]), first, first + width)
+    strength, first, last = best
+    least = _ALIKE * strength
+    # The falling line that belongs to the first edge, and the rising line that belongs to the last one.
+    inner_fall = first + low + _find_peak(fall[first + low : last - low + 1], least)
+    inner_rise = last - low - _find_peak(rise[first + low : last - low + 1][::-1], least)
+    if first + low <= inner_fall < inner_rise <= last - low:
+        left = min(float(rise[first]), float(fall[inner_fall])), first, inner_fall
+        right = min(float(rise[inner_rise]), float(fall[last])), inner_rise, last
+        return max(left, right)
     return best
+
+
+def _find_peak(values: Array, least: float) -> int:
+    """Return the index of the first peak that is at least so high, or a large one if there is none."""
+    high = np.flatnonzero(values >= least)
+    if not high.size:
+        return _NOWHERE
+    k = int(high[0])
+    while k + 1 < len(values) and values[k + 1] > values[k]:
+        k += 1
+    return k
 
 
 def _widen(sums: Array) -> Array:
@@ -206,6 +235,7 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
     """
     refusals: list[InvalidValueError] = []
     strongest: dict[bool, tuple[bool, Strip]] = {}
+    fitting: list[tuple[bool, Strip]] = []
     first_seen: set[bool] = set()
     most = 0.0
     for is_dark, angle, point in _search_lines(smooth):
@@ -224,13 +254,23 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
                 refusals.append(error)
             continue
         if length_px is not None and _has_length(found, length_px):
-            return is_dark, found
+            fitting.append((is_dark, found))
         if is_first:
             strongest[is_dark] = is_dark, found
+    if fitting:
+        is_dark, chosen = fitting[0]
+        rivals = sum(not _is_same(chosen, other) for _, other in fitting[1:])
+        return is_dark, replace(chosen, rivals=rivals)
     for choice in strongest.values():
         return choice
     # Of the stronger one.
     raise refusals[0] if refusals else _no_strip()
+
+
+def _is_same(one: Strip, other: Strip) -> bool:
+    """Whether two strips lie on each other."""
+    away = 0.5 * (one.base_px + one.tip_px) - 0.5 * (other.base_px + other.tip_px)
+    return float(np.hypot(*away)) < one.half_width_px + other.half_width_px
 
 
 def _has_length(strip: Strip, length_px: float) -> bool:
@@ -253,26 +293,39 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     lines = _prepare_lines(small)
     high = int(_LARGEST_WIDTH * min(small.shape))
-    pairs: list[tuple[float, bool, float, float]] = []
+    least = _LEAST_WIDTH_PX // shrink + 1
+    best: list[tuple[float, bool, float]] = []
     # Half a turn is enough: in the opposite direction the two edges only change places.
     for turn in np.arange(0.0, np.pi, _STEP_RAD):
-        sums, first = lines.across(float(turn))
-        wide = _widen(sums)
+        wide = _widen(lines.across(float(turn))[0])
         for dark, edges in ((False, wide), (True, -wide)):
-            strength, low, up = _find_best_pair(edges, -edges, _LEAST_WIDTH_PX // shrink + 1, high)
-            strength *= _DARK if dark else 1.0
-            pairs.append((strength, dark, float(turn), 0.5 * (low + up) + first))
-    middle = 0.5 * (np.array(size) - 1.0)
-    found: list[tuple[bool, float, Array]] = []
-    for strength, dark, angle, offset in sorted(pairs, key=lambda pair: -pair[0]):
-        alike = [turn for other, turn, _ in found if other == dark]
+            strength = _find_best_pair(edges, -edges, least, high)[0]
+            best.append((strength * (_DARK if dark else 1.0), dark, float(turn)))
+    directions: list[tuple[bool, float]] = []
+    for strength, dark, angle in sorted(best, key=lambda one: -one[0]):
+        alike = [turn for other, turn in directions if other == dark]
         apart = [abs((angle - turn + 0.5 * np.pi) % np.pi - 0.5 * np.pi) for turn in alike]
-        if strength <= 0.0 or len(alike) == _CANDIDATES or min(apart, default=np.pi) < _APART_RAD:
-            continue
+        if strength > 0.0 and len(alike) < _CANDIDATES and min(apart, default=np.pi) >= _APART_RAD:
+            directions.append((dark, angle))
+    middle = 0.5 * (np.array(size) - 1.0)
+    found: list[tuple[float, bool, float, Array]] = []
+    for dark, angle in directions:
+        sums, first = lines.across(angle)
+        edges = (-1.0 if dark else 1.0) * _widen(sums)
+        rise, fall = edges.copy(), -edges
         across = np.array([-np.sin(angle), np.cos(angle)])
-        point = middle + (offset - float(across @ middle)) * across
-        found.append((dark, angle, (point + 0.5) * shrink - 0.5))
-    return found
+        # Beside the strongest strip there may be others in the same direction.
+        for _ in range(_CANDIDATES):
+            strength, low, up = _find_best_pair(rise, fall, least, high)
+            if strength <= 0.0:
+                break
+            offset = 0.5 * (low + up) + first
+            point = middle + (offset - float(across @ middle)) * across
+            factor = _DARK if dark else 1.0
+            found.append((factor * strength, dark, angle, (point + 0.5) * shrink - 0.5))
+            rise[max(low - 2, 0) : up + 3] = fall[max(low - 2, 0) : up + 3] = 0.0
+    found.sort(key=lambda one: -one[0])
+    return [(dark, angle, point) for _, dark, angle, point in found]
 
 
 def _find_pair_near(
@@ -290,11 +343,21 @@ def _find_pair_near(
             continue
         rise, fall = wide[left:right].copy(), -wide[left:right]
         rise[here - left :], fall[: here - left] = -np.inf, -np.inf
-        strength, low, up = _find_best_pair(rise, fall, _LEAST_WIDTH_PX, right - left)
+        strength, low, up = _find_best_around(rise, fall, here - left)
         if strength > best:
             best = strength
             found = best, float(angle), 0.5 * (low + up) + left + first, 0.5 * (up - low)
     return found
+
+
+def _find_best_around(rise: Array, fall: Array, here: int) -> tuple[float, int, int]:
+    """Find the nearest rising line before a place and falling line after it that are as strong as any there."""
+    strength = float(min(rise[:here].max(initial=0.0), fall[here:].max(initial=0.0)))
+    low = here - 1 - _find_peak(rise[:here][::-1], _ALIKE * strength)
+    up = here + _find_peak(fall[here:], _ALIKE * strength)
+    if strength <= 0.0 or low < 0 or up >= len(fall) or up - low < _LEAST_WIDTH_PX:
+        return 0.0, 0, 0
+    return min(float(rise[low]), float(fall[up])), low, up
 
 
 def _follow_clicks(smooth: Array, base: Array, tip: Array) -> tuple[bool, Strip]:

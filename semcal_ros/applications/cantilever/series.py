@@ -245,6 +245,11 @@ def measure_series(
     _check_length(undeformed, settings.length_m, plane.camera)
     frames, shape, doubts = work.deflections(undeformed, tuple(reference), on_frame)
     notes = _collect_notes(undeformed, frames, background, tuple(reference), settings) + doubts
+    if strip.rivals:
+        notes += (
+            f"{counted(strip.rivals, 'other strip')} of that length in view: if one of them is the cantilever, give "
+            "base and tip",
+        )
     return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
 
