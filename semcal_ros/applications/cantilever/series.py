@@ -35,7 +35,12 @@ from semcal_ros.applications.cantilever.bending import (
     locate_load,
     parse_shape,
 )
-from semcal_ros.applications.cantilever.edges import EdgeFit, find_unchanged_width, fit_edges
+from semcal_ros.applications.cantilever.edges import (
+    EdgeFit,
+    StepFit,
+    find_unchanged_width,
+    fit_edges,
+)
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
 from semcal_ros.applications.cantilever.tip import find_apex
@@ -43,6 +48,7 @@ from semcal_ros.applications.cantilever.undeformed import (
     REACH_PX,
     PixelSamples,
     UndeformedBeam,
+    fit_base_edge,
     measure_undeformed_beam,
 )
 from semcal_ros.core.arrays import AnyImage, Array, Indices, check_positive
@@ -78,6 +84,10 @@ _ABSURD = 1.5
 # the end of a clamped beam: bent by a 25th of its length, that one comes back by a thousandth of it. The brightness of
 # the middle shows the end to 2 px. A pusher moves by its gap and the deflection.
 _SLIP_PX = 5.0
+# The same of the base, px, whose edge is found to a fraction of a pixel; and in sigmas of it.
+_BASE_SLIP_PX, _BASE_SLIP = 1.0, 5.0
+# Part of the time of a frame that is the least between two: less is no time at which a scan can have begun.
+_LEAST_INTERVAL = 0.9
 # Regions of the ground that a note names at most.
 _NAMED_REGIONS = 3
 # Points of the centre line in the results, for drawing.
@@ -219,6 +229,7 @@ def measure_series(
     """
     _check(images, times_s, reference)
     height, width = images[0].shape
+    timing, early = _check_timing(timing, times_s)
     plane = PlaneMap(camera.resized(width, height), timing)
     field_m = max(width, height) * plane.pixel_m
     if settings.length_m > _LARGEST_LENGTH * field_m:
@@ -244,7 +255,9 @@ def measure_series(
     )
     _check_length(undeformed, settings.length_m, plane.camera)
     frames, shape, doubts = work.deflections(undeformed, tuple(reference), on_frame)
-    notes = _collect_notes(undeformed, frames, background, tuple(reference), settings) + doubts
+    notes = (
+        _collect_notes(undeformed, frames, background, tuple(reference), settings) + doubts + early
+    )
     if strip.rivals:
         notes += (
             f"{counted(strip.rivals, 'other strip')} of that length in view: if one of them is the cantilever, give "
@@ -266,6 +279,21 @@ def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequ
         raise InvalidValueError(
             f"reference frames {list(reference)}", expected=f"indices from 0 to {len(images) - 1}"
         )
+
+
+def _check_timing(
+    timing: ScanTiming | None, times_s: Sequence[float]
+) -> tuple[ScanTiming | None, tuple[str, ...]]:
+    """Treat frames as instants, with a remark, if their times cannot be those of their scans."""
+    if timing is None or len(times_s) < 2:
+        return timing, ()
+    interval_s = float(np.min(np.diff(times_s)))
+    if interval_s >= _LEAST_INTERVAL * timing.acquisition_time_s:
+        return timing, ()
+    return None, (
+        f"frames are {interval_s:.3g} s apart and take {timing.acquisition_time_s:.3g} s each, so their times are not "
+        "those of the scans: each frame is treated as an instant, and the drift within it stays",
+    )
 
 
 def _invert(image: AnyImage) -> AnyImage:
@@ -338,7 +366,10 @@ def _collect_notes(
     path = background.path
     notes = list(undeformed.notes)
     if unseen := sum(not np.isfinite(f.deflection_m) for f in frames):
-        notes.append(f"the beam is not found in {unseen} of {counted(len(frames), 'frame')}")
+        notes.append(
+            f"the beam is not found in {unseen} of {counted(len(frames), 'frame')}; its end is looked for up to "
+            f"{1e6 * settings.reach_m:.3g} um from where it rests"
+        )
     if lost := sum(not _is_tied(path, frame, reference) for frame in range(len(path))):
         left = (
             "they rest on the base alone"
@@ -429,11 +460,12 @@ class _SeriesMeasurement:
         Also returns remarks: where the frames do not bend as the shape that was given, or what was measured is not a
         clamped beam.
         """
-        edges, free, ends_m = [], [], []
+        edges, free, ends_m, bases = [], [], [], []
         terms = np.zeros(2)
         for frame in range(len(self._images)):
             samples = self.sample(undeformed.axis, frame)
             ends_m.append(self._find_end(samples, undeformed))
+            bases.append(self._find_base(samples, undeformed))
             terms = np.zeros(2) if frame in reference else self._nearby(samples, undeformed, terms)
             edges.append(self._edges(samples, undeformed, terms))
             free.append(self._bending(frame, edges[-1], undeformed, reference, None))
@@ -451,7 +483,11 @@ class _SeriesMeasurement:
         else:
             shape, misfit = _compare_shapes(shape, common)
         bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
-        doubts = [misfit, self._describe_slip(np.array(ends_m), undeformed, reference)]
+        doubts = [
+            misfit,
+            self._describe_end_slip(np.array(ends_m), reference),
+            self._describe_base_slip(bases, reference),
+        ]
         results = [self._result(k, one, undeformed) for k, one in enumerate(bent)]
         return results, shape, tuple(doubt for doubt in doubts if doubt is not None)
 
@@ -462,19 +498,42 @@ class _SeriesMeasurement:
             return float("nan")
         return find_apex(samples, axis.visible_m[1], axis.half_width_m, self._plane.pixel_m)
 
-    def _describe_slip(
-        self, ends_m: Array, undeformed: UndeformedBeam, reference: tuple[int, ...]
-    ) -> str | None:
+    def _find_base(self, samples: PixelSamples, undeformed: UndeformedBeam) -> StepFit:
+        """Find where the holder begins in a frame; infinite sigma if that does not show."""
+        axis = undeformed.axis
+        if not axis.base_seen:
+            return StepFit(float("nan"), float("inf"), 0.0)
+        return fit_base_edge(samples, axis.visible_m[0], undeformed.model, self._plane.pixel_m)
+
+    def _measure_slip(self, places_m: Array, reference: tuple[int, ...]) -> Array:
+        """Measure by how much a place lies elsewhere than in the references, m, where the drift is known."""
+        tied = [_is_tied(self._path, frame, reference) for frame in range(len(places_m))]
+        slip_m = places_m - np.mean(places_m[list(reference)])
+        others = np.delete(slip_m, reference)[np.delete(tied, reference)]
+        return np.asarray(others[np.isfinite(others)], dtype=np.float64)
+
+    def _describe_end_slip(self, ends_m: Array, reference: tuple[int, ...]) -> str | None:
         """Return a remark if the end moves along the strip, as that of a pusher does."""
-        others = np.delete(ends_m, reference)
-        if not (undeformed.axis.end_seen and others.size):
-            return None
-        slip_m = others - np.mean(ends_m[list(reference)])
-        if not np.median(np.abs(slip_m)) > _SLIP_PX * self._plane.pixel_m:
+        slip_m = np.abs(self._measure_slip(ends_m, reference))
+        if not (slip_m.size and np.median(slip_m) > _SLIP_PX * self._plane.pixel_m):
             return None
         return (
-            f"the end of what was measured moves along it, by {1e6 * np.median(np.abs(slip_m)):.2g} um in half of the "
+            f"the end of what was measured moves along it, by {1e6 * np.median(slip_m):.2g} um in half of the "
             "frames, and that of a clamped beam does not: is it the pusher? Look at --strip, or give base and tip"
+        )
+
+    def _describe_base_slip(
+        self, bases: Sequence[StepFit], reference: tuple[int, ...]
+    ) -> str | None:
+        """Return a remark if the base moves against the ground."""
+        slip_m = np.abs(self._measure_slip(np.array([b.place_m for b in bases]), reference))
+        sigma_m = float(np.median([b.sigma_m for b in bases]))
+        limit_m = max(_BASE_SLIP_PX * self._plane.pixel_m, _BASE_SLIP * sigma_m)
+        if not (slip_m.size and np.median(slip_m) > limit_m):
+            return None
+        return (
+            f"the base of what was measured moves, by {1e9 * np.median(slip_m):.2g} nm in half of the frames, and "
+            "that of a cantilever stands still: is it the pusher? Look at --strip, or give base and tip"
         )
 
     def _nearby(self, samples: PixelSamples, undeformed: UndeformedBeam, terms: Array) -> Array:
