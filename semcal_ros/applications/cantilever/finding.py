@@ -259,8 +259,12 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
             strongest[is_dark] = is_dark, found
     if fitting:
         is_dark, chosen = fitting[0]
-        rivals = sum(not _is_same(chosen, other) for _, other in fitting[1:])
-        return is_dark, replace(chosen, rivals=rivals)
+        # Between two beams lies a strip of the other kind.
+        distinct = [chosen]
+        for kind, other in fitting[1:]:
+            if kind == is_dark and not any(_is_same(one, other) for one in distinct):
+                distinct.append(other)
+        return is_dark, replace(chosen, rivals=len(distinct) - 1)
     for choice in strongest.values():
         return choice
     # Of the stronger one.

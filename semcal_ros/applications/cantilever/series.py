@@ -85,7 +85,7 @@ _ABSURD = 1.5
 # the middle shows the end to 2 px. A pusher moves by its gap and the deflection.
 _SLIP_PX = 5.0
 # The same of the base, px, whose edge is found to a fraction of a pixel; and in sigmas of it.
-_BASE_SLIP_PX, _BASE_SLIP = 1.0, 5.0
+_BASE_SLIP_PX, _BASE_SLIP = 1.0, 3.0
 # Part of the time of a frame that is the least between two: less is no time at which a scan can have begun.
 _LEAST_INTERVAL = 0.9
 # Regions of the ground that a note names at most.
@@ -225,7 +225,7 @@ def measure_series(
     Raises
     ------
     InvalidValueError
-        If the images differ in size, or no cantilever is found.
+        If the images differ in size, their times do not grow, or no cantilever is found.
     """
     _check(images, times_s, reference)
     height, width = images[0].shape
@@ -271,6 +271,12 @@ def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequ
         raise InvalidValueError(
             f"{counted(len(images), 'image')} at {counted(len(times_s), 'time')}",
             expected="one time for each",
+        )
+    if len(times_s) > 1 and not np.min(np.diff(times_s)) > 0.0:
+        raise InvalidValueError(
+            "frames of one magnification whose times do not grow",
+            expected="a time of its own for each, in the order of time",
+            do="give --frame-interval, or record anew",
         )
     shapes = sorted({image.shape for image in images})
     if len(shapes) > 1 or len(shapes[0]) != 2:

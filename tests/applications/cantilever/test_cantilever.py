@@ -21,6 +21,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from semcal_ros.applications.cantilever import (
     SeriesSettings,
@@ -39,6 +41,7 @@ from semcal_ros.applications.cantilever.bending import (
     parse_shape,
 )
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_edges
+from semcal_ros.applications.cantilever.undeformed import fit_base_edge
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
@@ -73,8 +76,6 @@ def measured(plan, *, shape="free", magnification=None, reference=(0,), **option
 def edge_pixels(rng, rows, shift, noise, width=1.0):
     """Pixels around both edges of a straight beam, in px."""
     along, across = np.meshgrid(np.arange(120.0), np.arange(-rows, rows + 1.0))
-    from scipy.special import ndtr
-
     line = 0.02 * along + shift
     beam = ndtr((across - line + 10.0) / width) - ndtr((across - line - 10.0) / width)
     grey = 40.0 + 90.0 * beam + rng.normal(0.0, noise, along.shape)
@@ -409,6 +410,72 @@ def test_what_moves_along_itself_is_no_clamped_beam():
     assert "is it the pusher?" in told["the pusher"][0]
 
 
+def test_a_base_that_moves_is_that_of_no_cantilever():
+    """The tip of a pusher whose other end is out of view may be taken for a base."""
+    scene, plan = random_plan(14, 6450.0, (0.0, 0.4, 1.0))
+    images = [plan.render(k) for k in range(3)]
+    times = [frame.start_time_s for frame in plan.frames]
+    camera, timing = plan.microscope.camera_at(6450.0), plan.microscope.timing
+    other = find_strip(images[0])
+    outwards = other.base_px - other.tip_px
+    taken = {"base_px": other.tip_px, "tip_px": other.base_px + 0.2 * outwards}
+    wrong, right = (
+        measure_series(images, times, camera, timing, SeriesSettings(scene.length_m, **ends))
+        for ends in (taken, {})
+    )
+    assert wrong.undeformed.axis.base_seen and right.undeformed.axis.base_seen
+    assert any("the base of what was measured moves" in note for note in wrong.notes)
+    assert not any("moves" in note for note in right.notes)
+
+
+@pytest.mark.parametrize("turn_deg", [-8.0, 0.0, 3.0, 12.0])
+def test_the_edge_of_a_holder_may_be_turned(turn_deg):
+    """What counts is where it crosses the centre line of the beam."""
+    along, across = np.meshgrid(np.arange(0.0, 60.0), np.arange(-50.0, 51.0))
+    edge = 21.3 + np.tan(np.radians(turn_deg)) * across
+    noise = np.random.default_rng(6).normal(0.0, 5.0, along.shape)
+    grey = 50.0 + 90.0 * ndtr(edge - along) + noise
+    view = along.ravel(), across.ravel(), grey.ravel()
+    found = fit_base_edge(view, 19.0, EdgeModel(1.0, 6.0, 30.0, 12.0, 9, 10.0), 1.0)
+    assert 19.0 - found.place_m == pytest.approx(21.3, abs=4.0 * found.sigma_m)
+    assert found.sigma_m < 0.03
+
+
+def painted(beams, *, holder=True):
+    """A picture of 256 px with a holder on its left; beams are (row, half width, length, grey level)."""
+    image = np.full((256, 256), 60.0)
+    if holder:
+        image[:, :40] = 150.0
+    for row, half, length, grey in beams:
+        image[row - half : row + half + 1, 30 : 40 + length] = grey
+    noise = np.random.default_rng(5).normal(0.0, 6.0, image.shape)
+    return np.clip(gaussian_filter(image, 1.0) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("brighter", [150.0, 200.0])
+def test_one_of_two_parallel_beams_is_found_and_the_other_told(brighter):
+    """The left edge of one and the right edge of the other are as strong a pair as those of a beam."""
+    image = painted([(100, 8, 150, 150.0), (140, 8, 150, brighter)])
+    strip = find_strip(image, length_px=150.0)
+    assert strip.half_width_px == pytest.approx(8.5, abs=1.5)
+    assert min(abs(strip.base_px[1] - row) for row in (100.0, 140.0)) < 1.5
+    assert strip.rivals == 1
+    # A neighbour of another length is none.
+    strip = find_strip(painted([(100, 8, 150, 150.0), (140, 8, 110, brighter)]), length_px=150.0)
+    assert strip.base_px[1] == pytest.approx(100.0, abs=1.5)
+    assert strip.rivals == 0
+
+
+@pytest.mark.parametrize(("row", "other"), [(100, 140), (140, 100)])
+def test_two_clicks_choose_among_parallel_beams(row, other):
+    """The other one is brighter."""
+    image = painted([(row, 8, 150, 130.0), (other, 8, 150, 210.0)])
+    strip = find_strip(image, base_px=(42.0, row + 3.0), tip_px=(188.0, row - 3.0))
+    assert strip.base_px[1] == pytest.approx(row, abs=1.5)
+    assert strip.tip_px[1] == pytest.approx(row, abs=1.5)
+    assert strip.half_width_px == pytest.approx(8.5, abs=1.5)
+
+
 def test_pictures_without_a_cantilever_are_refused():
     with pytest.raises(InvalidValueError, match="no strip"):
         find_strip(np.full((128, 128), 80, dtype=np.uint8))
@@ -589,6 +656,22 @@ def test_frames_of_other_sizes_and_references_are_refused():
 
 
 # -- repeatability --------------------------------------------------------------------------------
+
+
+def test_frames_closer_than_a_scan_takes_are_instants(end_plan):
+    """The drift between two of them, over a time that is none, is no velocity within a frame."""
+    images = [end_plan.render(k) for k in range(3)]
+    truth = np.array([f.scene.deflection_m for f in end_plan.frames])
+    camera, timing = scope(256).camera_at(7760.0), end_plan.microscope.timing
+    found = measure_series(images, [0.0, 1e-3, 2e-3], camera, timing, SeriesSettings(LENGTH))
+    assert any("each frame is treated as an instant" in note for note in found.notes)
+    for frame, true in zip(found.frames, truth, strict=True):
+        assert abs(frame.deflection_m - true) < 4.0 * frame.sigma_m + 1e-12
+    times = [frame.start_time_s for frame in end_plan.frames]
+    usual = measure_series(images, times, camera, timing, SeriesSettings(LENGTH))
+    assert not any("instant" in note for note in usual.notes)
+    with pytest.raises(InvalidValueError, match=r"times do not grow.*--frame-interval"):
+        measure_series(images, [0.0, 0.0, 1.0], camera, timing, SeriesSettings(LENGTH))
 
 
 def test_frames_are_cut_into_poses():
