@@ -80,6 +80,10 @@ _ROUNDS = 12
 _TERMS = 4
 # Least number of edges in a fit: two more than unknowns show the scatter.
 _LEAST = _TERMS + 2
+# Frames in which an edge is seen that show whether its residual grows with the deflection, and the spread of their
+# deflections in sigmas of one: of frames that are bent alike, noise would seem to grow with it.
+_LEAST_BENT = 4
+_LEAST_SPREAD = 5.0
 # An edge of a smaller weight does not count as used.
 _LEAST_WEIGHT = 0.05
 
@@ -180,10 +184,14 @@ def fit_common_shape(
         normal = (rows / variance[:, None]).T @ rows + np.diag(prior)
         right = (rows / variance[:, None]).T @ b + np.array([prior[0] * _PRIOR[0], 0.0])
         c = float(np.linalg.solve(normal, right)[0])
-    excess = _estimate_shared_excess(good, d, reference_count)
-    sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))
     along = float(np.sum((d - d.mean()) ** 2)) if len(d) > 1 else 0.0
     single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
+    apart = along > (_LEAST_SPREAD * single) ** 2
+    excess = _estimate_shared_excess(good, d, reference_count) if apart else 1.0
+    if not apart and len(good):
+        # Where the errors may be the same in all frames, these know no more than one.
+        normal = (rows / (len(good) * variance)[:, None]).T @ rows + np.diag(prior)
+    sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))
     relative = float(np.sqrt((excess - 1.0) / max(along, _TINY))) * single
     return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
 
@@ -255,11 +263,11 @@ def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count
     A bright grain beside an edge pulls the fitted edge in all frames alike; the effect of the
     reference does not depend on the deflection.
     """
-    if len(frames) < 4:
+    if len(frames) < _LEAST_BENT:
         return 1.0
     left = np.stack([f.residuals.ravel() for f in frames])
     seen = np.isfinite(left)
-    whole = seen.sum(axis=0) >= 4
+    whole = seen.sum(axis=0) >= _LEAST_BENT
     left, seen = left[:, whole], seen[:, whole].astype(np.float64)
     count = np.maximum(seen.sum(axis=0), 1.0)
     away = (d[:, None] - (seen * d[:, None]).sum(axis=0) / count) * seen

@@ -91,7 +91,7 @@ class Strip:
     is_dark
         Whether the strip is darker than what lies beside it.
     rivals
-        Number of other strips that have the length of the cantilever, too.
+        Other strips of the same kind that have the length of the cantilever, too.
     """
 
     base_px: Array
@@ -100,7 +100,7 @@ class Strip:
     base_seen: bool
     tip_seen: bool
     is_dark: bool = False
-    rivals: int = 0
+    rivals: tuple[Strip, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -164,14 +164,19 @@ def find_strip(
     else:
         clicks = [(np.asarray(p, dtype=np.float64) + 0.5) / shrink - 0.5 for p in (base_px, tip_px)]
         is_dark, found = _follow_clicks(smooth, clicks[0], clicks[1])
+    rivals = tuple(_enlarge(rival, shrink, is_dark) for rival in found.rivals)
+    return replace(_enlarge(found, shrink, is_dark), rivals=rivals)
+
+
+def _enlarge(strip: Strip, shrink: int, is_dark: bool) -> Strip:
+    """Convert a strip that was found in a reduced image."""
     return Strip(
-        (found.base_px + 0.5) * shrink - 0.5,
-        (found.tip_px + 0.5) * shrink - 0.5,
-        found.half_width_px * shrink,
-        found.base_seen,
-        found.tip_seen,
+        (strip.base_px + 0.5) * shrink - 0.5,
+        (strip.tip_px + 0.5) * shrink - 0.5,
+        strip.half_width_px * shrink,
+        strip.base_seen,
+        strip.tip_seen,
         is_dark,
-        found.rivals,
     )
 
 
@@ -264,7 +269,7 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
         for kind, other in fitting[1:]:
             if kind == is_dark and not any(_is_same(one, other) for one in distinct):
                 distinct.append(other)
-        return is_dark, replace(chosen, rivals=len(distinct) - 1)
+        return is_dark, replace(chosen, rivals=tuple(distinct[1:]))
     for choice in strongest.values():
         return choice
     # Of the stronger one.

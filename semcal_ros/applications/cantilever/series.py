@@ -246,6 +246,39 @@ def measure_series(
     )
     if strip.is_dark:
         images = [_invert(image) for image in images]
+    chosen = _measure_strip(strip, images, times_s, plane, settings, tuple(reference), on_frame)
+    notes = early
+    for rival in strip.rivals:
+        try:
+            other = _measure_strip(rival, images, times_s, plane, settings, tuple(reference))
+        except InvalidValueError:
+            # It is no beam.
+            continue
+        chosen = max(chosen, other, key=_rate_bending)
+        notes = (
+            *early,
+            "several strips of that length are in view, and the one that bends was measured; for another one, give "
+            "base and tip",
+        )
+    return replace(chosen, notes=chosen.notes + notes)
+
+
+def _rate_bending(series: Series) -> float:
+    """Return the largest deflection of a series in its sigmas."""
+    rated = [abs(f.deflection_m) / f.sigma_m for f in series.frames if np.isfinite(f.sigma_m)]
+    return max((value for value in rated if np.isfinite(value)), default=0.0)
+
+
+def _measure_strip(
+    strip: Strip,
+    images: Sequence[AnyImage],
+    times_s: Sequence[float],
+    plane: PlaneMap,
+    settings: SeriesSettings,
+    reference: tuple[int, ...],
+    on_frame: Callable[[], None] = lambda: None,
+) -> Series:
+    """Measure a bright strip in all frames."""
     rough = _extend_to_apex(_make_rough_axis(strip, plane, settings.length_m), plane, images[0])
     margin_m = 2.0 * REACH_PX * plane.pixel_m
     background = follow_background(images, times_s, plane, rough, margin_m, on_frame)
@@ -254,16 +287,11 @@ def measure_series(
         rough, [work.sample(rough, k) for k in reference], settings.length_m, plane.pixel_m
     )
     _check_length(undeformed, settings.length_m, plane.camera)
-    frames, shape, doubts = work.deflections(undeformed, tuple(reference), on_frame)
-    notes = (
-        _collect_notes(undeformed, frames, background, tuple(reference), settings) + doubts + early
+    frames, shape, doubts = work.deflections(undeformed, reference, on_frame)
+    notes = _collect_notes(undeformed, frames, background, reference, settings) + doubts
+    return Series(
+        plane.camera.magnification, undeformed, tuple(frames), shape, background.path, notes
     )
-    if strip.rivals:
-        notes += (
-            f"{counted(strip.rivals, 'other strip')} of that length in view: if one of them is the cantilever, give "
-            "base and tip",
-        )
-    return Series(camera.magnification, undeformed, tuple(frames), shape, background.path, notes)
 
 
 def _check(images: Sequence[AnyImage], times_s: Sequence[float], reference: Sequence[int]) -> None:

@@ -36,6 +36,7 @@ from semcal_ros.applications.cantilever.bending import (
     Shape,
     expect_point_load,
     fit_bending,
+    fit_common_shape,
     locate_end,
     locate_load,
     parse_shape,
@@ -258,6 +259,28 @@ def test_the_load_is_where_something_hides_the_edges():
     assert locate_load(u, hidden_frames([250e-9], [36, 37, 38])) == (0.8, 1.0)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_frames_that_are_bent_alike_know_no_more_of_the_shape_than_one(seed):
+    """Noise of frames without a spread once seemed to grow with the deflection, and made a sigma of a third of it."""
+    rng = np.random.default_rng(seed)
+    u = np.linspace(0.05, 0.98, 30)
+    curve = np.stack([0.5 * (3 * u**2 - u**3)] * 2, axis=1)
+    sigma = np.full(curve.shape, 3e-9)
+
+    def frames(pushes_m):
+        seen = [d * curve + rng.normal(0.0, 3e-9, curve.shape) for d in pushes_m]
+        return [fit_bending(u, moved, sigma, LENGTH, 1e-9) for moved in seen]
+
+    alike = frames([2e-7] * 6)
+    shape = fit_common_shape(alike, 1e-8, 1)
+    assert shape.relative == 0.0
+    one = fit_common_shape(alike[:1], 1e-8, 1)
+    assert shape.sigma == pytest.approx(one.sigma, rel=0.25)
+    apart = fit_common_shape(frames(np.linspace(5e-8, 3e-7, 6)), 1e-8, 1)
+    # The noise of the reference stays.
+    assert apart.sigma < 0.95 * one.sigma
+
+
 def test_a_mean_over_frames_keeps_what_they_share():
     """Four frames of a pose, each with noise of 1 nm and an error of the scale of 1 nm."""
     frame = SimpleNamespace(
@@ -410,6 +433,38 @@ def test_what_moves_along_itself_is_no_clamped_beam():
     assert "is it the pusher?" in told["the pusher"][0]
 
 
+def test_of_two_parallel_beams_the_one_that_bends_is_measured():
+    """Both are alike, at 100 nm per pixel; the lower one bends as a beam that is pushed at its end."""
+    pixel_m, length = 100e-9, 150
+    camera = replace(scope(256, name="ideal").camera_at(6450.0), m=1.0 / pixel_m)
+    truth_px = np.array([0.0, 1.0, 2.5, 4.0])
+    ground = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (256, 256)), 2.0)
+    rows, columns = np.mgrid[:256, :256].astype(float)
+    u = np.clip((columns - 39.5) / length, 0.0, 1.0)
+    images = []
+    for number, push in enumerate(truth_px):
+        image = 60.0 + 30.0 * ground
+        for row, bent in ((80.0, 0.0), (150.0, push)):
+            across = np.abs(rows - row - bent * 0.5 * (3.0 * u**2 - u**3))
+            cover = ndtr(9.0 - across) * ndtr(39.5 + length - columns)
+            image = image + cover * (160.0 - image)
+        holder = ndtr(39.5 - columns)
+        image = image + holder * (160.0 - image)
+        noise = np.random.default_rng(number).normal(0.0, 5.0, image.shape)
+        images.append(np.clip(image + noise, 0, 255).astype(np.uint8))
+    settings = SeriesSettings(length * pixel_m)
+    found = measure_series(images, [0.0, 5.0, 10.0, 15.0], camera, None, settings)
+    assert any("the one that bends was measured" in note for note in found.notes)
+    for frame, push in zip(found.frames[1:], truth_px[1:], strict=True):
+        assert abs(frame.deflection_m) == pytest.approx(push * pixel_m, abs=4.0 * frame.sigma_m)
+        assert frame.sigma_m < 0.1 * pixel_m
+    clicks = {"base_px": (40.0, 80.0), "tip_px": (189.0, 80.0)}
+    other = measure_series(
+        images, [0.0, 5.0, 10.0, 15.0], camera, None, SeriesSettings(length * pixel_m, **clicks)
+    )
+    assert max(abs(f.deflection_m) for f in other.frames) < 0.1 * pixel_m
+
+
 def test_a_base_that_moves_is_that_of_no_cantilever():
     """The tip of a pusher whose other end is out of view may be taken for a base."""
     scene, plan = random_plan(14, 6450.0, (0.0, 0.4, 1.0))
@@ -459,11 +514,12 @@ def test_one_of_two_parallel_beams_is_found_and_the_other_told(brighter):
     strip = find_strip(image, length_px=150.0)
     assert strip.half_width_px == pytest.approx(8.5, abs=1.5)
     assert min(abs(strip.base_px[1] - row) for row in (100.0, 140.0)) < 1.5
-    assert strip.rivals == 1
+    (rival,) = strip.rivals
+    assert abs(rival.base_px[1] - strip.base_px[1]) == pytest.approx(40.0, abs=2.0)
     # A neighbour of another length is none.
     strip = find_strip(painted([(100, 8, 150, 150.0), (140, 8, 110, brighter)]), length_px=150.0)
     assert strip.base_px[1] == pytest.approx(100.0, abs=1.5)
-    assert strip.rivals == 0
+    assert strip.rivals == ()
 
 
 @pytest.mark.parametrize(("row", "other"), [(100, 140), (140, 100)])
