@@ -152,12 +152,15 @@ def describe_disagreement(series: Sequence[Series], found: Repeatability) -> lis
             f"the beam is {listed} wide: not all of these are the same body. Look at --strip, or give base and tip"
         )
     if found.rms_spread_m > _LARGE_SPREAD * found.expected_spread_m:
-        away = found.deflection_m - np.nanmedian(found.deflection_m, axis=0)
-        row, column = np.unravel_index(int(np.nanargmax(np.abs(away))), away.shape)
+        # A pose that was measured at less than two magnifications has no spread.
+        known = np.flatnonzero(np.isfinite(found.spread_m))
+        away = found.deflection_m[:, known] - np.nanmedian(found.deflection_m[:, known], axis=0)
+        row, place = np.unravel_index(int(np.nanargmax(np.abs(away))), away.shape)
+        column = int(known[place])
         notes.append(
             f"the magnifications differ by {1e9 * found.rms_spread_m:.2g} nm RMS where their sigmas predict "
             f"{1e9 * found.expected_spread_m:.2g} nm, most at {found.magnifications[row]:g}x in pose {column + 1}, by "
-            f"{1e9 * away[row, column]:+.2g} nm: were the poses the same?"
+            f"{1e9 * away[row, place]:+.2g} nm: were the poses the same?"
         )
     return notes
 

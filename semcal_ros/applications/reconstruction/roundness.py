@@ -166,6 +166,8 @@ class _SphereResiduals:
         """
         weight = np.ones(len(self.height))
         for turn in range(2 * _ROUNDS):
+            if turn > _ROUNDS and np.count_nonzero(weight) < 2 * design.shape[1]:
+                break
             rows = np.linalg.solve((design * weight[:, None]).T @ design, design.T * weight)
             leverage = np.einsum("nk,kn->n", design, rows)
             error = np.abs(self.height - design @ (rows @ self.height))

@@ -789,5 +789,17 @@ def test_magnifications_that_measured_different_things_are_told():
     # Standard deviations of (1, 50, 52) and (0, 98, 100): 28.9 and 57.2 nm, RMS 45.3 nm.
     assert "differ by 45 nm RMS where their sigmas predict 1.5 nm" in spread
     assert "most at 6450x in pose 3, by -98 nm" in spread
+    # A pose that is nowhere known, and one that one of them lacks.
+    gaps = [
+        series(6450.0, 2.5e-6, [0.0, np.nan, np.nan, 1e-9]),
+        series(7760.0, 2.5e-6, [0.0, np.nan, 98e-9, 98e-9]),
+        series(8890.0, 2.5e-6, [0.0, np.nan, 100e-9, 100e-9]),
+    ]
+    for one in gaps:
+        for frame in one.frames:
+            if np.isnan(frame.deflection_m):
+                frame.noise_m = np.inf
+    (spread,) = describe_disagreement(gaps, compare_series(gaps))
+    assert "most at 6450x in pose 4, by -97 nm" in spread
     # One magnification has nothing to differ from.
     assert describe_disagreement(alike[:1], compare_series(alike[:1])) == []
