@@ -31,7 +31,6 @@ import io
 import json
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ import trimesh
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from examples.nano_ball.looks import compare_looks
+from examples.nano_ball.looks import compare_looks, slow_down
 from semcal_ros import Calibration
 from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe
 from semcal_ros.cli import main as semcal
@@ -229,10 +228,8 @@ def main() -> None:
     # 2. The ball, with drift, every line at its own time.
     # Fewer frames are some of the same movement, not a faster one.
     interval_s = 0.1 * max(1.0, 2000 / frames)
-    drift = drift_preset("settling")
     # In a recording of half an hour, the drift of some minutes would carry the ball out of the field.
-    x_m_s, y_m_s = (v * min(1.0, 2000 / frames) for v in drift.velocity_m_s)
-    drift = replace(drift, velocity_m_s=(x_m_s, y_m_s))
+    drift = slow_down(drift_preset("settling"), 2000 / frames)
     # So few frames follow a simpler movement only: from one to the next, features must stay alike.
     motion = Turning(frames * interval_s, rolls=0.67, yaws=0.67) if given.quick else None
     plan = ball_plan(

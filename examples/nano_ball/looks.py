@@ -27,7 +27,7 @@ import numpy as np
 
 from semcal_ros.applications.reconstruction import SequenceTracker, measure_ball, reconstruct
 from semcal_ros.core.errors import StructureError
-from semcal_ros.synthetic.drift import drift_preset
+from semcal_ros.synthetic.drift import Drift, drift_preset
 from semcal_ros.synthetic.specimens.ball import draw_ball_plan
 
 # Two pixel sizes: 138 and 112 px across the ball.
@@ -61,13 +61,17 @@ class Look:
     departure: str
 
 
+def slow_down(drift: Drift, factor: float) -> Drift:
+    """The drift with its velocity times a factor below 1: a long recording then goes no farther than a short one."""
+    x_m_s, y_m_s = (v * min(1.0, factor) for v in drift.velocity_m_s)
+    return replace(drift, velocity_m_s=(x_m_s, y_m_s))
+
+
 def reconstruct_look(seed: int, body: str = "ball") -> Look | str:
     """Reconstruct one recording with the true camera; the reason if that fails."""
     frames, pixel_m = FRAMES[seed % len(FRAMES)], PIXELS_M[seed % len(PIXELS_M)]
     given = OTHER_BODIES.get(body, {})
-    slow = drift_preset("slow")
-    x_m_s, y_m_s = (v * min(1.0, DRIFTING_FRAMES / frames) for v in slow.velocity_m_s)
-    drift = replace(slow, velocity_m_s=(x_m_s, y_m_s))
+    drift = slow_down(drift_preset("slow"), DRIFTING_FRAMES / frames)
     plan = draw_ball_plan(seed, frames=frames, pixel_m=pixel_m, drift=drift, **given)
     tracker = SequenceTracker()
     for index, frame in enumerate(plan.frames):

@@ -48,9 +48,8 @@ _FALSE_ALARM = 0.005
 # Residuals beyond this many robust sigma of their surroundings count as this many (Huber).
 _HUBER = 2.5
 # Constant of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
-# doi:10.1080/03610927708827533), the sigma of normal noise over the median of its size, and rounds of either loss.
+# doi:10.1080/03610927708827533), and rounds of either loss.
 _TUKEY = 4.685
-_MEDIAN_TO_SIGMA = 1.4826
 _ROUNDS = 10
 # Keeps a division from zero where a point alone decides a fit.
 _LEAST_FREEDOM = 1e-3
@@ -172,12 +171,13 @@ class _SphereResiduals:
             leverage = np.einsum("nk,kn->n", design, rows)
             error = np.abs(self.height - design @ (rows @ self.height))
             error /= np.maximum(1.0 - leverage, _LEAST_FREEDOM)
+            scale = max(mad_sigma(error), 1e-15)
             if turn < _ROUNDS:
-                limit = _HUBER * max(mad_sigma(error), 1e-15)
+                limit = _HUBER * scale
                 weight = limit / np.maximum(error, limit)
             else:
                 # What is far off by then counts for nothing.
-                limit = _TUKEY * max(_MEDIAN_TO_SIGMA * float(np.median(error)), 1e-15)
+                limit = _TUKEY * scale
                 weight = np.maximum(1.0 - (error / limit) ** 2, 0.0) ** 2
         solution = np.asarray(rows @ self.height, dtype=np.float64)
         return solution, np.asarray(rows, dtype=np.float64)

@@ -366,6 +366,20 @@ def random_plan(seed, magnification, pushes):
     return drawn.scene, plan
 
 
+def random_series(seed, magnification, pushes):
+    """The first picture of a random scene, and its measurement, with base and tip where they are given."""
+    scene, plan = random_plan(seed, magnification, pushes)
+    images = [plan.render(k) for k in range(len(plan))]
+    times = [frame.start_time_s for frame in plan.frames]
+    camera, timing = plan.microscope.camera_at(magnification), plan.microscope.timing
+
+    def measure(**ends):
+        settings = SeriesSettings(scene.length_m, **ends)
+        return measure_series(images, times, camera, timing, settings)
+
+    return images[0], measure
+
+
 @pytest.mark.parametrize(
     ("seed", "magnification"), [(14, 6450.0), (43, 6450.0), (63, 6450.0), (82, 8890.0)]
 )
@@ -389,7 +403,8 @@ def test_a_body_of_more_contrast_is_not_taken_for_the_cantilever(seed, magnifica
 
 def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
     """The inner corner of the pusher touches the beam at 0.916 of its length."""
-    scene, plan = random_plan(1, 7760.0, (0.0, 0.3, 0.6, 1.0))
+    scene, _ = random_plan(1, 7760.0, (0.0,))
+    _, measure = random_series(1, 7760.0, (0.0, 0.3, 0.6, 1.0))
     located = []
 
     def remember(u, frames):
@@ -397,10 +412,7 @@ def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
         return located[-1]
 
     monkeypatch.setattr("semcal_ros.applications.cantilever.series.locate_load", remember)
-    camera, timing = plan.microscope.camera_at(7760.0), plan.microscope.timing
-    images = [plan.render(k) for k in range(4)]
-    times = [frame.start_time_s for frame in plan.frames]
-    found = measure_series(images, times, camera, timing, SeriesSettings(scene.length_m))
+    found = measure()
     assert scene.load == pytest.approx(0.917, abs=1e-3)
     # Two thirds of a block.
     assert located[0][0] == pytest.approx(scene.load, abs=0.012)
@@ -411,20 +423,11 @@ def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
 
 
 def test_what_moves_along_itself_is_no_clamped_beam():
-    scene, plan = random_plan(14, 6450.0, (0.0, 0.4, 1.0))
-    images = [plan.render(k) for k in range(3)]
-    times = [frame.start_time_s for frame in plan.frames]
-    camera, timing = plan.microscope.camera_at(6450.0), plan.microscope.timing
-    other = find_strip(images[0])
+    image, measure = random_series(14, 6450.0, (0.0, 0.4, 1.0))
+    other = find_strip(image)
     taken = {"the beam": {}, "the pusher": {"base_px": other.base_px, "tip_px": other.tip_px}}
     told = {
-        name: [
-            note
-            for note in measure_series(
-                images, times, camera, timing, SeriesSettings(scene.length_m, **ends)
-            ).notes
-            if "moves along it" in note
-        ]
+        name: [note for note in measure(**ends).notes if "moves along it" in note]
         for name, ends in taken.items()
     }
     assert told["the beam"] == []
@@ -467,17 +470,11 @@ def test_of_two_parallel_beams_the_one_that_bends_is_measured():
 
 def test_a_base_that_moves_is_that_of_no_cantilever():
     """The tip of a pusher whose other end is out of view may be taken for a base."""
-    scene, plan = random_plan(14, 6450.0, (0.0, 0.4, 1.0))
-    images = [plan.render(k) for k in range(3)]
-    times = [frame.start_time_s for frame in plan.frames]
-    camera, timing = plan.microscope.camera_at(6450.0), plan.microscope.timing
-    other = find_strip(images[0])
+    image, measure = random_series(14, 6450.0, (0.0, 0.4, 1.0))
+    other = find_strip(image)
     outwards = other.base_px - other.tip_px
     taken = {"base_px": other.tip_px, "tip_px": other.base_px + 0.2 * outwards}
-    wrong, right = (
-        measure_series(images, times, camera, timing, SeriesSettings(scene.length_m, **ends))
-        for ends in (taken, {})
-    )
+    wrong, right = measure(**taken), measure()
     assert wrong.undeformed.axis.base_seen and right.undeformed.axis.base_seen
     assert any("the base of what was measured moves" in note for note in wrong.notes)
     assert not any("moves" in note for note in right.notes)
