@@ -308,15 +308,20 @@ def fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float
     rough_m = _END_SEARCH_PX * px_m
     # From the middle of one side to that of the other.
     apart_m = 2.0 * model.half_width_m + (_BESIDE_PX + _BESIDE_REACH_PX) * px_m
-    slope, found = 0.0, fit_step(at_m - along, grey, model, rough_m=rough_m)
-    for _ in range(_TURNS):
-        distance = at_m - along - slope * across
+    slope, place_m, found = 0.0, 0.0, fit_step(at_m - along, grey, model, rough_m=rough_m)
+    for turn in range(_TURNS):
+        distance = at_m - along - slope * across - place_m
+        # After the first turn it is known where to look.
         left, right = (
-            fit_step(distance[side], grey[side], model, rough_m=rough_m)
+            fit_step(distance[side], grey[side], model, rough_m=None if turn else rough_m)
             for side in (across < 0.0, across > 0.0)
         )
         if not (np.isfinite(left.place_m) and np.isfinite(right.place_m)):
             return found
         slope += (right.place_m - left.place_m) / apart_m
-        found = fit_step(at_m - along - slope * across, grey, model, rough_m=rough_m)
+        place_m += 0.5 * (left.place_m + right.place_m)
+        step = fit_step(at_m - along - slope * across - place_m, grey, model)
+        if not np.isfinite(step.place_m):
+            return found
+        found = replace(step, place_m=place_m + step.place_m)
     return found
