@@ -19,6 +19,7 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 import warnings
 from pathlib import Path
@@ -45,6 +46,9 @@ def _share() -> None:
 
 def _isolate() -> int:
     _share()
+    # A shell ignores SIGINT for a job in the background, and what the tests start would inherit that.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     domain_id, lock = claim_domain()
     logs = tempfile.mkdtemp(prefix="semcal-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)

@@ -149,6 +149,8 @@ class CalibrationServer(StreamNode):
         self._newest: _Candidate | None = None
         self._added: StreamFrame | None = None
         self._views: list[FoundView] = []
+        # How many of them, the first ones, a calibration was made from.
+        self._calibrated_views = 0
         # Of the same views: their stamps, ns, and how they were taken.
         self._taken: list[tuple[int, Conditions]] = []
         self._calibration: Calibration | None = None
@@ -206,6 +208,7 @@ class CalibrationServer(StreamNode):
             for name, handler, group in handlers
         ]
         self.closing.callback(self._end_calibration)
+        self.closing.callback(self._tell_unused_views)
         self._report_progress("no views yet")
         self.reporter.info(self._saving)
 
@@ -228,6 +231,16 @@ class CalibrationServer(StreamNode):
         for thread in (self._beside, self._acquiring):
             if thread is not None:
                 thread.join()
+
+    def _tell_unused_views(self) -> None:
+        """Say at the end what is lost: a replay ends all nodes with its last frame."""
+        with self._lock:
+            count = len(self._views) - self._calibrated_views
+        if count > 0:
+            self.reporter.warn(
+                f"{counted(count, 'view')} collected and not calibrated; call ~/calibrate before the end, "
+                "or use `semcal calibrate` on the recording"
+            )
 
     def _report_answer(self, success: bool, text: str) -> None:
         self._report_progress(text, DiagnosticLevel.OK if success else DiagnosticLevel.WARN)
@@ -357,6 +370,7 @@ class CalibrationServer(StreamNode):
         with self._lock:
             count = len(self._views)
             self._views.clear()
+            self._calibrated_views = 0
             self._taken.clear()
             self._added = None
             self._position.forget_doubt()
@@ -396,6 +410,8 @@ class CalibrationServer(StreamNode):
             wanted = self._finish(running, done=done)
         if not wanted:
             raise CalibrationError("cancelled")
+        with self._lock:
+            self._calibrated_views = len(running.job.views)
         self._adopt(calibration)
         return result.summary
 
@@ -751,6 +767,8 @@ class CalibrationServer(StreamNode):
     def _update(self) -> str:
         calibration, views, origin = self._compared()
         done = update_found(calibration, views, self.config, origin)
+        with self._lock:
+            self._calibrated_views = len(views)
         self._adopt(Calibration.from_model(done.model))
         return f"updated; before, it was {done.check.summary}"
 

@@ -70,6 +70,8 @@ _MONITOR_PERIOD = ParameterDeclaration(
 _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
 # How often the end of these times is checked: six times within the shorter one.
 _TICK_S = 0.5
+# How soon another publisher of `camera_info`, or its end, is noticed: about as long as discovery takes.
+_WATCH_S = 0.5
 
 
 class ParameterServer(SemNode):
@@ -87,7 +89,8 @@ class ParameterServer(SemNode):
         self._published_g: float | None = None
         self._range = RangeWatch(self.reporter)
         self._text = self.endpoints.latched_publisher(String, "calibration")
-        self._info = self.endpoints.latched_publisher(CameraInfo, "camera_info")
+        self._info: Any = self.endpoints.latched_publisher(CameraInfo, "camera_info")
+        self._info_topic = str(self._info.topic_name)
         self._projection = self.endpoints.latched_publisher(Float64MultiArray, "projection")
         self._covariance = self.endpoints.latched_publisher(
             Float64MultiArray, "projection_covariance"
@@ -124,9 +127,9 @@ class ParameterServer(SemNode):
         # A restarted server must not set all nodes back to its file while another node, such as calibration_server,
         # still holds a calibration that has come into force since.
         self._listened_s = 0.0
-        self._listening = self.create_timer(
-            _TICK_S, self._publish_start, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._listening = self.create_timer(_TICK_S, self._publish_start, clock=steady)
+        self._watching = self.create_timer(_WATCH_S, self._watch_camera, clock=steady)
 
     def idle(self) -> bool:
         """Return True: a constant magnification is normal."""
@@ -205,9 +208,32 @@ class ParameterServer(SemNode):
             self._covariance.publish(covariance)
         self._projection.publish(projection)
         self.reporter.count_published(None)
-        # A node that publishes the camera of every image takes precedence; two sources would break its pairs.
-        if self.count_publishers(self._info.topic_name) > 1:
-            return
+        self._share_camera()
+        if self._info is not None:
+            self._publish_info(camera, width, height)
+
+    def _share_camera(self) -> None:
+        """Publish ``camera_info`` only where no other node publishes that of every image.
+
+        Two sources would break its pairs, and a late subscriber would also get what is kept here, of a magnification
+        that is over.
+        """
+        before = self._info
+        others = self.count_publishers(self._info_topic) > int(before is not None)
+        if others and before is not None:
+            self.endpoints.withdraw("camera_info")
+            self.reporter.forget("subscribers.camera_info")
+            self._info = None
+        elif not others and before is None:
+            self._info = self.endpoints.latched_publisher(CameraInfo, "camera_info")
+
+    def _watch_camera(self) -> None:
+        without = self._info is None
+        self._share_camera()
+        if without and self._info is not None:
+            self._refresh()
+
+    def _publish_info(self, camera: Any, width: int, height: int) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.frame_id)
         info = CameraInfo()
         flagged = not camera.in_range and self.parameters[OUT_OF_RANGE.name] == "flag"

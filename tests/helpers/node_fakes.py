@@ -34,12 +34,17 @@ class FakeSubscription:
         self.depth = depth
         self.lost = 0
         self.restarts = 0
+        self.renewals = 0
+        self.asked_again = 0
         self.rivals = ""
         self.names: list[str] = []
         self.waiting: deque[tuple[Any, Any]] = deque()
 
     def publishers(self) -> list[str]:
         return self.names
+
+    def ask_again(self) -> None:
+        self.asked_again += 1
 
     def find_rivals(self) -> str:
         return self.rivals

@@ -54,6 +54,7 @@ def test_a_node_that_is_stopped_does_not_wait_for_its_calibration(tmp_path: Path
         worker = _held_worker(session)
         assert session.node.stop(signal.SIGINT) == 0
         assert not is_alive(worker)
+        assert "1 view collected and not calibrated; call ~/calibrate" in session.node.output
 
 
 def _cancelled(session: Session) -> bool:

@@ -145,3 +145,37 @@ def test_stamps_decide_where_there_are_any(peer: Peer, files: Path) -> None:
             np.testing.assert_allclose(k_of(infos[-1]), CALIBRATION.at(g).rectified.K, rtol=1e-12)
         assert [stamp_of(info)[0] for info in infos] == [8, 12, 18, 20]
         peer.wait_for(lambda: peer.state("/sem/rectifier")["frames_mixed"] == "2", "the count")
+
+
+def test_an_unusable_value_of_a_publisher_that_leaves_is_forgotten(peer: Peer, files: Path) -> None:
+    """The value of the one that stays is asked for again: it keeps it for late subscribers."""
+    image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
+    magnification = peer.node.create_publisher(Float64, "magnification", LATCHED)
+    magnification.publish(magnification_message(2000.0))
+    infos = peer.collect(CameraInfo, "camera_info")
+    with running("rectifier", {"calibration": files / "cal.yaml"}) as node:
+        peer.wait_heard("/sem/rectifier", "camera_info")
+        peer.wait_for(lambda: image.get_subscription_count() == 1, "the subscription")
+        intruder = Peer("intruder")
+        try:
+            wrong = intruder.node.create_publisher(Float64, "magnification", RELIABLE)
+            intruder.wait_for(lambda: wrong.get_subscription_count() == 1, "the subscription")
+            wrong.publish(magnification_message(float("nan")))
+            peer.wait_for(lambda: peer.state("/sem/rectifier").get("rejected") == "1", "the NaN")
+            image.publish(image_message(texture(), 1.0))
+            peer.wait_for(
+                lambda: peer.state("/sem/rectifier").get("frames_without_magnification") == "1",
+                "the frame that is left out",
+            )
+        finally:
+            intruder.close()
+
+        def arrives() -> bool:
+            image.publish(image_message(texture(), 2.0))
+            peer.spin(0.1)
+            return bool(infos)
+
+        peer.wait_for(arrives, "a frame at the value of the one that stays")
+        log = node.output
+    np.testing.assert_allclose(k_of(infos[0]), CALIBRATION.at(2000.0).rectified.K, rtol=1e-12)
+    assert "the magnification is unknown until the next usable message" in log

@@ -199,6 +199,27 @@ def test_described_choices_are_those_of_the_code(
             assert "*start*" in row.group(1), f"{name} is only read at start"
 
 
+@pytest.mark.parametrize("node", NODES)
+def test_described_defaults_are_those_of_the_code(
+    node: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = _section(_text("nodes.md"), node)
+    compared = 0
+    for name, setting in _settings_of(node, monkeypatch).items():
+        row = re.search(rf"^\| `{name}` \| ([^|]+) \|", section, re.MULTILINE)
+        if row is None or not (described := row.group(1).strip()):
+            continue  # described with others, in prose, or at another node
+        default = setting.default
+        if isinstance(default, bool | str):
+            code = str(default).lower() if isinstance(default, bool) else default or "empty"
+            assert described.strip("`") in (code, "required"), name
+        else:
+            # A unit may follow.
+            assert float(described.split()[0]) == pytest.approx(default, rel=1e-3), name
+        compared += 1
+    assert compared or node in ("rectifier", "drift_compensator")
+
+
 def test_the_diagnostic_keys_are_those_of_the_code() -> None:
     section = _section(_text("nodes.md"), "Diagnostics")
     described = {

@@ -129,6 +129,30 @@ def test_an_executable_starts_and_stops(
     assert "Traceback" not in errors
 
 
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["sigint", "sigterm"])
+def test_a_signal_that_comes_during_the_imports_ends_it_without_a_traceback(
+    stop: signal.Signals,
+) -> None:
+    process = subprocess.Popen(
+        [str(_executable("stream_corrector"))],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        # numpy is among the first of the imports; the others take a second more.
+        maps, deadline = Path(f"/proc/{process.pid}/maps"), time.monotonic() + START_S
+        while "numpy" not in maps.read_text() and time.monotonic() < deadline:
+            time.sleep(0.002)
+        process.send_signal(stop)
+        output, _ = process.communicate(timeout=STOP_S)
+    finally:
+        process.kill()
+        process.wait()
+    assert (process.returncode, output) == (0, "")
+
+
 def test_nothing_else_is_in_the_executables_folder() -> None:
     found = {path.name for path in _executable("x").parent.iterdir() if os.access(path, os.X_OK)}
     # A colcon workspace has the command `semcal` there as well.

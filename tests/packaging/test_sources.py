@@ -123,7 +123,7 @@ def test_the_executables_are_the_modules_with_a_main() -> None:
     }
     assert modules == set(NODES)
     targets = PYPROJECT["project"]["entry-points"]["semcal_ros.nodes"]
-    assert targets == {node: f"semcal_ros.nodes.{node}:main" for node in NODES}
+    assert targets == {node: f"semcal_ros.nodes.start:{node}" for node in NODES}
 
 
 def _declared() -> set[str]:

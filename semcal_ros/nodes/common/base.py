@@ -37,6 +37,7 @@ from semcal_ros.bridge.diagnostics import (
     split_states,
 )
 from semcal_ros.config.config import load_config
+from semcal_ros.core.wording import nearest_name
 from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.help import EXECUTABLES
@@ -118,7 +119,13 @@ class SemNode(Node):
         return [purpose, f"config {self.config.name}"]
 
     def introduce(self) -> None:
-        """Say in one line of the log what the finished node is, and where it listens and speaks."""
+        """Say in one line of the log what the finished node is, and where it listens and speaks; warn of names that
+        were to be changed and that it does not use.
+        """
+        if unused := self._unused_renamings():
+            self.reporter.warn(
+                f"not topics or services of this node, and not renamed: {', '.join(unused)}"
+            )
         topics = self.endpoints.describe_topics()
         self.reporter.info("; ".join([*self.introduction(), *filter(None, [topics])]))
 
@@ -128,6 +135,22 @@ class SemNode(Node):
         """Return what :meth:`CommandLine.unused_names` does, for the parameters of topics or for all others."""
         given = [name for name in self._parameter_overrides if is_quality(name) == of_topics]
         return command_line().unused_names(given, self._parameters, self.get_fully_qualified_name())
+
+    def _unused_renamings(self) -> list[str]:
+        """Return renamed topics and services that this node does not have, with the name that was meant, perhaps.
+
+        A launch file may rename for all nodes of a group, so that they cannot be refused.
+        """
+        topics = {str(e.topic_name) for e in (*self.publishers, *self.subscriptions)}
+        services = {self.resolve_service_name(e.srv_name) for e in (*self.services, *self.clients)}
+        unused = []
+        for name in command_line().renamed_topics(self.get_name()):
+            renamed = self.resolve_topic_name(name), self.resolve_service_name(name)
+            if renamed[0] not in topics and renamed[1] not in services:
+                known = [t.removeprefix(f"{self.get_namespace()}/") for t in topics | services]
+                near = nearest_name(name, known)
+                unused.append(f"{name} ({near}, perhaps)" if near else name)
+        return unused
 
     def refuse_unknown_topics(self) -> None:
         """Refuse ``qos_overrides`` of topics that the finished node does not have.

@@ -125,6 +125,19 @@ class CommandLine:
                 )
         return unknown
 
+    def renamed_topics(self, node: str) -> list[str]:
+        """Return the names of topics and services that are given another name, as they were written.
+
+        Parameters
+        ----------
+        node
+            Name of the node, without its namespace: what is renamed for another node is left out.
+        """
+        pairs = zip(self.arguments, self.arguments[1:], strict=False)
+        rules = [value.partition(":=")[0] for flag, value in pairs if flag in ("-r", "--remap")]
+        split = [rule.rpartition(":") for rule in rules]
+        return [name for of, _, name in split if of in ("", node) and not name.startswith("__")]
+
     def _sections(self) -> list[ParameterSection]:
         pairs = zip(self.arguments, self.arguments[1:], strict=False)
         files = [value for flag, value in pairs if flag == "--params-file"]

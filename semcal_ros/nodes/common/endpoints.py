@@ -129,6 +129,10 @@ class Endpoints:
         self._publishers[topic] = publisher
         return publisher
 
+    def withdraw(self, topic: str) -> None:
+        """Destroy the publisher of a topic, and with it what it keeps for late subscribers."""
+        self._node.destroy_publisher(self._publishers.pop(topic))
+
     def guard(self, callback: Callable[[], None]) -> GuardCondition:
         """Create a condition that any thread may trigger; the node's executor runs its callback."""
         return self._node.create_guard_condition(callback)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A publisher that a short want of room in the middleware does not end."""
+"""A publisher that a short want of room in the middleware does not end, and that knows who waits for messages."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from typing import Any
 import rclpy.utilities
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 
 __all__ = ["PatientPublisher"]
 
@@ -35,8 +36,23 @@ class PatientPublisher(Publisher):
     machine when nothing is left between the messages. rclpy raises, and the node would end.
     """
 
+    _has_published = False
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether the next message is worth making.
+
+        It is if there is a subscriber, or if the middleware keeps an earlier message for those that come later: what is
+        kept must not be older than the stream.
+        """
+        if self.get_subscription_count():
+            return True
+        keeps = self.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        return self._has_published and keeps
+
     def publish(self, msg: Any) -> None:
         """Extend the base class: try again."""
+        self._has_published = True
         for _ in range(_TRIES - 1):
             if self._takes(msg):
                 return

@@ -143,6 +143,11 @@ class AdaptiveSubscription:
         self._full_topic = str(self._subscription.topic_name)
         self._paused = False
         self._received = 0
+        # Of a latched value: whether to ask for it again, how often that was done, publishers at the last message.
+        self._wants_again = False
+        self.renewals = 0
+        self._publishers = 0
+        self._keeps_last = bool(source) and not streams
         self._watch: SourceWatch | None = None
         if source:
             now_s = time.monotonic()
@@ -209,7 +214,8 @@ class AdaptiveSubscription:
     def _count(self, info: MessageInfo) -> None:
         self._received += 1
         number = info.get("publication_sequence_number")
-        self._counter.count(number, self._subscription.get_publisher_count())
+        self._publishers = self._subscription.get_publisher_count()
+        self._counter.count(number, self._publishers)
 
     def take_waiting(self) -> None:
         """Run the callback for everything that has already arrived.
@@ -232,6 +238,10 @@ class AdaptiveSubscription:
         message, info = taken
         self._count(info)
         return message, info
+
+    def ask_again(self) -> None:
+        """Subscribe again at the next check: publishers that keep their last message then send it once more."""
+        self._wants_again = True
 
     # -- quality of service ------------------------------------------------------------------------
 
@@ -276,6 +286,8 @@ class AdaptiveSubscription:
             self._node.destroy_subscription(self._subscription)
             self._profile = self._requested
             self._subscription = self._subscribe()
+        elif self._keeps_last:
+            self._renew()
         if self._watch is not None:
             names = self._sources(publishers)
             warnings, news = self._watch.check(time.monotonic(), self._received, names)
@@ -283,6 +295,20 @@ class AdaptiveSubscription:
                 self._node.get_logger().warning(text)
             for text in news:
                 self._node.get_logger().info(text)
+
+    def _renew(self) -> None:
+        """Ask again for the last message, also where a publisher has left and its message may be the newest one."""
+        now = self._subscription.get_publisher_count()
+        left = 0 < now < self._publishers
+        self._publishers = min(self._publishers, now)
+        if not (self._wants_again or left):
+            return
+        self._wants_again = False
+        self._node.destroy_subscription(self._subscription)
+        # The one that has left may have been the one that offered less.
+        self._profile = self._requested
+        self._subscription = self._subscribe()
+        self.renewals += 1
 
     def _sources(self, publishers: list[Any]) -> list[str]:
         return [

@@ -115,7 +115,7 @@ class CompressedOutput:
 
     def publish(self, image: NDArray[Any], frame: StreamFrame) -> None:
         """Compress, beside the stream, an image made from ``frame``; its memory may be reused after the call."""
-        if self._publisher.get_subscription_count() == 0:
+        if not self._publisher.is_awaited:
             return
         self._submitted += 1
         codec = self._parameter("format")

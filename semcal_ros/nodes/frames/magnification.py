@@ -51,7 +51,8 @@ class MagnificationInput:
     A value is valid from its stamp on. Messages without a header count from their publication, and
     so do the frames then: the order in which the microscope publishes decides, whatever the order of
     arrival and the rate of a replay. An unusable message makes the magnification unknown until the
-    next usable one.
+    next usable one; meanwhile, and when one of several publishers leaves, those that are there are asked for
+    their last value again.
 
     Parameters
     ----------
@@ -89,6 +90,7 @@ class MagnificationInput:
             source="magnification",
         )
         self.received = 0
+        self._renewals = 0
         self._last_ns = 0
         self._latest_sent_ns = 0
         # Until when, on a steady clock, to wait for a message that was published after the other time.
@@ -96,14 +98,25 @@ class MagnificationInput:
 
     def _on_message(self, message: Any, info: MessageInfo) -> None:
         self.received += 1
-        key_ns = self._latest_sent_ns = published_ns(info)
+        key_ns = sent_ns = published_ns(info)
+        repeated = sent_ns <= self._latest_sent_ns and self._subscription.renewals > 0
+        if repeated and self._renewals != self._subscription.renewals:
+            # Sent once more by a publisher that is still there: what came after it is over.
+            self._history.clear()
+        self._renewals = self._subscription.renewals
+        self._latest_sent_ns = max(sent_ns, self._latest_sent_ns)
         reading: MagnificationReading | None = None
         try:
             if self._has_stamp:
                 key_ns = optional_stamp_ns(message) or 0
             reading = read_magnification(message, self._config)
         except SemcalError as error:
-            self._reporter.reject(error)
+            if not repeated:
+                self._reporter.reject(error)
+                self._reporter.warn_seldom(
+                    "the magnification is unknown until the next usable message: images are not used meanwhile"
+                )
+                self._subscription.ask_again()
         self._history.insert(key_ns, reading)
         if reading is not None and self._on_reading is not None:
             self._on_reading(reading)

@@ -80,10 +80,7 @@ class ImageOutput:
 
 
 class _CameraOutput:
-    """A message about the camera of a frame, filled again only where another camera or size is due.
-
-    Each is filled only for a subscriber of its own.
-    """
+    """A message about the camera of a frame, filled again only where another camera or size is due."""
 
     def __init__(
         self, message: Any, fill: Callable[[Any, ScanCamera | None, Any, int, int], None]
@@ -137,7 +134,17 @@ class RectifiedOutput:
         projection = _CameraOutput(Image(), fill_stamped_projection)
         spread = _CameraOutput(Image(), fill_stamped_projection_covariance)
         raw_info = _CameraOutput(CameraInfo(), self._fill_raw)
-        self._outputs = (
+        # These take microseconds and are latched: a subscriber that comes after the last frame gets its camera.
+        self._always = (
+            (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
+            (
+                endpoints.camera_publisher(
+                    CameraInfo, own, endpoints.below("image_rect", "camera_info")
+                ),
+                info,
+            ),
+        )
+        self._where_awaited = (
             (
                 endpoints.camera_publisher(
                     CameraInfo, f"{raw}/camera_info", endpoints.below(raw, "camera_info")
@@ -149,13 +156,6 @@ class RectifiedOutput:
                     Image, covariance, endpoints.beside(covariance, "image_rect")
                 ),
                 spread,
-            ),
-            (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
-            (
-                endpoints.camera_publisher(
-                    CameraInfo, own, endpoints.below("image_rect", "camera_info")
-                ),
-                info,
             ),
             (
                 endpoints.stream_publisher(Image, matrix, endpoints.beside(matrix, "image_rect")),
@@ -174,9 +174,11 @@ class RectifiedOutput:
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""
         # The camera first: a subscriber that has the image can then use it at once.
-        for publisher, output in self._outputs:
-            if publisher.get_subscription_count():
+        for publisher, output in self._where_awaited:
+            if publisher.is_awaited:
                 publisher.publish(output.message_for(camera, frame))
+        for publisher, output in self._always:
+            publisher.publish(output.message_for(camera, frame))
         self._image.publish(frame)
 
     def _fill_raw(
@@ -206,8 +208,8 @@ class DriftOutput:
     def publish(self, drift: FrameDrift, frame: StreamFrame) -> None:
         """Publish the drift, in m, at the centre of a frame."""
         pose, twist = self._messages
-        # A few matrices per frame, filled only for a subscriber.
-        if self._drift.get_subscription_count():
+        # A few matrices per frame, filled only where they are awaited.
+        if self._drift.is_awaited:
             fill_drift(
                 pose,
                 drift.estimate.drift_m,
@@ -216,7 +218,7 @@ class DriftOutput:
                 rotation_of(drift.estimate),
             )
             self._drift.publish(pose)
-        if self._velocity.get_subscription_count():
+        if self._velocity.is_awaited:
             fill_drift_velocity(
                 twist,
                 drift.estimate.velocity_m_s,

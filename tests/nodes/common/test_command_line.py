@@ -19,6 +19,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,7 @@ import pytest
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.command_line import CommandLine
 from semcal_ros.nodes.common.help import EXECUTABLES
+from tests.helpers.ros_process import running
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DECLARED = ("config", "calibration", "interpolation", "use_sim_time")
@@ -101,6 +103,7 @@ import importlib
 import rclpy
 rclpy.init = None
 from semcal_ros.nodes.common.help import EXECUTABLES
+from tests.helpers.ros_process import running
 for name in EXECUTABLES:
     assert importlib.import_module(f"semcal_ros.nodes.{name}").main(["--help"]) == 0
     print("=====")
@@ -134,3 +137,21 @@ def test_help_may_be_cut_short() -> None:
     assert process.stderr is not None
     assert process.stderr.read() == ""
     process.stderr.close()
+
+
+def test_renamed_topics_are_those_for_this_node() -> None:
+    rules = ("a:=/x", "__ns:=/lab", "rectifier:b:=/y", "other:c:=/z", "~/d:=/v")
+    line = CommandLine(("--ros-args", *(word for rule in rules for word in ("-r", rule))))
+    assert line.renamed_topics("rectifier") == ["a", "b", "~/d"]
+
+
+def test_a_misspelt_topic_is_told_at_the_start() -> None:
+    given = ("image_rct:=/out/x", "camera_info:=/out/y", "~/get_parameters:=/out/z")
+    rules = tuple(word for rule in given for word in ("-r", rule))
+    with running("rectifier", None, *rules) as node:
+        deadline = time.monotonic() + 30.0
+        while "subscribes to" not in node.output and time.monotonic() < deadline:
+            time.sleep(0.02)
+        log = node.output
+    assert "not renamed: image_rct (image_rect, perhaps)" in log
+    assert log.count("perhaps") == 1

@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from semcal_ros.nodes.common.publisher import PatientPublisher
 
@@ -58,3 +59,28 @@ def test_a_refusal_that_lasts_or_comes_with_the_end_is_raised(
     with pytest.raises(RCLError, match="cannot publish data"):
         middleware.publisher.publish("lost")
     assert middleware.calls == calls
+
+
+@pytest.mark.parametrize(
+    ("durability", "published", "subscribers", "awaited"),
+    [
+        ("volatile", True, 0, False),
+        ("volatile", False, 1, True),
+        ("transient_local", False, 0, False),
+        # What the middleware keeps would be of the last time that somebody listened.
+        ("transient_local", True, 0, True),
+    ],
+)
+def test_a_message_is_awaited_by_subscribers_now_or_later(
+    monkeypatch: pytest.MonkeyPatch,
+    durability: str,
+    published: bool,
+    subscribers: int,
+    awaited: bool,
+) -> None:
+    publisher = Middleware(0, monkeypatch).publisher
+    publisher.qos_profile = QoSProfile(depth=1, durability=DurabilityPolicy[durability.upper()])
+    monkeypatch.setattr(Publisher, "get_subscription_count", lambda _self: subscribers)
+    if published:
+        publisher.publish("message")
+    assert publisher.is_awaited is awaited

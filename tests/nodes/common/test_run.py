@@ -16,8 +16,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
@@ -67,6 +69,8 @@ for number in (signal.SIGINT, signal.SIGTERM):
 sys.exit(status)
 """
 AFTER = ["ROS up: False", "builtin_function_or_method", "Handlers"]
+# Where the parent ignores SIGINT, as a shell does for a job in the background, that is what it is afterwards.
+IGNORED = ["ROS up: False", "Handlers", "Handlers"]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -82,13 +86,33 @@ AFTER = ["ROS up: False", "builtin_function_or_method", "Handlers"]
 def test_a_signal_ends_the_node_in_order(
     moment: str, printed: list[str], number: int, threads: int
 ) -> None:
-    done = subprocess.run(
+    done = _run(moment, number, threads)
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [*printed, *AFTER]
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("number", [2, 15])
+def test_a_node_whose_parent_ignores_sigint_still_ends_in_order(number: int) -> None:
+    """As `ros2 run ... &` in a script: `kill -INT` must end it, as it ends every other ROS node."""
+    done = _run("waiting", number, 1, preexec=_ignore_sigint)
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == ["waited", "destroyed, ROS up: True", *IGNORED]
+    assert done.returncode == 0
+
+
+def _ignore_sigint() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _run(
+    moment: str, number: int, threads: int, preexec: Callable[[], None] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, "-c", NODE, moment, str(number), str(threads)],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
+        preexec_fn=preexec,
     )
-    assert done.stderr == ""
-    assert done.stdout.splitlines() == [*printed, *AFTER]
-    assert done.returncode == 0

@@ -35,6 +35,18 @@ from tests.helpers.ros_process import TIMEOUT_S
 TOPIC = "image_rect/compressed"
 
 
+class _Publisher:
+    """Publishes to the endpoints that made it."""
+
+    def __init__(self, endpoints: Stub) -> None:
+        self._endpoints = endpoints
+        self.publish = endpoints._publish
+
+    @property
+    def is_awaited(self) -> bool:
+        return self._endpoints.subscribers > 0
+
+
 class Stub:
     """What a compressed output is connected with; publishing waits for ``may_publish``."""
 
@@ -57,9 +69,7 @@ class Stub:
 
     def stream_publisher(self, message_type: Any, topic: str, name: str) -> Any:
         assert (message_type, topic) == (CompressedImage, TOPIC)
-        return SimpleNamespace(
-            publish=self._publish, get_subscription_count=lambda: self.subscribers
-        )
+        return _Publisher(self)
 
     def guard(self, callback: Callable[[], None]) -> Any:
         self.results = callback
