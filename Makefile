@@ -14,7 +14,7 @@ endif
 SUITABLE := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-fast lint format demo demo-live docs bench fuzz soak clean
+.PHONY: help setup test test-long test-fast lint format demo demo-live docs bench fuzz soak clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
@@ -51,11 +51,14 @@ PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal --rerun-sho
 # process is ended.
 END_STUCK := -o faulthandler_timeout=500 -o faulthandler_exit_on_timeout=true
 
-test: lint ## everything that is checked: style, types, tests
+test: lint ## style, types, and all tests but the long ones (under six minutes)
 	@$(PYTEST) $(END_STUCK) $(PYTEST_ARGS) tests
 
+test-long: setup ## what takes long by nature: whole examples, tutorials, networks, endurance
+	@$(PYTEST) $(END_STUCK) -m long $(PYTEST_ARGS) tests
+
 test-fast: setup ## the quick tests: no running nodes, no whole experiments, no fuzzing
-	@$(PYTEST) -m "not slow" --ignore tests/nodes --ignore tests/fuzz $(PYTEST_ARGS) tests
+	@$(PYTEST) -m "not slow and not long" --ignore tests/nodes --ignore tests/fuzz $(PYTEST_ARGS) tests
 
 demo: setup ## virtual SEM, calibration, live nodes, report: the whole thing working
 	@$(VENV_PYTHON) -m examples.demo

@@ -275,6 +275,7 @@ def test_the_module_is_the_command(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_snippets_of_the_page_on_python_run(folder, tmp_path):
     """One after the other, on the recordings of this module."""
     page = Path(__file__).resolve().parents[2] / "doc" / "python.md"

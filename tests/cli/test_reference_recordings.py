@@ -29,7 +29,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.reader import open_bag
 from tests.helpers.made_once import folder_once
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

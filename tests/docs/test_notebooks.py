@@ -29,6 +29,7 @@ TOLERANCE = 0.05
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_calibration_notebook_prints_and_draws_what_it_keeps(tmp_path: Path) -> None:
     assert follow_notebook(FOLDER / "calibration_notebook.ipynb", tmp_path, TOLERANCE) == 16
     # The other one is followed where its recording is made: test_cantilever of tests/examples.

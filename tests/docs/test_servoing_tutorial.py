@@ -64,6 +64,7 @@ def _nodes(page: list[Listed], folder: Path) -> list[tuple[str, dict[str, str]]]
     return found
 
 
+@pytest.mark.long
 def test_the_servo_follows_the_target_as_the_page_says(peer: Peer, tmp_path: Path) -> None:
     page = listings(PAGE)
     made = [c for c in page if c.command.startswith(("semcal simulate", "semcal calibrate"))]

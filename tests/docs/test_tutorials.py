@@ -38,6 +38,7 @@ TOLERANCE = 0.05
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)  # eighteen commands, some of them calibrations
+@pytest.mark.long
 def test_the_first_calibration_prints_what_the_page_shows(tmp_path: Path) -> None:
     assert run_page(DOC / "tutorials" / "first_calibration.md", tmp_path, TOLERANCE) == 11
     # Goes on in the same folder.
@@ -64,6 +65,7 @@ NOT_RUN = {
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
+@pytest.mark.long
 def test_the_page_of_all_commands_prints_what_it_shows(tmp_path: Path) -> None:
     page = DOC / "cli.md"
     commands = [listed.command for listed in listings(page)]
@@ -107,6 +109,7 @@ def test_no_sentence_is_longer_than_thirty_words(page: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_site_builds_without_a_warning() -> None:
     """Links, anchors and the navigation are checked by MkDocs, the generated pages among them."""
     script = ROOT / "scripts" / "build_docs.py"
@@ -161,6 +164,7 @@ def test_the_site_builds_without_a_warning() -> None:
         ("/index.md", False),
     ],
 )
+@pytest.mark.long
 def test_a_link_that_leads_nowhere_fails_the_build(tmp_path: Path, link: str, good: bool) -> None:
     """By the settings of mkdocs.yml, on one page."""
     spec = importlib.util.spec_from_file_location("build_docs", ROOT / "scripts" / "build_docs.py")

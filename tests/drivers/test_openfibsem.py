@@ -96,6 +96,7 @@ print("passed")
 @pytest.mark.skipif(
     importlib.util.find_spec("fibsem") is None, reason="needs fibsem (requirements/microscope.txt)"
 )
+@pytest.mark.long
 def test_faults_of_a_microscope() -> None:
     paths = [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(

@@ -71,6 +71,7 @@ def follow_tutorial(name: str, folder: Path) -> None:
 
 # Five processes must get their turns.
 @pytest.mark.flaky(reruns=1)
+@pytest.mark.long
 def test_demo(tmp_path: Path) -> None:
     """What `make demo` runs, with fewer views and frames."""
     out = tmp_path / "demo"
@@ -100,6 +101,7 @@ def test_demo(tmp_path: Path) -> None:
     assert (out / "cal.yaml").exists()
 
 
+@pytest.mark.long
 def test_cantilever(tmp_path: Path) -> None:
     folder = tmp_path / "cantilever"
     printed = ran("cantilever", "--only", "whole", "--figure-16a", "--output", folder)
@@ -135,6 +137,7 @@ def test_cantilever(tmp_path: Path) -> None:
     assert follow_notebook(notebook, tmp_path, TOLERANCE, but="!python -m examples.") == 5
 
 
+@pytest.mark.long
 def test_nano_ball(tmp_path: Path) -> None:
     out = tmp_path / "ball"
     ran("nano_ball", "--output", out)
@@ -152,6 +155,7 @@ def test_nano_ball(tmp_path: Path) -> None:
 
 # Four processes must get their turns within a stream's interval.
 @pytest.mark.flaky(reruns=1)
+@pytest.mark.long
 def test_visual_servo(tmp_path: Path) -> None:
     out = tmp_path / "out"
     # A frame a second; nodes on a busy machine pass over those for which they are late.

@@ -71,6 +71,7 @@ class Progress:
         return str(self.messages[-1].message)
 
 
+@pytest.mark.long
 def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl_c(
     tmp_path: Path,
 ) -> None:
@@ -139,6 +140,7 @@ def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl
     assert tilts == {0, 1}
 
 
+@pytest.mark.long
 def test_a_grid_that_a_tilt_carries_away_is_followed(peer: Peer) -> None:
     """A grid of 100 um on a stage whose axis is 0.5 mm off: 40 degrees carry it by 117 um, out of the field."""
     scene = {
@@ -213,9 +215,10 @@ def test_a_person_is_told_what_to_set_and_goes_on_after_a_stop(peer: Peer) -> No
     [
         ({"allow_motion": False}, "which is not allowed"),
         ({"max_magnification": 1000.0}, "1000"),
-        (
+        pytest.param(
             {"specimen": "gold"},
             "3 views in a row without a usable picture, the last: no grid found",
+            marks=pytest.mark.long,
         ),
     ],
     ids=["not allowed", "limits", "no grid"],

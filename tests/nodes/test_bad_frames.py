@@ -308,6 +308,7 @@ def test_neither_memory_nor_the_log_grows_with_bad_messages(bench: Bench) -> Non
 # -- the nodes that make no frames -------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_parameter_server_survives_absurd_magnifications(peer: Peer, tmp_path: Path) -> None:
     CALIBRATION.save(tmp_path / "cal.yaml")
     watch = Watch(peer)

@@ -207,6 +207,7 @@ def test_a_replay_is_paused_resumed_and_given_another_rate(peer: Peer, session: 
         peer.wait_for(lambda: len(images) > 2, "frames")
 
 
+@pytest.mark.long
 def test_a_replay_begins_when_every_topic_has_its_subscribers(peer: Peer, session: Path) -> None:
     """Also a topic of another node, which alone knows who receives what it publishes."""
     diagnostics = peer.node.create_publisher(DiagnosticArray, "/diagnostics", 10)

@@ -36,6 +36,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import SetBool
 
+from tests.helpers.long_tests import long_but
 from tests.helpers.node_scenes import (
     SIZE,
     image_message,
@@ -129,7 +130,9 @@ class Burst:
         return [came - self.sent_at[stamp] for stamp, came in self.came_at.items()]
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.node)
+@pytest.mark.parametrize(
+    "kind", long_but(lambda kind: kind.node == "rectifier", KINDS), ids=lambda kind: kind.node
+)
 def test_ten_times_too_many_frames(peer: Peer, kind: Kind, calibration_file: Path) -> None:
     parameters: dict[str, Any] = {"interpolation": "lanczos4"}
     if kind.rectifies:
@@ -219,6 +222,7 @@ def test_ten_times_too_many_frames_for_the_calibration_server(peer: Peer) -> Non
         assert process.process.poll() is None
 
 
+@pytest.mark.long
 def test_ten_times_too_many_magnifications(peer: Peer, calibration_file: Path) -> None:
     """The last one counts, for the server and for the frame after it."""
     watch = Watch(peer)
@@ -247,6 +251,7 @@ def test_ten_times_too_many_magnifications(peer: Peer, calibration_file: Path) -
         assert watch.count(server, "rejected") == 0
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_magnifications_that_were_seen(
     peer: Peer, calibration_file: Path
 ) -> None:
@@ -268,6 +273,7 @@ def test_memory_does_not_grow_with_the_magnifications_that_were_seen(
         assert np.abs(pixels(bench.images[-1]) - right).max() <= 1
 
 
+@pytest.mark.long
 def test_a_recording_that_is_played_too_fast(
     peer: Peer, tmp_path: Path, calibration_file: Path
 ) -> None:
@@ -303,6 +309,7 @@ def test_a_recording_that_is_played_too_fast(
     assert np.abs(pixels(images[-1]) - right).max() <= 1
 
 
+@pytest.mark.long
 def test_a_player_that_waits_for_subscribers_loses_none_of_its_frames(
     peer: Peer, tmp_path: Path, calibration_file: Path
 ) -> None:
@@ -342,6 +349,7 @@ def _slow_listener(bench: Bench) -> Iterator[subprocess.Popen[str]]:
 
 # What the rectifier publishes, the corrector publishes by the same code.
 @pytest.mark.parametrize("kind", [COMPENSATOR, CORRECTOR], ids=lambda kind: kind.node)
+@pytest.mark.long
 def test_a_consumer_that_takes_nothing_holds_up_nobody(
     peer: Peer, kind: Kind, calibration_file: Path
 ) -> None:
@@ -372,6 +380,7 @@ def test_a_consumer_that_takes_nothing_holds_up_nobody(
         assert [m.header.stamp.sec for m in bench.images] == list(range(1, bench.sent + 1))
 
 
+@pytest.mark.long
 def test_a_consumer_that_is_stopped_or_killed_does_not_stop_the_node(
     peer: Peer, calibration_file: Path
 ) -> None:

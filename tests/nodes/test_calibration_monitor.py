@@ -65,6 +65,7 @@ def peer() -> Iterator[Peer]:
     made.close()
 
 
+@pytest.mark.long
 def test_a_calibration_that_holds_and_one_that_does_not(peer: Peer, tmp_path: Path) -> None:
     image = peer.node.create_publisher(Image, "image_raw", RELIABLE)
     magnification = peer.node.create_publisher(Float64, "magnification", LATCHED)

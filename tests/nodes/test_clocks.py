@@ -28,6 +28,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 
+from tests.helpers.long_tests import long_but
 from tests.helpers.node_scenes import SIZE, stamp_of, texture, write_recording
 from tests.helpers.ros_process import PATIENT, Peer, running
 from tests.helpers.stream_bench import (
@@ -201,7 +202,11 @@ def test_an_unusable_stamp_of_a_magnification_makes_it_unknown(stamped: Bench) -
 # -- bags that loop ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.node)
+@pytest.mark.parametrize(
+    "kind",
+    long_but(lambda kind: kind.node == "stream_corrector", KINDS),
+    ids=lambda kind: kind.node,
+)
 def test_every_turn_of_a_looping_bag_is_as_the_first(
     peer: Peer, kind: Kind, tmp_path: Path, calibration_file: Path
 ) -> None:

@@ -47,6 +47,7 @@ def _nodes() -> set[str]:
     return found
 
 
+@pytest.mark.long
 def test_one_command_shows_the_corrected_stream_and_ends_with_ctrl_c() -> None:
     before = _nodes()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
@@ -73,6 +74,7 @@ def test_one_command_shows_the_corrected_stream_and_ends_with_ctrl_c() -> None:
     assert _nodes() <= before
 
 
+@pytest.mark.long
 def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     with socket.create_server(("localhost", 0)) as taken:
         port = taken.getsockname()[1]

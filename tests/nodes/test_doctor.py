@@ -119,6 +119,7 @@ def _examine(peer: Peer, arguments: tuple[str, ...], tick: Callable[[], Any]) ->
     return Report(process.returncode, output)
 
 
+@pytest.mark.long
 def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> None:
     scene = {"width": 96, "height": 96, "rate": 10.0, "magnification": 1000.0}
     known = {"calibration": calibration_file}
@@ -154,6 +155,7 @@ def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> Non
     assert report.has("ok", "time", "real")
 
 
+@pytest.mark.long
 def test_wrong_types_weak_and_doubled_publishers_and_clocks_are_named(peer: Peer) -> None:
     # Those who do not fit are the point here; the default would only log them.
     silent = PublisherEventCallbacks(use_default_callbacks=False)
@@ -187,6 +189,7 @@ def test_wrong_types_weak_and_doubled_publishers_and_clocks_are_named(peer: Peer
     assert report.has("ok", "images", "96 x 96 mono8")
 
 
+@pytest.mark.long
 def test_a_calibration_that_does_not_fit_and_a_clock_nobody_uses_are_named(
     peer: Peer, calibration_file: str
 ) -> None:

@@ -55,6 +55,7 @@ from tests.helpers.stream_bench import (
 # -- the sources -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_killed_microscope_comes_back_and_nothing_of_it_is_mixed_up(
     peer: Peer, calibration_file: Path
 ) -> None:
@@ -120,6 +121,7 @@ def test_a_publisher_that_restarts_is_counted_from_its_first_frame(
         bench.wait_counts(published=12, rejected=0)
 
 
+@pytest.mark.long
 def test_a_killed_bag_player_begins_anew_and_so_does_what_depends_on_stamps(
     peer: Peer, tmp_path: Path, calibration_file: Path
 ) -> None:
@@ -157,6 +159,7 @@ def test_a_killed_bag_player_begins_anew_and_so_does_what_depends_on_stamps(
 # -- further nodes -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_killed_compensator_does_not_confuse_the_rectifier_behind_it(
     peer: Peer, calibration_file: Path
 ) -> None:
@@ -191,6 +194,7 @@ def test_a_killed_compensator_does_not_confuse_the_rectifier_behind_it(
         np.testing.assert_allclose(np.reshape(message.k, (3, 3)), expected, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_a_killed_calibration_server_starts_with_nothing_and_works(peer: Peer) -> None:
     """Views live in the process only; it says so, and takes new ones at the latched magnification."""
     node = "/sem/calibration_server"

@@ -28,6 +28,7 @@ pytestmark = pytest.mark.skipif(bool(why_not()), reason=f"no network namespaces 
 
 
 @pytest.mark.timeout(180)
+@pytest.mark.long
 def test_frames_cross_a_network_without_multicast() -> None:
     by_address = Case(256, 10.0, discovery="static peers", clock_ahead_s=3.0, compressed=True)
     found = measured(by_address, seconds=2.0)
@@ -39,6 +40,7 @@ def test_frames_cross_a_network_without_multicast() -> None:
 
 
 @pytest.mark.timeout(180)
+@pytest.mark.long
 def test_a_cable_that_comes_back_costs_the_viewer_some_frames_and_the_nodes_none() -> None:
     seconds, unplugged_s = 6.0, 1.5
     found = measured(Case(256, 10.0, unplugged_s=unplugged_s), seconds)
@@ -68,6 +70,7 @@ rclpy.spin(node)
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.long
 def test_a_discovery_server_takes_the_place_of_multicast(monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(256, 10.0, discovery="discovery server")
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}

@@ -92,6 +92,7 @@ def _calls(peer: Peer, folder: Path) -> list[tuple[Any, Any]]:
     return calls
 
 
+@pytest.mark.long
 def test_every_call_is_answered(
     peers: list[Peer], nodes: list[NodeProcess], tmp_path: Path
 ) -> None:

@@ -138,6 +138,7 @@ def test_a_picture_comes_with_magnification_stage_and_conditions(
         assert numbers(images[-1:]) == [6]
 
 
+@pytest.mark.long
 def test_none_is_lost_and_none_comes_twice(peer: Peer, settings: dict[str, Any]) -> None:
     images = peer.collect(Image, "image_raw")
     with running("microscope", settings):
@@ -149,6 +150,7 @@ def test_none_is_lost_and_none_comes_twice(peer: Peer, settings: dict[str, Any])
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_none_is_lost_by_kill_9(peer: Peer, settings: dict[str, Any]) -> None:
     images = peer.collect(Image, "image_raw")
     settings["max_rate"] = 200.0
@@ -174,6 +176,7 @@ def test_none_is_lost_by_kill_9(peer: Peer, settings: dict[str, Any]) -> None:
     assert len(found) <= 61
 
 
+@pytest.mark.long
 def test_files_wait_for_a_subscriber(peer: Peer, settings: dict[str, Any]) -> None:
     with running("microscope", settings):
         wait_open(peer)
@@ -204,6 +207,7 @@ def test_what_it_cannot_start_with(tmp_path: Path) -> None:
     assert "-p folder:=PATH" in output
 
 
+@pytest.mark.long
 def test_a_folder_that_is_not_there_yet(peer: Peer, settings: dict[str, Any]) -> None:
     settings["folder"].rmdir()
     images = peer.collect(Image, "image_raw")

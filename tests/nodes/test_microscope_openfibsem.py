@@ -118,6 +118,7 @@ def demo(peer: Peer, configuration: Path, **parameters: Any) -> Iterator[Listene
         yield heard
 
 
+@pytest.mark.long
 def test_live_frames_and_what_the_microscope_says(peer: Peer, configuration: Path) -> None:
     with demo(peer, configuration) as heard:
         heard.wait_frames()
@@ -148,6 +149,7 @@ def test_live_frames_and_what_the_microscope_says(peer: Peer, configuration: Pat
         heard.wait_frames()
 
 
+@pytest.mark.long
 def test_a_corrected_frame_on_the_page(
     peer: Peer, configuration: Path, calibration_file: Path
 ) -> None:
@@ -168,6 +170,7 @@ def test_a_corrected_frame_on_the_page(
     assert scale["nm_per_px"] == pytest.approx(150e3 / 1536, rel=0.05)
 
 
+@pytest.mark.long
 def test_moves_within_limits(peer: Peer, configuration: Path) -> None:
     with demo(peer, configuration, allow_motion=True, max_tilt=0.5, step_tilt=0.2) as heard:
         assert heard.move(tilt=0.1)["state"] == "done"

@@ -174,6 +174,7 @@ def own_source(code: str, tmp_path: Path, *parameters: str) -> Iterator[None]:
         process.wait()
 
 
+@pytest.mark.long
 def test_the_example_of_the_documentation_and_its_bad_days(
     peer: Peer, server: Server, tmp_path: Path
 ) -> None:
@@ -256,6 +257,7 @@ raise SystemExit(run_source(Stubborn))
 """
 
 
+@pytest.mark.long
 def test_a_stage_that_refuses_or_hangs_moves_no_more_until_somebody_has_looked(
     peer: Peer, tmp_path: Path
 ) -> None:

@@ -31,6 +31,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from tests.helpers.dds_keystore import Keystore, Rights, read_policy, rights
+from tests.helpers.long_tests import long_but
 from tests.helpers.node_scenes import make_calibration, write_recording
 from tests.helpers.project import NODES
 from tests.helpers.ros_process import LATCHED, NodeProcess, Peer, running
@@ -137,7 +138,9 @@ def names(found: list[tuple[str, list[str]]]) -> list[str]:
     return [name for name, _types in found]
 
 
-@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize(
+    "node", long_but(lambda node: node in ("calibration_server", "stream_corrector"), NODES)
+)
 def test_the_policy_grants_a_node_what_it_uses_and_no_more(node: str, tmp_path: Path) -> None:
     granted = GRANTED[f"/sem/{node}"]
     needed = granted.all - SOMETIMES

@@ -27,6 +27,7 @@ DURATION_S = 8.0
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.long
 def test_a_suite_that_is_broken_every_second_recovers_each_time(tmp_path: Path) -> None:
     peer = Peer()
     soak = Soak(peer, tmp_path, seed=1)

@@ -306,6 +306,7 @@ def _taken(process: NodeProcess) -> list[str]:
     return [line.partition("; it displaces ")[0].rpartition(", ")[2] for line in lines]
 
 
+@pytest.mark.long
 def test_all_nodes_agree_and_find_back_after_a_crash(peer: Peer, files: dict[str, Path]) -> None:
     """Their start parameter names A all the time."""
     of_a, of_b = calibration_digest(A.dumps()), calibration_digest(B.dumps())

@@ -137,6 +137,7 @@ def look_closer(page: Page, folder: Path) -> None:
     assert "PhysicalSizeX" in told and "drift_x_m" in told and "calibrated" in told
 
 
+@pytest.mark.long
 def test_the_live_page(peer: Peer, page: Page, calibration_file: Path, tmp_path: Path) -> None:
     raw = peer.node.get_publishers_info_by_topic
     with (
@@ -216,6 +217,7 @@ def test_the_live_page(peer: Peer, page: Page, calibration_file: Path, tmp_path:
     assert page.console == []
 
 
+@pytest.mark.long
 def test_bad_days_and_the_end_of_the_viewer_are_told(peer: Peer, page: Page) -> None:
     """What a microscope says of itself, and that the viewer has ended; it goes on when it is back."""
     bad = join_states(["blank frames", "not moving any more: no answer; expected tilt 0.1 rad"])
@@ -244,6 +246,7 @@ def test_bad_days_and_the_end_of_the_viewer_are_told(peer: Peer, page: Page) -> 
         page.wait_for("document.querySelector('#link').textContent === 'connected'")
 
 
+@pytest.mark.long
 def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     with viewing() as address:
         port = address.rstrip("/").rpartition(":")[2]
@@ -260,6 +263,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_a_recording_in_the_browser(page: Page, tmp_path: Path, calibration_file: Path) -> None:
     write_recording(tmp_path / "bag", [2000.0] * 30, 0.05)
     with viewing(str(tmp_path / "bag"), "--calibration", str(calibration_file)) as address:
@@ -278,6 +282,7 @@ def test_a_recording_in_the_browser(page: Page, tmp_path: Path, calibration_file
     assert page.console == []
 
 
+@pytest.mark.long
 def test_the_calibration_panel(page: Page, tmp_path: Path) -> None:
     grid = {"specimen": "grid", "magnification": 1000.0, "rate": 5.0, "width": 320, "height": 320}
     with (

@@ -114,6 +114,7 @@ def test_a_two_axis_stage_says_nothing(peer: Peer) -> None:
         assert peer.node.count_publishers("/sem/stage") == 0
 
 
+@pytest.mark.long
 def test_the_stage_goes_where_it_is_sent_within_limits(peer: Peer) -> None:
     said = peer.collect(JointState, "stage", LATCHED)
     images = peer.collect(Image, "image_raw")
@@ -185,7 +186,9 @@ def _change(first: Any, last: Any, margin_px: int) -> float:
     return float(np.std(pixels(first)[inner].astype(float) - pixels(last)[inner]))
 
 
-@pytest.mark.parametrize("tracking", ["every_frame", "forecast"])
+@pytest.mark.parametrize(
+    "tracking", ["every_frame", pytest.param("forecast", marks=pytest.mark.long)]
+)
 def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: str) -> None:
     """The stage moves at a known speed; the compensator finds that drift and holds the image."""
     speed_px_s = np.array([6.0, -3.0])

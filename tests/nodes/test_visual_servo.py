@@ -173,6 +173,7 @@ def test_it_waits_for_the_start_and_stops_without_frames_and_when_asked(peer: Pe
         assert _stands(microscope)
 
 
+@pytest.mark.long
 def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer) -> None:
     """A processor that is too slow takes one frame of many; what counts is the time that the microscope needs."""
     with servoed(peer) as (microscope, _):
@@ -190,6 +191,7 @@ def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 3600.0], ids=["own clock", "another clock"])
+@pytest.mark.long
 def test_frames_that_come_too_late_do_not_move_it(peer: Peer, ahead_s: float) -> None:
     with servoed(peer) as (microscope, _):
         microscope.late_s = -ahead_s
@@ -207,6 +209,7 @@ def test_frames_that_come_too_late_do_not_move_it(peer: Peer, ahead_s: float) ->
         microscope.frames_until(lambda: _moves(microscope), "motion again")
 
 
+@pytest.mark.long
 def test_a_simulated_clock_that_begins_after_the_frames_does_not_make_them_old(peer: Peer) -> None:
     clock = peer.node.create_publisher(ClockMessage, "/clock", RELIABLE)
     with servoed(peer, use_sim_time=True, start=False) as (microscope, _):
@@ -345,6 +348,7 @@ def _calibration() -> Calibration:
     )
 
 
+@pytest.mark.long
 def test_the_nodes_together_converge_across_magnifications(peer: Peer, tmp_path: Path) -> None:
     """virtual_sem, parameter_server, stream_corrector and visual_servo; the goal is kept from 1000x to 4000x."""
     _calibration().save(tmp_path / "cal.yaml")

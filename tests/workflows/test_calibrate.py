@@ -368,6 +368,7 @@ def test_files_are_untilted_by_name_and_the_certificate_is_kept(tmp_path, monkey
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
     # The first two of the four frames of each visit.
     every = workflow.named_frames

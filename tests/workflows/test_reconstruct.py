@@ -23,6 +23,7 @@ from semcal_ros import reconstruct
 from tests.helpers.turning_ball import turning_ball
 
 
+@pytest.mark.long
 def test_frames_without_the_specimen_do_not_take_the_place_of_others():
     """A ball that leaves the field: each frame after that is a keyframe without points."""
     images, calibration = turning_ball()

@@ -137,6 +137,7 @@ def test_a_stage_like_no_other_and_a_perfect_one_say_nothing(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_calibration_on_the_stage_is_right_within_what_it_states(tmp_path: Path) -> None:
     """An axis that misses by 0.2 mm, a magnification that comes back to 0.3 %, and a grid as it is made."""
     scope = preset("jsm820")

@@ -401,6 +401,7 @@ def test_a_body_of_more_contrast_is_not_taken_for_the_cantilever(seed, magnifica
     assert not (other.base_seen and other.tip_seen)
 
 
+@pytest.mark.long
 def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
     """The inner corner of the pusher touches the beam at 0.916 of its length."""
     scene, _ = random_plan(1, 7760.0, (0.0,))
@@ -422,6 +423,7 @@ def test_the_shape_of_a_pushed_beam_knows_the_pusher(monkeypatch):
     )
 
 
+@pytest.mark.long
 def test_what_moves_along_itself_is_no_clamped_beam():
     image, measure = random_series(14, 6450.0, (0.0, 0.4, 1.0))
     other = find_strip(image)
@@ -468,6 +470,7 @@ def test_of_two_parallel_beams_the_one_that_bends_is_measured():
     assert max(abs(f.deflection_m) for f in other.frames) < 0.1 * pixel_m
 
 
+@pytest.mark.long
 def test_a_base_that_moves_is_that_of_no_cantilever():
     """The tip of a pusher whose other end is out of view may be taken for a base."""
     image, measure = random_series(14, 6450.0, (0.0, 0.4, 1.0))

@@ -82,6 +82,7 @@ def test_points_lie_on_the_true_surface(plan, structure):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_outline_of_a_tip_does_not_bend_the_poses():
     """Points on the outline move over the surface as it turns: they are told by their residuals."""
     made = draw_ball_plan(3, frames=60, pixel_m=8e-9)

@@ -180,6 +180,7 @@ def test_tilts_that_say_nothing_are_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_axis_is_within_its_uncertainty() -> None:
     """30 pairs of five specimens, each with other noise. In such a set, one false match on its line made the RMS 6."""
     scores = []

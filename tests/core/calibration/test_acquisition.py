@@ -100,6 +100,7 @@ def test_one_magnification_is_visited_several_times() -> None:
     assert {request.magnification for request in requests} == {2000.0}
 
 
+@pytest.mark.long
 def test_it_goes_on_until_the_target_is_met_and_is_right_then() -> None:
     taken = plan_survey(GOAL)
     first = None

@@ -90,6 +90,7 @@ def test_a_distortion_has_its_size(model: CalibrationModel) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_other_views_of_one_microscope_agree(model: CalibrationModel) -> None:
     others = [compare_calibrations(model, calibrated(seed)) for seed in range(2, 8)]
     # The limit is reached by chance in one comparison of a hundred.

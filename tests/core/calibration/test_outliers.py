@@ -45,7 +45,11 @@ def _misnamed(views, index, factor):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "factor", "wrong"),
-    [("strong_perspective", 1.06, 10), ("parallel", 0.94, 10), ("parallel", 1.06, 11)],
+    [
+        ("strong_perspective", 1.06, 10),
+        pytest.param("parallel", 0.94, 10, marks=pytest.mark.long),
+        ("parallel", 1.06, 11),
+    ],
 )
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
     # One of 16 views, which is still no more than few of them.

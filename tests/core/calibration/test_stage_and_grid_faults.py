@@ -98,6 +98,7 @@ def scale_notes(result):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_wavy_grid_is_the_grids_and_no_residual_field():
     result = calibrated(views_of(ANY_WAY, GridFaults(wave=1e-2), seed=1))
     assert result.model.residual is None
@@ -121,6 +122,7 @@ def test_a_bowed_stretched_and_sheared_grid_is_estimated():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_stretched_grid_whose_lattices_lie_anyhow_is_stated():
     """Without the stage's rotation each lattice has one of four directions, and its stretch a sign, by chance.
 
@@ -135,6 +137,7 @@ def test_a_stretched_grid_whose_lattices_lie_anyhow_is_stated():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
     result = calibrated(views_of(replace(ANY_WAY, line_jitter_px=0.05), seed=3, most_corners=None))
     # From some 12 000 corners of 33 images.
@@ -143,6 +146,7 @@ def test_a_jitter_of_lines_is_estimated_and_held_by_the_sigmas():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_drift_within_images_does_not_become_skew_and_aspect():
     result = calibrated(views_of(replace(ANY_WAY, drift_sigma_px=0.3), seed=4, most_corners=None))
     low, high = result.model.statistics["fit"]["drift_sigma_px"]
@@ -153,6 +157,7 @@ def test_drift_within_images_does_not_become_skew_and_aspect():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_spread_of_visits_comes_out():
     stage = replace(ANY_WAY, scale_sigma=3e-3)
     result = calibrated(views_of(stage, seed=5))
@@ -183,6 +188,7 @@ def test_hysteresis_is_named():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_one_axis_without_a_stage_is_warned_of_and_untilted_views_help():
     views = views_of(ONE_AXIS, seed=8)
     free = calibrated(views, untilted="none")
@@ -216,6 +222,7 @@ def test_a_tilt_that_contradicts_the_image_is_named_and_not_used():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_axis_the_wrong_way_round_is_said():
     views = views_of(replace(ONE_AXIS, reading_sigma_rad=0.003), seed=10, readings=True)
     result = calibrated(views, axis=StageAxis(0.2 + np.pi))
@@ -223,6 +230,7 @@ def test_an_axis_the_wrong_way_round_is_said():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_constant_error_of_the_stage_beyond_belief_is_said():
     stage = replace(ONE_AXIS, reading_sigma_rad=0.003, tilt_error_rad=0.06)
     result = calibrated(views_of(stage, seed=11, readings=True), axis=StageAxis(0.2))

@@ -195,6 +195,7 @@ def test_drift_of_recursive_averages_is_that_of_their_effective_time() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_stated_uncertainty_of_averaged_passes_is_honest() -> None:
     """20 recordings of a steady drift, each with another specimen, in px; passes that are averaged before."""
     # After fewer frames the process noise is not known yet, and the sigma is on the safe side.

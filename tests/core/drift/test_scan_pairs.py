@@ -49,6 +49,7 @@ def truth_at(drifts: list[Drift], progress: Array) -> Array:
     return np.asarray(values - values[0].mean(axis=0))
 
 
+@pytest.mark.long
 def test_the_drift_is_found_within_its_uncertainty():
     """Both senses, square and wide frames, coarse and fine structure; 12 pairs of 12 to 32 displacements."""
     ratios = []
@@ -92,6 +93,7 @@ def test_without_noise_it_is_exact():
     assert np.sqrt(np.mean(distorted**2)) > 10.0
 
 
+@pytest.mark.long
 def test_distortion_turns_with_the_raster():
     """The lines of a turned scan are those of the beam, so that each scan is undistorted before it is turned."""
     camera = ScanCamera(

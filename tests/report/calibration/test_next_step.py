@@ -59,6 +59,7 @@ def test_where_nothing_helps_the_budget_is_shown() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_command_of_the_page_runs(
     result: CalibrationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

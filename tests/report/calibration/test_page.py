@@ -266,6 +266,7 @@ def test_examples_are_the_richest_views(result: CalibrationResult) -> None:
         assert len(view.detection.xy) == max(len(v.image_xy) for v in own)
 
 
+@pytest.mark.long
 def test_fast_and_small_enough_with_many_views(result: CalibrationResult, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     many = tuple(
