@@ -43,10 +43,10 @@ format: setup ## bring the source into the form that lint wants
 	@$(VENV_PYTHON) -m ruff check --fix .
 	@$(VENV_PYTHON) -m ruff format .
 
-# As many processes as cores: with more, nodes are late as they would not be on a microscope's computer.
-# Tests of several processes are tried once more, but no more than four in a run: the fifth one fails. Measured on
-# two cores: none to two in a run of 3800.
-PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 2 --dist worksteal --rerun-show-tracebacks --max-suite-reruns=4
+# Nodes wait for most of their time: two processes use 0.6 of two cores, three nearly all. With more, nodes are late as
+# they would not be on a microscope's computer.
+# Tests of several processes are tried once more, but no more than four in a run: the fifth one fails.
+PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal --rerun-show-tracebacks --max-suite-reruns=4
 # No test may take longer than 400 s. One that waits within the middleware for ever does not hear its time limit: its
 # process is ended.
 END_STUCK := -o faulthandler_timeout=500 -o faulthandler_exit_on_timeout=true

@@ -224,8 +224,8 @@ def test_no_frame_waits_until_a_large_calibration_is_read(
     )
     with running("rectifier", {"calibration": files["a"], **PATIENT}):
         stream.ready()
-        # A quick machine reads it in half a second; that must be many frames.
-        stream.start(30.0)
+        # A quick machine reads it in a quarter of a second; that must be many frames.
+        stream.start(60.0)
         stream.wait_more(5)
         publisher = peer.node.create_publisher(String, "calibration", LATCHED)
         publisher.publish(String(data=SLOW.dumps()))
