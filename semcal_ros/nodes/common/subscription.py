@@ -143,11 +143,13 @@ class AdaptiveSubscription:
         self._full_topic = str(self._subscription.topic_name)
         self._paused = False
         self._received = 0
-        # Of a latched value: whether to ask for it again, how often that was done, publishers at the last message.
+        # Of a latched value: whether to ask for it again, how often that was done, who published at the last message,
+        # and the second subscription that asks.
         self._wants_again = False
         self.renewals = 0
         self._publishers = 0
         self._keeps_last = bool(source) and not streams
+        self._asking: Any = None
         self._watch: SourceWatch | None = None
         if source:
             now_s = time.monotonic()
@@ -240,7 +242,10 @@ class AdaptiveSubscription:
         return message, info
 
     def ask_again(self) -> None:
-        """Subscribe again at the next check: publishers that keep their last message then send it once more."""
+        """Ask, at the next check, publishers that keep their last message to send it once more.
+
+        The callback gets it as any other; :attr:`renewals` says how often that was asked for.
+        """
         self._wants_again = True
 
     # -- quality of service ------------------------------------------------------------------------
@@ -298,17 +303,32 @@ class AdaptiveSubscription:
 
     def _renew(self) -> None:
         """Ask again for the last message, also where a publisher has left and its message may be the newest one."""
+        if self._asking is not None:
+            self._node.destroy_subscription(self._asking)
+            self._asking = None
         now = self._subscription.get_publisher_count()
         left = 0 < now < self._publishers
         self._publishers = min(self._publishers, now)
         if not (self._wants_again or left):
             return
         self._wants_again = False
-        self._node.destroy_subscription(self._subscription)
-        # The one that has left may have been the one that offered less.
-        self._profile = self._requested
-        self._subscription = self._subscribe()
         self.renewals += 1
+        asked_ns = time.time_ns()
+
+        def on_kept(message: Any, info: MessageInfo) -> None:
+            # What is new also comes on the subscription itself, which goes on so that nothing is lost.
+            if published_ns(info) < asked_ns:
+                self._callback(message, info)
+
+        callback: Any = on_kept
+        self._asking = self._node.create_subscription(
+            self._type,
+            self.topic,
+            callback,
+            self._requested,
+            callback_group=self._group,
+            raw=self._raw,
+        )
 
     def _sources(self, publishers: list[Any]) -> list[str]:
         return [
