@@ -98,6 +98,23 @@ def test_drift_begins_anew_when_the_stamps_go_back(
         bench.wait_counts(received=12, published=12, dropped=0, rejected=0)
 
 
+@pytest.mark.parametrize("kind", TRACKING, ids=lambda kind: kind.node)
+def test_drift_begins_anew_when_asked(peer: Peer, kind: Kind, calibration_file: Path) -> None:
+    parameters = _parameters(kind, calibration_file, drift_tracking="every_frame")
+    with bench_of(peer, kind, parameters) as bench:
+        bench.set_magnification(MAGNIFICATION)
+        for index in range(4):
+            bench.exchange(noisy(shifted_texture(index), index), NOW_S + index)
+        peer.wait_for(lambda: len(bench.drifts) == 4, "the drifts")
+        assert bench.drifts[-1].pose.pose.position.x != 0.0
+        assert peer.trigger(f"{kind.full_name}/reset").success
+        picture = noisy(shifted_texture(3), 99)
+        message = bench.exchange(picture, NOW_S + 4)
+        np.testing.assert_array_equal(pixels(message), kind.right(picture, MAGNIFICATION))
+        drift = peer.wait_for(lambda: bench.drifts[4:], "the drift")[0].pose
+        assert (drift.pose.position.x, drift.pose.position.y) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.node)
 def test_a_leap_of_the_stamps_does_no_harm(peer: Peer, kind: Kind, calibration_file: Path) -> None:
     """From the first second that a stamp can hold to the last, and a stamp that stands still."""

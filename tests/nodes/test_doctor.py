@@ -119,7 +119,6 @@ def _examine(peer: Peer, arguments: tuple[str, ...], tick: Callable[[], Any]) ->
     return Report(process.returncode, output)
 
 
-@pytest.mark.long
 def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> None:
     scene = {"width": 96, "height": 96, "rate": 10.0, "magnification": 1000.0}
     known = {"calibration": calibration_file}
