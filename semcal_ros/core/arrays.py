@@ -84,10 +84,10 @@ def equilibrate(matrix: Array) -> tuple[Array, Array]:
     Returns
     -------
     The scaled matrices ``scale[i] * matrix[i, j] * scale[j]``, (..., n, n), and ``scale``,
-    (..., n). A row whose diagonal is zero stays zero.
+    (..., n). A row whose diagonal is zero, or negative by rounding, stays as it is.
     """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, _TINY))
+    scale = 1.0 / np.sqrt(np.where(diagonal > _TINY, diagonal, 1.0))
     return matrix * (scale[..., :, None] * scale[..., None, :]), scale
 
 

@@ -44,6 +44,13 @@ def test_a_matrix_is_scaled_to_ones_on_the_diagonal() -> None:
     np.testing.assert_allclose(scaled / np.outer(scale, scale), matrix, rtol=1e-14)
 
 
+def test_a_diagonal_that_rounding_made_negative_overflows_nothing() -> None:
+    matrix = np.array([[1e12, 1e3], [1e3, -1e-7]])
+    scaled, scale = equilibrate(matrix)
+    np.testing.assert_allclose(scaled, [[1.0, 1e-3], [1e-3, -1e-7]])
+    np.testing.assert_allclose(scale, [1e-6, 1.0])
+
+
 def test_systems_in_mixed_units_are_solved_one_by_one_and_in_stacks() -> None:
     matrices = _matrices(3)
     wanted = np.random.default_rng(2).normal(size=(3, 4)) * UNITS

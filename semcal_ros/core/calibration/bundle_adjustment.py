@@ -19,24 +19,25 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, invert_scaled, solve_scaled
+from semcal_ros.core.arrays import Array, Mask, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.normal_equations import (
     Eliminated,
     NormalEquations,
     Problem,
     State,
+    damped_diagonal,
     empty_effects,
     normal_equations,
     pick_views,
     pose_priors,
     prior_cost,
     reduced_normal_equations,
-    residuals,
     retract,
     schur_complement,
     select_views,
@@ -61,6 +62,10 @@ _POOR_GAIN = 0.25
 _FOLLOWING_STEPS = 6
 # Change of a view's half chi-square that does not count as a failure.
 _NEGLIGIBLE = 1e-2
+# Longest step of a rotation vector, rad: farther away, the equations say nothing.
+_LARGEST_TURN = 0.5
+# Damping that makes up for what rounding takes from the equations: it changes no sigma in the first five digits.
+_ROUNDING = 1e-10
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-7
 
@@ -71,7 +76,7 @@ class BundleStatus(Enum):
     SMALL_DECREASE = "converged: relative decrease below the tolerance"
     NO_DESCENT = "converged: no step lowers the cost"
     ITERATION_LIMIT = "stopped at the iteration limit"
-    NO_PROJECTION = "a point has no projection at the start"
+    SINGULAR = "the views and the priors do not determine the unknowns"
 
 
 @dataclass(frozen=True)
@@ -120,8 +125,14 @@ class BundleResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the cost is at a minimum."""
-        return self.status in (BundleStatus.SMALL_DECREASE, BundleStatus.NO_DESCENT)
+        """Whether the cost is at a minimum, and every point has a projection there."""
+        ended = self.status in (BundleStatus.SMALL_DECREASE, BundleStatus.NO_DESCENT)
+        return ended and not np.any(self.lost)
+
+    @property
+    def lost(self) -> Mask:
+        """(N,) the points that the camera does not show at all."""
+        return ~np.all(np.isfinite(self.residuals_px), axis=1)
 
     def rms_px(self) -> float:
         """Return the RMS distance of observed and projected corners, px."""
@@ -145,13 +156,21 @@ class _Step:
     predicted_prior: float
 
 
-def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step:
-    reduced = schur_complement(problem, state, normal, damping)
-    matrix, right = reduced_normal_equations(
-        problem, state.theta, reduced.information, reduced.gradient
-    )
-    change = solve_scaled(matrix, right, damping)
+def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step | None:
+    """Return the step, or None where rounding leaves no positive definite equations: a larger damping does."""
+    try:
+        reduced = schur_complement(problem, state, normal, damping)
+        matrix, right = reduced_normal_equations(
+            problem, state.theta, reduced.information, reduced.gradient
+        )
+        change = solve_scaled(matrix, right, damping)
+    except np.linalg.LinAlgError:
+        return None
     camera, visits, pose = reduced.back(problem, change)
+    if not (np.all(np.isfinite(change)) and np.all(np.isfinite(pose))):
+        return None
+    if np.any(np.abs(pose[:, :3]) > _LARGEST_TURN):
+        return None
     new = retract(problem, state, change, pose, visits)
     parts = (
         [camera, pose] if problem.effects is None else [camera, visits[problem.effects.visit], pose]
@@ -188,8 +207,6 @@ def refine(
         state = empty_effects(problem, state)
     costs = view_costs(problem, state)
     cost = float(costs.sum()) + prior_cost(problem, state)
-    if not np.isfinite(cost):
-        return _make_empty_result(problem, state)
     if fixed_theta:
         state, costs, iterations, status = _refine_poses(
             problem, state, costs, max_iterations, tolerance
@@ -201,13 +218,14 @@ def refine(
         iterations += 1
         normal = normal_equations(problem, state)
         while True:
-            step = _step(problem, state, normal, damping)
-            trial, trial_costs = _refine_following_poses(problem, state, costs, step)
-            trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
+            trial_cost, step = np.inf, _step(problem, state, normal, damping)
+            if step is not None:
+                trial, trial_costs = _refine_following_poses(problem, state, costs, step)
+                trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
             if trial_cost <= cost or damping >= _MAX_DAMPING:
                 break
             damping *= 10.0
-        if trial_cost > cost:
+        if step is None or not trial_cost <= cost:
             status = BundleStatus.NO_DESCENT
             break
         decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
@@ -257,7 +275,7 @@ def _refine_poses(
         iterations += 1
         normal = normal_equations(problem, state, poses_only=True)
         pose = normal.matrix[:, first:, first:].copy()
-        pose[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        pose[:, diagonal, diagonal] = damped_diagonal(pose, damping[:, None])
         change = solve_scaled(pose, normal.right[:, first:])
         still = np.zeros_like(state.visits)
         trial = retract(problem, state, np.zeros_like(state.theta), change, still)
@@ -278,12 +296,18 @@ def _make_result(
     problem: Problem, state: State, cost: float, iterations: int, status: BundleStatus
 ) -> BundleResult:
     normal = normal_equations(problem, state)
-    reduced = schur_complement(problem, state, normal, 0.0)
-    matrix, _ = reduced_normal_equations(
-        problem, state.theta, reduced.information, reduced.gradient
-    )
-    # A direction that neither data nor prior hold gets no spurious certainty from rounding.
-    covariance = invert_scaled(matrix, rcond=1e-15)
+    for damping in (0.0, _ROUNDING):
+        with suppress(np.linalg.LinAlgError):
+            reduced = schur_complement(problem, state, normal, damping)
+            matrix, _ = reduced_normal_equations(
+                problem, state.theta, reduced.information, reduced.gradient
+            )
+            # A direction that neither data nor prior hold gets no spurious certainty from rounding.
+            covariance = invert_scaled(matrix, rcond=1e-15)
+            if np.all(np.diagonal(covariance) > 0.0):
+                break
+    else:
+        return _make_singular_result(problem, state, normal, cost, iterations)
     covariance = 0.5 * (covariance + covariance.T)
     visit_variance, view_covariance = _posterior(problem, reduced, covariance)
     priors = pose_priors(problem, state)
@@ -330,22 +354,24 @@ def _with_inner(outer: Array, by_outer: Array, inverse: Array) -> Array:
     return np.block([[outer, cross], [np.swapaxes(cross, 1, 2), inner]])
 
 
-def _make_empty_result(problem: Problem, state: State) -> BundleResult:
-    """Return the result where some point has no projection at the start: nothing is known."""
+def _make_singular_result(
+    problem: Problem, state: State, normal: NormalEquations, cost: float, iterations: int
+) -> BundleResult:
+    """Return the result where rounding leaves nothing of the equations: no sigma is known."""
     groups, size = len(problem.designs), len(state.theta)
-    views, rows, _ = pose_priors(problem, state).shape
+    priors = pose_priors(problem, state)
     own = problem.shared_columns
     return BundleResult(
         state=state,
-        residuals_px=residuals(problem, state),
-        huber_weight=np.zeros(len(problem.board_m)),
-        cost=float("inf"),
+        residuals_px=normal.residuals_px,
+        huber_weight=normal.huber_weight,
+        cost=cost,
         information=np.zeros((groups, own, own)),
         gradient=np.zeros((groups, own)),
         covariance=np.full((size, size), np.inf),
-        prior_residuals=np.zeros((views, rows)),
-        prior_variance=np.ones((views, rows)),
+        prior_residuals=priors[:, :, -1],
+        prior_variance=np.ones(priors.shape[:2]),
         visit_variance=np.full((len(state.visits), problem.visit_columns), np.inf),
-        iterations=0,
-        status=BundleStatus.NO_PROJECTION,
+        iterations=iterations,
+        status=BundleStatus.SINGULAR,
     )

@@ -56,6 +56,7 @@ from semcal_ros.core.calibration.pda_step import (
 )
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.problem import variance_factor
+from semcal_ros.core.calibration.residual_field_fit import undo_field
 from semcal_ros.core.calibration.scale_checks import (
     estimate_repeatability,
     find_scale_weaknesses,
@@ -491,8 +492,10 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
         if count[setup.views[int(v)].magnification] > 2
     ]
     left = {}
+    # The field is that of all views: one of them hardly changes it.
+    plain = setup if fit.field is None else undo_field(setup, fit.field.field)
     for suspect in suspects:
-        views = tuple(view for i, view in enumerate(setup.views) if i != suspect)
+        views = tuple(view for i, view in enumerate(plain.views) if i != suspect)
         other = fit_joint(replace(setup, views=views), "off").adjustment.spread.lattice_sigma
         left[suspect] = np.inf if other is None else float(np.max(other))
     best = min(left, key=lambda v: left[v], default=None)

@@ -39,9 +39,9 @@ from semcal_ros.core.wording import counted
 __all__ = ["InitialValues", "initial_values", "pose_from_camera"]
 
 
-# Ratio of the field width to the distance of the pivot. Noise and distortion imitate a few
-# hundredths; an SEM at 100x has 0.06 to 0.15, a photographic lens about 1.
-_WIDE = 0.3
+# Ratio of the field width to the distance of the pivot. Noise and distortion imitate a few hundredths; an SEM at 100x
+# has 0.06 to 0.15, at 60x with a pivot of 4 mm 0.5, and a photographic lens about 1.
+_WIDE = 0.7
 
 
 @dataclass(frozen=True)

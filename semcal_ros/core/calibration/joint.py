@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices, solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, BundleStatus, refine
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, solve_scaled
+from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.line_jitter import LineJitter, estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
@@ -44,7 +44,9 @@ from semcal_ros.core.calibration.problem import (
     adjust,
     build_problem,
     constant_functions,
+    mirror,
     resolve_mirrored_tilts,
+    restart_poses,
     stack_coefficients,
     variance_factor,
     with_coefficients,
@@ -64,11 +66,13 @@ from semcal_ros.core.calibration.stage import OFFSET_NAMES
 from semcal_ros.core.calibration.variance_components import (
     VarianceComponents,
     initial_components,
+    limit_components,
     update_components,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.plane_geometry import fit_homography
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -96,16 +100,21 @@ _RESERVE, _LEAST_SIZE = 2, 5
 # every later adjustment updates them again. At most so many after that, until they change by less
 # than the last number.
 _FIRST_UPDATES, _LAST_UPDATES, _SMALL_CHANGE = 4, 12, 0.02
+# Steps in which corners come to be believed, and the part of the excess noise beyond which there is no further one.
+_MOST_STEPS, _LEAST_STEP = 3, 0.7
+# Views that a message names.
+_NAMED = 5
 # Corners per view for what only needs to be near: signs of tilts, poses, start functions.
 _ENOUGH_CORNERS = 60
 # Tolerance of the intermediate adjustments; only the last one needs to be exact.
 _COARSE = 1e-6
 # Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
 # change; with both fixed the turns converge.
-_MAX_FIELD_TURNS, _CHOOSING_TURNS = 12, 2
+_MAX_FIELD_TURNS, _CHOOSING_TURNS = 30, 2
 # Part of the misfit that a field must explain: distortion of the scan that none of the other
-# parameters describes is explained to nine tenths, the waves of a grid to a sixth.
-_LEAST_EXPLAINED = 1.0 / 3.0
+# parameters describes is explained to nine tenths, settling that is narrower than the knots to a quarter, and the waves
+# of a grid to a sixth.
+_LEAST_EXPLAINED = 0.2
 # RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
 # the noise of good corners.
 _FIELD_CONVERGED_PX = 1e-3
@@ -274,6 +283,59 @@ def add_shared_unknowns(setup: Setup) -> Setup:
     return replace(setup, shared=(*GRID_NAMES, *squares, *MISS_NAMES, *stage))
 
 
+def measure_misfit_px(setup: Setup) -> float:
+    """Return by how much the worst view departs from a plane under a perspective, 1-sigma per axis in px, beyond the
+    sigmas of its corners.
+
+    Where every corner is believed to its own noise while lens and scan are not known yet, poses, pivot and grid take
+    their place, and no prior counts. An adjustment therefore starts from corners that are as uncertain as that.
+    """
+    worst = 0.0
+    for view in setup.views:
+        ones = np.ones((len(view.board_xy_m), 1))
+        seen = np.hstack([view.board_xy_m, ones]) @ fit_homography(view.board_xy_m, view.image_xy).T
+        square = np.sum((view.image_xy - seen[:, :2] / seen[:, 2:]) ** 2, axis=1)
+        variance = float(np.median(square)) / MEDIAN_CHI2_2 - float(np.median(view.sigma_px)) ** 2
+        worst = max(worst, variance)
+    return float(np.sqrt(worst))
+
+
+def _with_excess(setup: Setup, sigma_px: float) -> Setup:
+    """Return the setup with corners that are more uncertain by ``sigma_px`` per axis."""
+    if sigma_px == 0.0:
+        return setup
+    return replace(setup, views=add_excess_noise(setup.views, sigma_px))
+
+
+def _tempered(setup: Setup, sigma_px: float) -> Setup:
+    """Return the setup with observations, of corners and of the stage, that are believed less by the same factor."""
+    noisy = _with_excess(setup, sigma_px)
+    own = np.concatenate([view.own_variance_share for view in noisy.views])
+    return replace(noisy, tempering=float(np.median(own)) ** -0.5)
+
+
+def _excess_px(setup: Setup, adjustment: Adjustment) -> float:
+    """Return the scatter of the corners of an adjustment beyond their own sigmas."""
+    residuals = adjustment.result.residuals_px
+    return estimate_excess_sigma_px(setup.views, residuals, 6 * len(setup.views))
+
+
+def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, Adjustment]:
+    """Believe the corners as far as the model explains them, step by step; return the last setup and adjustment."""
+    level = max(view.excess_px for view in noisy.views)
+    for _ in range(_MOST_STEPS):
+        excess = min(_excess_px(setup, adjustment), level)
+        # The first step brings in what the stage says.
+        if np.isfinite(noisy.tempering) and (level == 0.0 or excess > _LEAST_STEP * level):
+            break
+        level, noisy = excess, _tempered(setup, excess)
+        spread = update_components(noisy, adjustment.problem, adjustment.result)
+        adjustment = _select_and_adjust(
+            noisy, adjustment.functions, adjustment.result.state, spread
+        )
+    return noisy, adjustment
+
+
 def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     """Fit moderately flexible functions, poses and variance components from nominal values."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
@@ -290,7 +352,8 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     functions = refit_functions(functions, dict.fromkeys(_SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
-    result = _check_projection(adjust(problem, state, tolerance=_COARSE))
+    result = adjust(problem, state, tolerance=_COARSE)
+    result = _right_way_up(setup, functions, problem, result)
     for _ in range(_FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
@@ -300,19 +363,37 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     return with_coefficients(functions, result.state.theta), result.state, spread
 
 
-def _check_projection(result: BundleResult) -> BundleResult:
-    """Return the result, unless the camera does not show some corners at all; then nothing is known."""
-    if result.status is BundleStatus.NO_PROJECTION:
-        raise UnusableCalibrationError(
-            "an adjustment in which a corner has no projection",
-            expected="views of one flat grid, by one microscope, at the magnifications that are stated",
-            do="check magnifications, --display-width and --squares, or leave out other views",
-        )
-    return result
+def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
+    """Refuse an adjustment whose camera does not show some corners at all, and name their views."""
+    lost = adjustment.result.lost
+    if not np.any(lost):
+        return
+    views = sorted({int(v) for v in adjustment.problem.view_of_point[lost]})
+    more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
+    raise UnusableCalibrationError(
+        "an adjustment whose camera cannot show corners of "
+        f"{', '.join(setup.views[v].name for v in views[:_NAMED])}{more}",
+        expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+        do="leave these views out, or check magnifications, --display-width and --squares",
+    )
+
+
+def _right_way_up(
+    setup: Setup, functions: Functions, problem: Problem, result: BundleResult
+) -> BundleResult:
+    """Return the adjustment, or the one of the mirrored start if that fits better.
+
+    It is tried where the pivot has come to lie on the far side of the specimen, where no microscope has it.
+    """
+    rho = with_coefficients(functions, result.state.theta)["rho"](setup.magnifications[0])
+    if rho >= 0.0:
+        return result
+    other = refine(problem, mirror(functions, problem, result.state), tolerance=_COARSE)
+    return other if other.cost < result.cost else result
 
 
 def _refine_coarsely(problem: Problem, state: State) -> BundleResult:
-    return _check_projection(refine(problem, state, tolerance=_COARSE))
+    return refine(problem, state, tolerance=_COARSE)
 
 
 def _theta(setup: Setup, functions: Functions, state: State) -> Array:
@@ -479,13 +560,15 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     """
     thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
     functions = adjustment.functions
+    # From what is usual: spreads that were wide while the model was wrong would hold it there.
     spread = update_components(setup, adjustment.problem, adjustment.result)
-    state, _ = resolve_mirrored_tilts(
-        build_problem(thin, functions, thin.views, spread), adjustment.result.state
-    )
+    spread = limit_components(setup, spread)
+    few = build_problem(thin, functions, thin.views, spread)
+    state, _ = resolve_mirrored_tilts(few, adjustment.result.state)
+    state, _ = restart_poses(thin, few, state)
     for _ in range(_LAST_UPDATES):
         problem = build_problem(setup, functions, setup.views, spread)
-        result = _refine_coarsely(problem, state)
+        result = _right_way_up(setup, functions, problem, _refine_coarsely(problem, state))
         before, state = spread, result.state
         spread = update_components(setup, problem, result)
         if _largest_change(before, spread) < _SMALL_CHANGE:
@@ -588,27 +671,33 @@ def fit_joint(
     changes. With ``residual`` ``"on"``, or ``"auto"`` where cross-validation finds it worthwhile, a
     residual field is estimated too. ``on_stage`` as for ``calibrate_views``.
     """
-    thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
+    start_px = measure_misfit_px(setup)
+    noisy = _tempered(setup, start_px)
+    if start_px > 0.0:
+        # What a stage says wrongly must not lead poses astray that are so uncertain.
+        noisy = replace(noisy, tempering=np.inf)
+    thin = replace(noisy, views=tuple(_thin_view(v) for v in noisy.views))
     on_stage("start values", 0.0)
     start = _fit_start(thin)
     on_stage("number of coefficients", 0.3)
-    adjustment, field, pattern = _select_and_adjust(setup, *start), None, None
+    adjustment = _select_and_adjust(noisy, *start)
+    noisy, adjustment = _anneal(setup, noisy, adjustment)
+    field, pattern = None, None
     if residual != "off":
         on_stage("residual field", 0.5)
-        adjustment, field, pattern = _add_field(setup, adjustment, residual == "on")
-    excess = estimate_excess_sigma_px(
-        setup.views, adjustment.result.residuals_px, 6 * len(setup.views)
-    )
-    if excess > 0.0:
-        setup = replace(setup, views=add_excess_noise(setup.views, excess))
-    final = setup if field is None else undo_field(setup, field.field)
-    if excess > 0.0:
+        adjustment, field, pattern = _add_field(noisy, adjustment, residual == "on")
+    excess = _excess_px(setup, adjustment)
+    final = setup = _with_excess(setup, excess)
+    if field is not None:
+        final = undo_field(setup, field.field)
+    if excess > 0.0 or start_px > 0.0:
         spread = update_components(setup, adjustment.problem, adjustment.result)
         adjustment = _select_and_adjust(
-            final, adjustment.functions, adjustment.result.state, spread, _current_sizes(adjustment)
+            final, adjustment.functions, adjustment.result.state, spread
         )
     on_stage("final adjustment", 0.75)
     adjustment = _adjust_exactly(final, adjustment)
+    _refuse_lost_corners(final, adjustment)
     if field is not None:
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)

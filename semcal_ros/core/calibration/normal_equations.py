@@ -57,6 +57,7 @@ __all__ = [
     "Problem",
     "State",
     "WhitenedRows",
+    "damped_diagonal",
     "empty_effects",
     "make_problem",
     "normal_equations",
@@ -87,6 +88,9 @@ MISS_NAMES: tuple[str, ...] = ("axis_x_m", "axis_y_m", "axis_z_m")
 
 # Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
 _HUBER = 3.0
+# Loss of a corner that the camera does not show at all: that of one that is far outside the image. An adjustment may
+# start in such a state, and leaves it as soon as it can; one that ends in it is refused.
+_LOST = 1e6
 
 
 @dataclass(frozen=True)
@@ -330,20 +334,21 @@ def whitened_norm(problem: Problem, miss: Array) -> Array:
 
 
 def _huber(norm: Array) -> tuple[Array, Array]:
-    """Return Huber's loss (half the squared norm inside) and weight of whitened residual norms."""
+    """Return Huber's loss (half the squared norm inside) and weight of whitened residual norms.
+
+    A point without a projection has a large loss and no weight.
+    """
+    seen = np.isfinite(norm)
+    norm = np.where(seen, norm, 0.0)
     outside = norm > _HUBER
     loss = np.where(outside, _HUBER * (norm - 0.5 * _HUBER), 0.5 * norm * norm)
-    return loss, np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
+    weight = np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
+    return np.where(seen, loss, _LOST), np.where(seen, weight, 0.0)
 
 
 def view_costs(problem: Problem, state: State) -> Array:
-    """Return (V,) half robust sums of squares, with the priors of the poses.
-
-    The cost of a view is infinite where one of its points has no projection.
-    """
-    miss = residuals(problem, state)
-    norm = whitened_norm(problem, miss)
-    loss = np.where(np.isfinite(norm), _huber(norm)[0], np.inf)
+    """Return (V,) half robust sums of squares, with the priors of the poses."""
+    loss, _ = _huber(whitened_norm(problem, residuals(problem, state)))
     own = pose_priors(problem, state)[:, :, -1]
     return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * np.sum(own**2, axis=1)
 
@@ -445,6 +450,7 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
             _by_shear(problem, by_grid),
         )
     rows[:, -1] = miss.T
+    rows[:, :, huber == 0.0] = 0.0
     whiten(problem.whitening, rows, huber)
     return WhitenedRows(np.array(columns, dtype=np.intp), rows, miss, huber)
 
@@ -657,8 +663,16 @@ def schur_complement(
 def _damped_inverse(matrix: Array, damping: float) -> Array:
     diagonal = np.arange(matrix.shape[-1])
     out = matrix.copy()
-    out[:, diagonal, diagonal] *= 1.0 + damping
+    out[:, diagonal, diagonal] = damped_diagonal(matrix, damping)
     return invert_scaled(out)
+
+
+def damped_diagonal(matrix: Array, damping: Array | float) -> Array:
+    """Return the (V, p) diagonals of (V, p, p) with Marquardt's damping; 1 where nothing is known of an unknown, as of
+    the pose of a view of which the camera shows no corner.
+    """
+    known = np.diagonal(matrix, axis1=1, axis2=2)
+    return np.where(known > 0.0, known * (1.0 + damping), 1.0)
 
 
 def sum_by(index: Indices, count: int, values: Array) -> Array:

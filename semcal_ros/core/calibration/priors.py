@@ -123,7 +123,8 @@ class Setup:
 
     With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.normal_equations.Problem`),
     the problems also have the effects of visits and of drift within the images.
-    ``stage_rotation_rad`` is where the constant error of the stage's rotation starts.
+    ``stage_rotation_rad`` is where the constant error of the stage's rotation starts. ``tempering`` is by how much less
+    than stated the readings of the stage are believed, as long as the corners are: else a wrong reading would win.
     """
 
     views: tuple[GridView, ...]
@@ -135,6 +136,7 @@ class Setup:
     shared: tuple[str, ...] = ()
     axis: StageAxis = field(default_factory=StageAxis)
     stage_rotation_rad: float = 0.0
+    tempering: float = 1.0
 
     @property
     def norm_px(self) -> float:

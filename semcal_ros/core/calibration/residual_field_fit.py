@@ -22,6 +22,7 @@ one: it leaves out magnifications, or views where there are few magnifications.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +42,7 @@ from semcal_ros.core.calibration.normal_equations import (
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
+from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = [
     "FieldChoice",
@@ -54,9 +56,9 @@ __all__ = [
 ]
 
 
-# Standard deviations of a coefficient that are tried, px: from less than the noise to a camera
-# lens.
-_STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
+# Standard deviations of a coefficient that are tried, px in a picture of the reference width: from less than the noise
+# to a camera lens. Distortion grows with the picture.
+_STRENGTHS_PX, _REFERENCE_WIDTH_PX = (0.05, 0.3, 2.0, 12.0), 512
 # A prior this narrow holds the field at zero; the same equations then serve without a field.
 _NO_STRENGTH_PX = 1e-7
 # Ratio of the coefficients to their second differences: fields are smooth.
@@ -66,13 +68,17 @@ _STEADINESS = 3.0
 # Prior standard deviation of the part of the field that the rest of the model describes, px.
 _OVERLAP_PX = 1e-4
 # The field is taken to change slowly with the magnification: as a parabola in log g at most.
-_MAX_COEFFICIENTS_IN_G = 3
+_MAX_COEFFICIENTS_IN_G = 5
 # Fewer magnifications do not predict one that is left out.
 _ENOUGH_MAGNIFICATIONS = 4
 # Bounds the time: every fold is solved once for each strength.
 _MAX_FOLDS = 6
+# Ridges that are tried in turn, relative to the diagonal: what elimination by subtraction loses.
+_RIDGES = (0.0, 1e-12, 1e-10, 1e-8)
 # Least gain of a worthwhile field, in held-out half chi-squares and in standard errors.
 _LEAST_GAIN, _CLEARLY = 6.0, 2.5
+# Part of the members that must gain: what is in a few of them only is no distortion of the microscope.
+_MOST_MEMBERS = 2.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,7 @@ class FieldSystem:
     theta_mean, theta_precision
         (K,) prior of theta.
     excess
-        Half chi-squares of the residuals beyond those that the corners' own noise explains.
+        (N,) half chi-squares of the residuals beyond those that the corners' own noise explains.
     """
 
     information: Array
@@ -106,7 +112,7 @@ class FieldSystem:
     weights: Array
     theta_mean: Array
     theta_precision: Array
-    excess: float
+    excess: Array
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
         """Assemble the normal equations of theta and the field, which has precision ``prior``."""
@@ -136,15 +142,13 @@ class FieldSystem:
         """Solve for theta followed by the coefficients of the field, from members in ``keep``."""
         matrix, right = self.assembled(keep, prior)
         scaled, scale = equilibrate(matrix)
-        factor = cho_factor(scaled, check_finite=False)
-        return scale * cho_solve(factor, scale * right)
+        return scale * cho_solve(_cholesky(scaled), scale * right)
 
     def covariance(self, prior: Array) -> Array:
         """Return the covariance of the result of :meth:`solve` from all members."""
         matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
         scaled, scale = equilibrate(matrix)
-        factor = cho_factor(scaled, check_finite=False)
-        inverse = cho_solve(factor, np.eye(len(scale)))
+        inverse = cho_solve(_cholesky(scaled), np.eye(len(scale)))
         return 0.5 * (inverse + inverse.T) * np.outer(scale, scale)
 
     def costs(self, solution: Array) -> Array:
@@ -154,6 +158,21 @@ class FieldSystem:
         z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
         bent = (self.information @ z[:, :, None])[:, :, 0]
         return np.sum((0.5 * bent - self.right) * z, axis=1)
+
+
+def _cholesky(scaled: Array) -> tuple[Array, bool]:
+    """Factor a matrix with ones on its diagonal, which rounding may have taken out of the positive definite ones."""
+    for ridge in _RIDGES:
+        with suppress(np.linalg.LinAlgError):
+            factor: tuple[Array, bool] = cho_factor(
+                scaled + ridge * np.eye(len(scaled)), check_finite=False
+            )
+            return factor
+    raise UnusableCalibrationError(
+        "equations of the residual field that rounding has made unsolvable",
+        expected="views that determine the camera",
+        do="record more views, or calibrate with --residual off",
+    )
 
 
 @dataclass(frozen=True)
@@ -169,7 +188,7 @@ class FieldChoice:
     worthwhile
         Whether the gain is significant.
     explained
-        Part of the misfit that the field explains; infinite where there is no misfit.
+        Part of the misfit of the members that are left out which the field predicts; infinite where there is none.
     prior
         Prior precision of the coefficients.
     """
@@ -216,6 +235,7 @@ def field_system(
     the image.
     """
     variance = variance_factor(problem, result)
+    own_variance = np.concatenate([v.own_variance_share for v in setup.views])
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
     whitened = whitened_rows(scaled, result.state)
     size = field.slice_size
@@ -260,8 +280,12 @@ def field_system(
     group = problem.group if scaled.effects is None else scaled.effects.visit_group
     z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[group]
     right += np.einsum("vpq,vq->vp", information, z)
+    excess = np.add.reduceat(
+        result.huber_weight * (1.0 - own_variance / variance), problem.starts[:-1]
+    )
     if not few:
         count = len(setup.magnifications)
+        excess = sum_by(problem.group, count, excess)
         information, right = (sum_by(group, count, a) for a in (information, right))
         group = np.arange(count, dtype=np.intp)
     return FieldSystem(
@@ -272,7 +296,7 @@ def field_system(
         weights,
         problem.prior_mean,
         problem.prior_sigma**-2.0,
-        float(np.sum(result.huber_weight)) * (1.0 - 1.0 / variance),
+        excess,
     )
 
 
@@ -357,17 +381,22 @@ def choose_field(
         return np.concatenate(costs)
 
     without = held_out(_NO_STRENGTH_PX)
-    gains = {s: without - held_out(s) for s in _STRENGTHS_PX}
+    relative = setup.image_size[0] / _REFERENCE_WIDTH_PX
+    gains = {s: without - held_out(s) for s in (relative * s for s in _STRENGTHS_PX)}
     best = max(gains, key=lambda s: float(gains[s].sum()))
     gain = float(gains[best].sum())
-    sigma = float(np.std(gains[best]) * np.sqrt(len(without)))
+    # A misfit d, whitened, that the field removes from residuals r of unit variance gains r d - d^2 / 2 in each of
+    # them: d^2 / 2 on average, with the variance d^2.
+    sigma = float(np.sqrt(2.0 * max(gain, 0.0)))
+    most = np.mean(gains[best] > 0.0) >= _MOST_MEMBERS
     prior = _prior(blank, best, setup.norm_px)
+    excess = float(np.sum(system.excess[np.any(folds, axis=0)]))
     return FieldChoice(
         strength_px=best,
         gain=gain,
         gain_sigma=sigma,
-        worthwhile=gain > max(_LEAST_GAIN, _CLEARLY * sigma),
-        explained=gain / system.excess if system.excess > 0.0 else np.inf,
+        worthwhile=bool(most and gain > max(_LEAST_GAIN, _CLEARLY * sigma)),
+        explained=gain / excess if excess > 0.0 else np.inf,
         prior=prior,
     )
 

@@ -84,7 +84,8 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
     number = np.zeros(len(groups), dtype=int)
     number[visit] = [v.visit for v in setup.views]
     order = np.argsort(number)
-    if len(order) < 2 or number.min() < 0:
+    # Photographs have no effects of visits.
+    if len(order) < 2 or number.min() < 0 or not setup.shared:
         return None
     effects = fit.adjustment.result.state.visits[:, 0]
     upward: dict[int, list[float]] = {}
@@ -137,7 +138,14 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
     adjustment = fit.adjustment
     for name, label, sigma in errors:
         (value,) = adjustment.problem.shared_values(adjustment.result.state.theta, [name])
-        if abs(value) > _SURPRISING * sigma:
+        if name == "stage_axis" and abs(value) > 0.5 * np.pi:
+            out.append(
+                Finding(
+                    f"scale: the tilt axis of the stage is {np.degrees(value):+.1f} degrees off from what the "
+                    "configuration says, so its tilts have the wrong sign: add 180 to stage.tilt_axis_deg"
+                )
+            )
+        elif abs(value) > _SURPRISING * sigma:
             out.append(
                 Finding(
                     f"scale: the {label} of the stage is {np.degrees(value):+.1f} degrees off from what "

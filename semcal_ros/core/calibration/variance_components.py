@@ -34,7 +34,13 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.priors import Priors, Setup
 
-__all__ = ["Spread", "VarianceComponents", "initial_components", "update_components"]
+__all__ = [
+    "Spread",
+    "VarianceComponents",
+    "initial_components",
+    "limit_components",
+    "update_components",
+]
 
 # Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
 # mount, less than tilts that are set on purpose.
@@ -133,7 +139,34 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
 
     Views without tilt have a spread of heights of their own: tilting moves the specimen, while
     views from above may all share one height.
+
+    As long as the corners are believed less than stated (``setup.tempering``), what they show besides is no more than
+    usual: it would be the distortion that the model does not have yet.
     """
+    found = _updated_components(setup, problem, result)
+    return found if setup.tempering == 1.0 else limit_components(setup, found)
+
+
+def limit_components(setup: Setup, found: VarianceComponents) -> VarianceComponents:
+    """Return spreads that are at most the usual ones, but for the heights."""
+    usual = initial_components(setup)
+
+    def least(a: Spread, b: Spread) -> Spread:
+        return a if a.sigma <= b.sigma else b
+
+    lattice = found.lattice_sigma
+    if lattice is not None and usual.lattice_sigma is not None:
+        lattice = np.minimum(lattice, usual.lattice_sigma)
+    return replace(
+        found,
+        scale=least(found.scale, usual.scale),
+        visit_height=least(found.visit_height, usual.visit_height),
+        drift_sigma_px=np.minimum(found.drift_sigma_px, usual.drift_sigma_px),
+        lattice_sigma=lattice,
+    )
+
+
+def _updated_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
     priors = setup.priors
     flat: Mask = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
     if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:

@@ -77,6 +77,8 @@ class GridView:
         What the stage said about this view, or None.
     untilted
         Whether the specimen is known not to be tilted.
+    excess_px
+        Part of the sigmas that :meth:`add_excess_noise` has added, px per axis.
     """
 
     magnification: float
@@ -89,6 +91,7 @@ class GridView:
     square_m: float = 0.0
     stage: StageReading | None = None
     untilted: bool = False
+    excess_px: float = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.board_xy_m)
@@ -127,7 +130,17 @@ class GridView:
         spread = self.covariance_px2
         if spread is not None:
             spread = spread + sigma_px**2 * np.eye(2)
-        return replace(self, sigma_px=np.hypot(self.sigma_px, sigma_px), covariance_px2=spread)
+        return replace(
+            self,
+            sigma_px=np.hypot(self.sigma_px, sigma_px),
+            covariance_px2=spread,
+            excess_px=float(np.hypot(self.excess_px, sigma_px)),
+        )
+
+    @property
+    def own_variance_share(self) -> Array:
+        """(n,) part of the variance of the observations that is not excess noise."""
+        return 1.0 - (self.excess_px / self.sigma_px) ** 2
 
     def chosen(self, keep: NDArray[Any]) -> GridView:
         """Return the view with some of its corners, by index or mask."""

@@ -51,7 +51,22 @@ __all__ = ["FieldSlice", "ResidualField", "zero_field"]
 _DEGREE = 3
 # Knots in half image widths; the outermost ones lie outside the image, so that its border is
 # inside the domain.
-_BREAKS_X = (-1.04, -0.97, -0.9, -0.8, -0.65, -0.45, -0.22, 0.0, 0.25, 0.5, 0.75, 1.04)
+_BREAKS_X = (
+    -1.04,
+    -1.0,
+    -0.97,
+    -0.935,
+    -0.9,
+    -0.8,
+    -0.65,
+    -0.45,
+    -0.22,
+    0.0,
+    0.25,
+    0.5,
+    0.75,
+    1.04,
+)
 # Knots in half image heights.
 _BREAKS_Y = (-1.04, -0.5, 0.0, 0.5, 1.04)
 # Newton's method needs a few steps; a point that needs more has no raw position.

@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.bundle_adjustment import BundleStatus, refine
+from semcal_ros.core.calibration.bundle_adjustment import refine
 from semcal_ros.core.calibration.normal_equations import State, make_problem, residuals
 from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
@@ -168,13 +168,18 @@ def test_fixed_theta_moves_only_the_poses(poses):
     np.testing.assert_array_equal(result.state.theta, theta)
 
 
-def test_a_start_without_projection_says_so(poses):
+def test_views_that_cannot_be_seen_are_no_result_and_do_not_spoil_the_others(poses):
     problem = _problem(0.05)
-    far = poses.translations_m + np.array([0.0, 0.0, -1.0])
+    far = poses.translations_m.copy()
+    far[0, 2] = -1.0
     result = refine(problem, State(np.ones(20), poses.rotations, far))
     assert not result.converged
-    assert result.status is BundleStatus.NO_PROJECTION
-    assert result.cost == np.inf
+    assert set(problem.view_of_point[result.lost]) == {0}
+    others = refine(problem, State(np.ones(20), poses.rotations, poses.translations_m))
+    assert np.all(np.isfinite(result.covariance))
+    sigma = np.sqrt(np.diag(result.covariance))
+    # The same but for the corners of one view of many.
+    assert np.all(np.abs(result.state.theta - others.state.theta) < 3.0 * sigma)
 
 
 def test_views_are_checked():

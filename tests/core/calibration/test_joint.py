@@ -22,11 +22,18 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import solve_scaled
+from semcal_ros.core.calibration import joint as joint_module
 from semcal_ros.core.calibration.bundle_adjustment import refine
-from semcal_ros.core.calibration.joint import JointFit, fit_joint
-from semcal_ros.core.calibration.normal_equations import reduced_normal_equations
+from semcal_ros.core.calibration.joint import JointFit, fit_joint, measure_misfit_px
+from semcal_ros.core.calibration.normal_equations import reduced_normal_equations, residuals
 from semcal_ros.core.calibration.priors import Priors, Setup
-from semcal_ros.core.calibration.problem import build_problem, stack_coefficients, variance_factor
+from semcal_ros.core.calibration.problem import (
+    build_problem,
+    mirror,
+    restart_poses,
+    stack_coefficients,
+    variance_factor,
+)
 from semcal_ros.core.camera.calibration_model import design_matrix
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -92,3 +99,49 @@ def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
     rest = fit.covariance[:size, :size] - fit.parts.corners - fit.parts.visits
     for part in (fit.parts.corners, fit.parts.visits, rest):
         assert np.all(np.einsum("gk,kl,gl->g", rows, part, rows) > 0.0)
+
+
+def test_what_is_mirrored_in_the_reference_plane_is_seen_at_the_same_places_and_turned_over(
+    setup: Setup, fit: JointFit
+) -> None:
+    own = fit.adjustment
+    flipped = mirror(own.functions, own.problem, own.result.state)
+    np.testing.assert_allclose(
+        residuals(own.problem, flipped), own.result.residuals_px, rtol=0.0, atol=1e-9
+    )
+    wrong = refine(own.problem, flipped)
+    right = joint_module._right_way_up(setup, own.functions, own.problem, wrong)
+    assert right.cost < wrong.cost
+    # The sixth of the functions is constant.
+    rho = sum(own.functions[name].size for name in list(own.functions)[:5])
+    assert wrong.state.theta[rho] < 0.0 < right.state.theta[rho]
+
+
+def test_a_pose_in_an_optimum_of_its_own_is_found_again(setup: Setup, fit: JointFit) -> None:
+    own = fit.adjustment
+    rotations = own.result.state.rotations.copy()
+    # A quarter turn about the normal: no tilt brings it back.
+    rotations[3] = rotations[3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    lost = replace(own.result.state, rotations=rotations)
+    found, changed = restart_poses(setup, own.problem, lost)
+    assert changed >= 1
+    np.testing.assert_allclose(found.rotations[3], own.result.state.rotations[3], atol=1e-3)
+
+
+def test_the_misfit_of_a_start_is_the_distortion_that_a_plane_does_not_explain() -> None:
+    """Less than the noise of the corners without any; 3 px of distortion leave the part that is no projection."""
+    sizes = {}
+    for name in ("no_distortion", "jsm820"):
+        microscope = preset(name)
+        views = grid_views(microscope.camera_at, MAGNIFICATIONS, noise_px=0.05, views=3, seed=1)
+        sizes[name] = measure_misfit_px(
+            Setup(
+                tuple(views),
+                np.array(MAGNIFICATIONS),
+                microscope.image_size,
+                microscope.display_width_m,
+                Priors(),
+            )
+        )
+    assert sizes["no_distortion"] < 0.05
+    assert 0.1 < sizes["jsm820"] < 3.0

@@ -1,0 +1,35 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Microscopes that nobody drew: some of the fleet of `benchmarks.calibration.fleet`, which tells what the rest does."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.calibration.fleet.score import judge
+from tests.helpers.long_tests import long_but
+
+# What each of them did before the fit started from corners that are as uncertain as the model: 4, 11 and 18 have strong
+# spirals, coils or settling, or a pivot 4 mm away; 5 ended with the pivot on the wrong side, 3 left out sound views.
+CASES = long_but(lambda index: index == 4, (3, 4, 5, 10, 11, 13, 18))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", CASES)
+def test_a_random_microscope_is_calibrated_within_what_is_stated(index: int) -> None:
+    outcome, trace = judge(1, index)
+    assert (outcome.raised, outcome.numpy_warnings) == ("", ()), trace
+    assert outcome.verdict == "fine"
+    assert outcome.views_left_out == 0
