@@ -105,6 +105,8 @@ _PARAMETERS = (
     ),
     *ACQUISITION,
 )
+# States of an acquisition that has ended, and how long its thread may take after it has said so.
+_ENDED, _LAST_WORD_S = ("stopped", "failed", "done"), 1.0
 _GOAL = ("lowest_magnification", "highest_magnification", "target")
 # Stamps that are behind by more are of another clock, or of so slow a scan that one follows the other.
 _OTHER_CLOCK_NS = 30 * 10**9
@@ -484,6 +486,10 @@ class CalibrationServer(StreamNode):
     def acquire(self) -> str:
         """Begin an acquisition, or go on with one; return what was begun, in words."""
         self._refuse_rivals()
+        ending = not self._acquisition_wanted and self.acquisition_progress.state in _ENDED
+        if self._acquiring is not None and ending:
+            # It has said how it ended, and whoever heard that may call at once.
+            self._acquiring.join(_LAST_WORD_S)
         with self._lock:
             if self.acquiring:
                 raise CalibrationError("an acquisition is running", do="call ~/cancel to end it")
