@@ -44,9 +44,6 @@ from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-# Shared unknowns that change their sign when everything is mirrored in the reference plane.
-_ODD = ("grid_curvature_m", "axis_z_m")
-
 __all__ = [
     "Functions",
     "adjust",
@@ -65,6 +62,8 @@ __all__ = [
 
 Functions = Mapping[str, ContinuousFunction]
 
+# Shared unknowns that change their sign when everything is mirrored in the reference plane.
+_ODD = ("grid_curvature_m", "axis_z_m")
 # Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
 # no view turns.
 _MAX_TURNS = 5
