@@ -21,6 +21,7 @@ import binascii
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import lru_cache
 from importlib import resources
@@ -364,10 +365,14 @@ def _check_covariance(matrix: Array) -> None:
     unit[unit == 0.0] = 1.0
     with np.errstate(over="ignore"):
         correlation = matrix / unit[:, None] / unit
-    least = -np.inf
+    least, lowest = -np.inf, _NEGATIVE_CORRELATION * len(matrix)
     if np.all(np.abs(correlation) < 2.0):
+        # With a residual field of a thousand coefficients the eigenvalues themselves would take seconds.
+        with suppress(np.linalg.LinAlgError):
+            np.linalg.cholesky(correlation + lowest * np.eye(len(matrix)))
+            return
         least = float(np.linalg.eigvalsh(correlation)[0])
-    if least < -_NEGATIVE_CORRELATION * len(matrix):
+    if least < -lowest:
         raise InvalidValueError(
             f"a covariance whose correlations have the eigenvalue {least:.2g}",
             expected="no negative eigenvalue",
