@@ -179,7 +179,9 @@ def measure(plan: Plan, received: Received, cal: Calibration) -> dict[str, list[
     rows: dict[str, list[float]] = {topic: [] for topic in STAGES}
     for g in plan.replayed:
         stamps = stamps_at(plan, g, received)
-        first = next(s for s in stamps if s in received.images["image_rect"])
+        first = next((s for s in stamps if s in received.images["image_rect"]), None)
+        if first is None:
+            sys.exit(f"no frame at {g}x came through all nodes: free the computer and run it again")
         found = find_lattice(received.images["image_rect"][first])
         assert not isinstance(found, Rejection), found.reason
         view = GridView(

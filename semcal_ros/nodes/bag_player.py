@@ -167,7 +167,8 @@ class BagPlayer(SemNode):
         self._publishers_by_topic = self._make_publishers(self._choose_topics())
         self._frames = self._find_frames()
         self._wanted = self._wanted_subscribers()
-        self._undiscovered = bool(self._wanted)
+        # Latched topics whose subscribers may not have discovered this node yet.
+        self._undiscovered = set(self._latched) if self._wanted else set()
         # Of topics of other nodes, by name.
         self._reported: dict[str, int] = {}
         self._clock_publisher = (
@@ -485,13 +486,14 @@ class BagPlayer(SemNode):
             if not self._ended:
                 self._changed.wait(seconds)
 
-    def _wait_for_discovery(self, publisher: Any, position_ns: int) -> None:
-        """Wait until the subscribers have discovered this node: that it knows them does not prove it.
+    def _wait_for_discovery(self, topic: str, position_ns: int) -> None:
+        """Wait until the subscribers of a latched topic have discovered this node: that it knows them does not prove it.
 
-        A latched message reaches them however late they discover it, and only then do they acknowledge it.
+        A latched message reaches them however late they discover it, and only then do they acknowledge it. One topic
+        says nothing of another, which may have no subscriber at all.
         """
-        self._undiscovered = False
-        publisher.wait_for_all_acked(Duration(seconds=_DISCOVERY_S))
+        self._undiscovered.remove(topic)
+        self._publishers_by_topic[topic].wait_for_all_acked(Duration(seconds=_DISCOVERY_S))
         with self._changed:
             self._pacer.seek(position_ns)
 
@@ -532,8 +534,8 @@ class BagPlayer(SemNode):
         publisher = self._publishers_by_topic[message.topic]
         publisher.publish(bytes(message.data))
         self.reporter.count_published(None)
-        if self._undiscovered and message.topic in self._latched:
-            self._wait_for_discovery(publisher, message.log_time_ns)
+        if message.topic in self._undiscovered:
+            self._wait_for_discovery(message.topic, message.log_time_ns)
 
     def _count_frame(self, position_ns: int) -> None:
         with self._changed:
