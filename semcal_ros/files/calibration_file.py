@@ -34,7 +34,7 @@ import yaml
 
 from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel, ScaleSigma
+from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -54,8 +54,8 @@ __all__ = [
 
 
 # What is written. Version 1 has no provenance; a file with a number that is not listed is refused.
-FILE_VERSION = 2
-_READ_VERSIONS = (1, FILE_VERSION)
+FILE_VERSION = 3
+_READ_VERSIONS = (1, 2, FILE_VERSION)
 _FORMAT = "semcal-calibration"
 # Characters of a reason: it may repeat a value from the file, which can have any length.
 _MAX_REASON = 400
@@ -123,7 +123,9 @@ def format_calibration(model: CalibrationModel) -> str:
         "image_height_px": int(model.image_height),
         "display_width_m": float(model.display_width_m),
         "magnifications": [float(g) for g in model.magnifications],
-        "functions": {name: _write_function(model.functions[name]) for name in FUNCTION_NAMES},
+        "functions": {
+            name: _write_function(model.functions[name]) for name in names_of(model.functions)
+        },
         "statistics": _to_plain(model.statistics),
         "covariance": {
             "size": size,
@@ -224,7 +226,9 @@ def _read_fields(data: Mapping[str, Any]) -> dict[str, Any]:
         )
     width, *magnifications = _check_finite([data["display_width_m"], *data["magnifications"]])
     return {
-        "functions": {name: _read_function(data["functions"][name]) for name in FUNCTION_NAMES},
+        "functions": {
+            name: _read_function(data["functions"][name]) for name in names_of(data["functions"])
+        },
         "covariance": covariance,
         # The schema counts 512.0 as an integer.
         "image_width": int(data["image_width_px"]),

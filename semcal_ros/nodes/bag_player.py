@@ -487,10 +487,10 @@ class BagPlayer(SemNode):
                 self._changed.wait(seconds)
 
     def _wait_for_discovery(self, topic: str, position_ns: int) -> None:
-        """Wait until the subscribers of a latched topic have discovered this node: that it knows them does not prove it.
+        """Wait until the subscribers of a latched topic have discovered this node.
 
-        A latched message reaches them however late they discover it, and only then do they acknowledge it. One topic
-        says nothing of another, which may have no subscriber at all.
+        That it knows them does not prove it. A latched message reaches them however late they discover it, and only
+        then do they acknowledge it. One topic says nothing of another, which may have no subscriber at all.
         """
         self._undiscovered.remove(topic)
         self._publishers_by_topic[topic].wait_for_all_acked(Duration(seconds=_DISCOVERY_S))

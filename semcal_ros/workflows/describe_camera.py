@@ -22,7 +22,6 @@ import numpy as np
 
 from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import RectifiedCamera, ScanCamera
 
 __all__ = ["describe_camera", "parameter_sigma"]
@@ -33,7 +32,7 @@ def parameter_sigma(camera: ScanCamera) -> dict[str, float]:
     assert camera.covariance is not None
     # Rounding may make the variance of an exactly known parameter negative.
     sigma = np.sqrt(np.maximum(np.diag(camera.covariance), 0.0))
-    return dict(zip(PARAMETER_NAMES, sigma.tolist(), strict=True))
+    return dict(zip(camera.names, sigma.tolist(), strict=True))
 
 
 def describe_camera(calibration: Calibration, magnification: float) -> dict[str, Any]:
@@ -61,7 +60,7 @@ def describe_camera(calibration: Calibration, magnification: float) -> dict[str,
         "rectified": _describe_rectified(camera.rectified),
         "distortion": {"xi_r": camera.xi_r, "xi_t": camera.xi_t, "norm_px": camera.norm_px},
         "distortion_centre_px": [camera.ex, camera.ey],
-        "parameters": dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True)),
+        "parameters": dict(zip(camera.names, camera.parameters.tolist(), strict=True)),
         "parameter_sigma": parameter_sigma(camera),
         "projection_sigma_px": continuous_value("sigma", camera),
     }

@@ -28,7 +28,6 @@ import tifffile
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.pinhole_model import PinholeModel, fit_pinhole
 from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes, atomic_write_text
@@ -237,7 +236,7 @@ def _write_parameters(
     columns += [
         f"{prefix}nm_per_px_{axis}" for axis in ("x", "y", "rectified") for prefix in ("", "sigma_")
     ]
-    for name in PARAMETER_NAMES:
+    for name in calibration.at(calibration.magnification_range[0]).names:
         full = {"m": "scale"}.get(name, name) + _UNITS.get(name, "")
         columns += [full, f"sigma_{full}"]
     rows = []
@@ -248,7 +247,7 @@ def _write_parameters(
         sizes.append((camera.rectified.pixel_size_m[0], max(camera.rectified.pixel_size_sigma_m)))
         row += [1e9 * float(value) for pair in sizes for value in pair]
         sigma = parameter_sigma(camera)
-        for name, value in zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True):
+        for name, value in zip(camera.names, camera.parameters.tolist(), strict=True):
             row += [value, sigma[name]]
         rows.append(row)
     write_table(file, columns, rows)

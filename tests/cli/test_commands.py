@@ -221,7 +221,7 @@ def test_bad_input_is_one_line_and_status_2(folder, tmp_path, capsys):
     assert "missing" in refused(capsys, "rectify", folder / "grid").lower()
     assert "not valid YAML" in refused(capsys, "at", _file(tmp_path / "a.yaml", "a: [1"), 100)
     assert "not a calibration" in refused(capsys, "at", _file(tmp_path / "b.yaml", "a: 1"), 100)
-    newer = cal.read_text().replace("\nversion: 2\n", "\nversion: 999\n")
+    newer = cal.read_text().replace("\nversion: 3\n", "\nversion: 999\n")
     assert "update" in refused(capsys, "at", _file(tmp_path / "n.yaml", newer), 100)
     assert "folder" in refused(
         capsys, "calibrate", folder / "grid", "-o", tmp_path / "x" / "c.yaml"

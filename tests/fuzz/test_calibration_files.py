@@ -133,8 +133,8 @@ _PLAIN = _texts()[0]
 
 @fuzz()
 @given(text=edited_text(_texts(), YAML_PIECES))
-@example(text=changed(_PLAIN, "version: 2\n", f"version: {'9' * 3000}\n"))
-@example(text=changed(_PLAIN, "version: 2\n", f"version: '{'9' * 5000}'\n"))
+@example(text=changed(_PLAIN, "version: 3\n", f"version: {'9' * 3000}\n"))
+@example(text=changed(_PLAIN, "version: 3\n", f"version: '{'9' * 5000}'\n"))
 @example(text=changed(_PLAIN, "display_width_m: 0.12", "display_width_m: .inf"))
 @example(text=changed(_PLAIN, "display_width_m: 0.12", "display_width_m: 1" + "0" * 400))
 @example(text=changed(_PLAIN, "image_width_px: 512", "image_width_px: 512.0"))

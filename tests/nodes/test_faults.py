@@ -179,7 +179,7 @@ def test_a_corrupt_calibration_on_the_topic_leaves_the_old_one_in_force(bench: B
     text = bench.peer.node.create_publisher(String, "calibration", LATCHED)
     text.publish(String(data=CALIBRATION.dumps()[:400]))
     bench.wait_rejected(1, "calibration")
-    newer = CALIBRATION.dumps().replace("\nversion: 2\n", "\nversion: 999\n")
+    newer = CALIBRATION.dumps().replace("\nversion: 3\n", "\nversion: 999\n")
     assert newer != CALIBRATION.dumps()
     text.publish(String(data=newer))
     bench.wait_rejected(2, "999")

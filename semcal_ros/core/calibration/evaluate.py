@@ -31,6 +31,7 @@ from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.normal_equations import State, make_problem
 from semcal_ros.core.calibration.priors import HELD_SIGMA
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
+from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
@@ -130,14 +131,16 @@ def compare_scales(
     """
     magnifications, cameras, corrected = _without_fields(views, camera_at)
     count = len(magnifications)
-    designs = np.zeros((count, 10, 1 + count))
-    designs[:, :, 0] = np.stack([c.parameters for c in cameras])
+    known = np.stack([c.all_parameters for c in cameras])
+    designs = np.zeros((*known.shape, 1 + count))
+    designs[:, :, 0] = known
     designs[np.arange(count), 0, 1 + np.arange(count)] = [c.m for c in cameras]
     problem = make_problem(
         corrected,
         magnifications,
         designs,
-        norm_px=cameras[0].norm_px,
+        parameters=ALL_NAMES,
+        raster=cameras[0].raster,
         nominal_px_per_m=np.array([c.m for c in cameras]),
         prior_mean=np.append(1.0, np.zeros(count)),
         prior_sigma=np.append(HELD_SIGMA, np.full(count, _FREE_SCALE)),
@@ -185,8 +188,9 @@ def fit_poses(
     problem = make_problem(
         corrected,
         magnifications,
-        np.stack([c.parameters for c in cameras])[:, :, None],
-        norm_px=cameras[0].norm_px,
+        np.stack([c.all_parameters for c in cameras])[:, :, None],
+        parameters=ALL_NAMES,
+        raster=cameras[0].raster,
         nominal_px_per_m=np.array([c.m for c in cameras]),
         prior_mean=np.ones(1),
         prior_sigma=np.ones(1),

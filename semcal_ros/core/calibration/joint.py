@@ -70,7 +70,7 @@ from semcal_ros.core.calibration.variance_components import (
     update_components,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
+from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.plane_geometry import fit_homography
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -243,8 +243,14 @@ def refit_functions(
 ) -> dict[str, ContinuousFunction]:
     """Fit functions of other kinds and sizes to the values of the given ones, by least squares."""
     out: dict[str, ContinuousFunction] = {}
-    for name, function in functions.items():
-        kind, size = sizes.get(name, (function.kind, function.smooth_size))
+    none = replace(functions["scale"], coefficients=np.zeros(1), breaks=np.zeros(0))
+    for name in ALL_FUNCTIONS:
+        function = functions.get(name, none)
+        kind, size = sizes.get(
+            name, (function.kind, function.smooth_size if name in functions else 0)
+        )
+        if size == 0:
+            continue
         zeros = np.zeros(size + len(function.breaks))
         blank = ContinuousFunction(kind, zeros, function.g_range, breaks=function.breaks)
         grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
@@ -502,7 +508,7 @@ def _left_out(chosen: Functions, padded: Functions) -> Indices:
     """Indices of the coefficients that the padded functions have and the chosen ones have not."""
     out: list[int] = []
     start = 0
-    for name in FUNCTION_NAMES:
+    for name in names_of(padded):
         own, whole = chosen[name], padded[name]
         out += range(start + own.smooth_size, start + whole.smooth_size)
         start += whole.size
@@ -536,10 +542,13 @@ def _select_and_adjust(
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
     result = _refine_coarsely(problem, state)
-    converged, rounds = len(setup.magnifications) < 3, 0
+    converged, rounds = False, 0
+    terms = () if setup.priors.is_wide else TERM_NAMES
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
-        chosen = select_functions(Summary.of(problem, result), setup, functions, _SMOOTH, sizes)
+        every = build_problem(setup, functions, setup.views, spread, candidates=ALL_FUNCTIONS)
+        summary = Summary.of(every, refine(every, result.state, max_iterations=0))
+        chosen = select_functions(summary, setup, functions, _SMOOTH, terms, sizes)
         converged = chosen == sizes
         if converged:
             break
@@ -642,7 +651,12 @@ def _add_field(
 
 def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
     own = adjustment.functions
-    return {name: (own[name].kind, own[name].smooth_size) for name in _SMOOTH}
+    none = dict.fromkeys(TERM_NAMES, ("chebyshev_log", 0))
+    return none | {
+        name: (own[name].kind, own[name].smooth_size)
+        for name in names_of(own)
+        if name in _SMOOTH or name in TERM_NAMES
+    }
 
 
 def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:

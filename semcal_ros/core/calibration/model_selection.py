@@ -14,7 +14,7 @@
 
 """Selection of the number of coefficients of each continuous function.
 
-An adjustment leaves one 10 x 10 information matrix per magnification (poses eliminated), and a
+An adjustment leaves one information matrix per magnification (poses eliminated), and a
 candidate set of functions is fitted to these alone. A candidate is judged by
 leave-one-magnification-out cross-validation on these summaries: fitted to all magnifications but
 one, how much worse does it explain the images of that one? The two outermost magnifications are
@@ -34,7 +34,7 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor, with_shared
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
+from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
 __all__ = ["Summary", "select_functions"]
@@ -47,6 +47,11 @@ _MAX_SIZE = 8
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0
+# That of a term that is not there yet: by chance in one of 70 terms that are not needed, as the chance of a chi-square
+# of one degree of freedom above 6.
+_GAIN_OF_TERM = 3.0
+# Most coefficients of a term that a calibration need not have: these change slowly.
+_MAX_TERM_SIZE = 4
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
 _CLEARLY = 2.0
 
@@ -62,7 +67,7 @@ class Summary:
         magnification i is ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of
         the noise variance.
     shared_mean, shared_precision
-        (C - 10,) prior of the shared unknowns.
+        (C - 19,) prior of the shared unknowns.
     """
 
     information: Array
@@ -102,10 +107,11 @@ class _Candidates:
         magnifications = [float(g) for g in setup.magnifications]
         blocks: list[Array] = []
         rows: list[int] = []
-        for row, name in enumerate(FUNCTION_NAMES):
-            most = max(_MAX_SIZE, base[name].smooth_size)
+        for row, name in enumerate(ALL_FUNCTIONS):
+            most = _MAX_TERM_SIZE if name in TERM_NAMES else _MAX_SIZE
+            most = max(most, base[name].smooth_size if name in base else 0)
             for kind in _POLYNOMIALS:
-                blank = ContinuousFunction(kind, np.zeros(most), base[name].g_range)
+                blank = ContinuousFunction(kind, np.zeros(most), base["scale"].g_range)
                 self.columns[name, kind] = np.arange(len(rows), len(rows) + most)
                 blocks.append(np.stack([blank.basis(g) for g in magnifications]))
                 rows += [row] * most
@@ -120,7 +126,7 @@ class _Candidates:
         # The scale is the first of the functions.
         nominal = setup.nominal_px_per_m(setup.magnifications)
         values[:, np.array(rows) == 0] *= nominal[:, None]
-        designs = np.zeros((len(magnifications), len(FUNCTION_NAMES), len(rows)))
+        designs = np.zeros((len(magnifications), len(ALL_FUNCTIONS), len(rows)))
         designs[:, rows, np.arange(len(rows))] = values
         designs = with_shared(designs, shared)
         transposed = np.swapaxes(designs, 1, 2)
@@ -128,6 +134,8 @@ class _Candidates:
         self.rights = (transposed @ summary.right[:, :, None])[:, :, 0]
 
     def _prior(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
+        if size == 0:
+            return np.zeros(0), np.zeros(0)
         key = (name, kind, size)
         if key not in self.priors:
             mean, sigma = self.setup.coefficient_priors(name, kind, size)
@@ -136,18 +144,18 @@ class _Candidates:
 
     def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
         """Return the cost of predicting inner magnifications and of fitting the outermost ones."""
-        key = tuple(sizes[name] for name in FUNCTION_NAMES)
+        key = tuple(sizes[name] for name in ALL_FUNCTIONS)
         if key not in self.scores:
             self.scores[key] = self._score(sizes)
         return self.scores[key]
 
     def _score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
         chosen: list[Indices] = []
-        for name in FUNCTION_NAMES:
+        for name in ALL_FUNCTIONS:
             kind, size = sizes[name]
             chosen += [self.columns[name, kind][:size], self.jumps[name]]
         columns = np.concatenate([*chosen, self.shared])
-        priors = [self._prior(name, *sizes[name]) for name in FUNCTION_NAMES]
+        priors = [self._prior(name, *sizes[name]) for name in ALL_FUNCTIONS]
         mean, precision = (
             np.concatenate(parts) for parts in zip(*priors, self.shared_prior, strict=True)
         )
@@ -168,25 +176,32 @@ def select_functions(
     setup: Setup,
     functions: Mapping[str, ContinuousFunction],
     free: Sequence[str],
+    terms: Sequence[str],
     current: Mapping[str, tuple[str, int]] | None = None,
 ) -> dict[str, tuple[str, int]]:
-    """Choose (kind, size) of the functions named in ``free`` greedily.
+    """Choose (kind, size) of the functions named in ``free`` and ``terms`` greedily.
 
     Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the
     cross-validation gains more than :data:`_GAIN_PER_COEFFICIENT` for each, and removed where that
-    costs less. The ``current`` choice stays unless another one is clearly better.
+    costs less. One of ``terms`` may have none, and needs more of a gain for the first. The ``current``
+    choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions)
-    limit = min(_MAX_SIZE, len(setup.magnifications) - 1)
-    sizes = {name: (functions[name].kind, functions[name].smooth_size) for name in FUNCTION_NAMES}
+    most = len(setup.magnifications) - 1
+    limits = {name: min(_MAX_SIZE, most) for name in free}
+    limits |= {name: min(_MAX_TERM_SIZE, max(most, 1)) for name in terms}
+    sizes = dict.fromkeys(ALL_FUNCTIONS, ("chebyshev_log", 0))
+    sizes |= {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
+    sizes.update(dict.fromkeys(terms, ("chebyshev_log", 0)))
     while True:
         score = candidates.score(sizes)
         best: tuple[float, str, tuple[str, int]] | None = None
-        for name, option in _moves(sizes, free, limit):
-            change = option[1] - sizes[name][1]
+        for name, option in _moves(sizes, limits, terms):
             trial = candidates.score({**sizes, name: option})
-            gain = score - trial - _GAIN_PER_COEFFICIENT * change
+            gain = score - trial - _price(option[1]) + _price(sizes[name][1])
+            if name in free:
+                gain = score - trial - _GAIN_PER_COEFFICIENT * (option[1] - sizes[name][1])
             if gain > 1e-6 and (best is None or gain > best[0]):
                 best = (gain, name, option)
         if best is None:
@@ -194,21 +209,28 @@ def select_functions(
         sizes[best[1]] = best[2]
     if current is not None:
         kept = {**sizes, **current}
-        more = sum(kept[name][1] - sizes[name][1] for name in free)
-        if candidates.score(kept) + _GAIN_PER_COEFFICIENT * more < score + _CLEARLY:
+        more = sum(kept[name][1] - sizes[name][1] for name in free) * _GAIN_PER_COEFFICIENT
+        more += sum(_price(kept[name][1]) - _price(sizes[name][1]) for name in terms)
+        if candidates.score(kept) + more < score + _CLEARLY:
             sizes = kept
-    return {name: sizes[name] for name in free}
+    return {name: sizes[name] for name in (*free, *terms)}
+
+
+def _price(size: int) -> float:
+    """Return what a term of so many coefficients must gain."""
+    return 0.0 if size == 0 else _GAIN_OF_TERM + _GAIN_PER_COEFFICIENT * (size - 1)
 
 
 def _moves(
-    sizes: Mapping[str, tuple[str, int]], free: Sequence[str], limit: int
+    sizes: Mapping[str, tuple[str, int]], limits: Mapping[str, int], terms: Sequence[str]
 ) -> list[tuple[str, tuple[str, int]]]:
     moves = []
-    for name in free:
+    for name, limit in limits.items():
         kind, size = sizes[name]
-        for other in _POLYNOMIALS:
+        least = 0 if name in terms else 1
+        for other in _POLYNOMIALS[:1] if name in terms else _POLYNOMIALS:
             for change in (-1, 0, 1, 2):
                 option = (other, size + change)
-                if 1 <= option[1] <= limit and option != (kind, size):
+                if least <= option[1] <= limit and option != (kind, size):
                     moves.append((name, option))
     return moves

@@ -46,7 +46,13 @@ from semcal_ros.core.calibration.stage import (
 )
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
-from semcal_ros.core.camera.projection import project_points, project_points_with_jacobians
+from semcal_ros.core.camera.projection import (
+    ALL_NAMES,
+    PARAMETER_NAMES,
+    project_points,
+    project_points_with_jacobians,
+)
+from semcal_ros.core.camera.scan_distortion import Raster
 
 __all__ = [
     "GRID_NAMES",
@@ -127,7 +133,7 @@ class Effects:
 class Problem:
     """Observations and priors of one adjustment.
 
-    A magnification has C unknowns: the 10 parameters of its camera, then those in ``shared``.
+    A magnification has C unknowns: the ``parameters`` of its camera, then those in ``shared``.
 
     Attributes
     ----------
@@ -144,12 +150,14 @@ class Problem:
         (M, C, K): unknowns of each magnification per unit of theta.
     unit_m
         (V,) metres per pose unit (about one pixel), which keeps the equations well scaled.
-    norm_px
-        Normalisation of the distortion.
+    raster
+        Where the raster lies in the pictures.
     prior_mean, prior_sigma
         (K,) prior of theta; an infinite sigma stands for no prior.
     height_sigma_m
         (V,) prior 1-sigma of each view's height about the reference plane.
+    parameters
+        Names of the parameters of the camera that the designs give; the others are zero.
     shared
         Names of the unknowns that all views share: of the grid's shape (``GRID_NAMES`` and
         ``square_1``...), of the miss of the tilt axis (``MISS_NAMES``), and of the stage.
@@ -168,10 +176,11 @@ class Problem:
     group: Indices
     designs: Array
     unit_m: Array
-    norm_px: float
+    raster: Raster
     prior_mean: Array
     prior_sigma: Array
     height_sigma_m: Array
+    parameters: tuple[str, ...] = PARAMETER_NAMES
     shared: tuple[str, ...] = ()
     square_class: Indices | None = None
     effects: Effects | None = None
@@ -185,7 +194,7 @@ class Problem:
     @property
     def shared_columns(self) -> int:
         """Number C of the unknowns of a magnification: camera and shared ones."""
-        return 10 + len(self.shared)
+        return len(self.parameters) + len(self.shared)
 
     @property
     def visit_columns(self) -> int:
@@ -198,6 +207,24 @@ class Problem:
         if self.effects is None:
             return 6
         return 8 if self.effects.lattice_sigma is None else 10
+
+    @cached_property
+    def parameter_index(self) -> Indices:
+        """(P,) place of each of ``parameters`` among those of a camera."""
+        return np.array([ALL_NAMES.index(name) for name in self.parameters], dtype=np.intp)
+
+    def column(self, name: str) -> int:
+        """Return the column of a parameter of the camera, or of a shared unknown."""
+        return (*self.parameters, *self.shared).index(name)
+
+    def cameras(self, theta: Array) -> Array:
+        """Return the parameters of the cameras, (M, 10), or (M, 19) with others than those of every camera."""
+        own = self.designs[:, : len(self.parameters)] @ theta
+        if self.parameters == PARAMETER_NAMES:
+            return own
+        out = np.zeros((len(self.designs), len(ALL_NAMES)))
+        out[:, self.parameter_index] = own
+        return out
 
     def shared_values(self, theta: Array, names: Sequence[str]) -> Array:
         """Return the values of shared unknowns, zero for those that the problem does not have."""
@@ -236,11 +263,12 @@ def make_problem(
     magnifications: Array,
     designs: Array,
     *,
-    norm_px: float,
+    raster: Raster,
     nominal_px_per_m: Array,
     prior_mean: Array,
     prior_sigma: Array,
     height_sigma_m: Array | float,
+    parameters: tuple[str, ...] = PARAMETER_NAMES,
 ) -> Problem:
     """Arrange views for an adjustment; ``magnifications`` (M,) are the distinct ones, in order.
 
@@ -257,7 +285,8 @@ def make_problem(
         group=group,
         designs=designs,
         unit_m=1.0 / nominal_px_per_m[group],
-        norm_px=norm_px,
+        raster=raster,
+        parameters=parameters,
         prior_mean=prior_mean,
         prior_sigma=prior_sigma,
         height_sigma_m=np.broadcast_to(np.asarray(height_sigma_m, dtype=np.float64), len(views)),
@@ -274,11 +303,11 @@ def _shaped_grid(problem: Problem, state: State) -> Array:
         own = state.lattices[problem.view_of_point]
         stretch, shear = stretch + own[:, 0], shear + own[:, 1]
     size = np.zeros(len(x))
-    for k, column in _square_columns(problem):
+    for k, name in _square_names(problem):
         assert problem.square_class is not None
-        size += (problem.square_class == k)[problem.view_of_point] * state.theta[
-            column - 10 - len(problem.shared)
-        ]
+        size += (problem.square_class == k)[problem.view_of_point] * problem.shared_values(
+            state.theta, [name]
+        )
     grid = np.stack(
         [
             x * (1.0 + 0.5 * stretch) + shear * y,
@@ -290,11 +319,11 @@ def _shaped_grid(problem: Problem, state: State) -> Array:
     return grid * (1.0 + size[:, None])
 
 
-def _square_columns(problem: Problem) -> list[tuple[int, int]]:
-    """Return the class of each size of squares that has an unknown, and its column."""
+def _square_names(problem: Problem) -> list[tuple[int, str]]:
+    """Return the class of each size of squares that has an unknown, and the name of this."""
     return [
-        (int(name.removeprefix("square_")), 10 + k)
-        for k, name in enumerate(problem.shared)
+        (int(name.removeprefix("square_")), name)
+        for name in problem.shared
         if name.startswith("square_")
     ]
 
@@ -307,7 +336,7 @@ def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, A
         state.rotations, problem.starts[:-1], problem.starts[1:], strict=True
     ):
         np.matmul(grid[first:last], rotation.T, out=rotated[first:last])
-    cameras = (problem.designs[:, :10] @ state.theta)[problem.group]
+    cameras = problem.cameras(state.theta)[problem.group]
     if problem.effects is not None:
         cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
     return rotated, rotated + state.translations_m[view], cameras[view]
@@ -323,7 +352,7 @@ def _drift_shift(problem: Problem, state: State) -> Array | float:
 def residuals(problem: Problem, state: State) -> Array:
     """Return (N, 2) observed minus projected pixels; NaN where a point has no projection."""
     _, points, cameras = _points_and_cameras(problem, state)
-    projected = project_points(cameras, points, problem.norm_px)
+    projected = project_points(cameras, points, problem.raster)
     return problem.observed_px - projected - _drift_shift(problem, state)
 
 
@@ -411,7 +440,7 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
     With ``poses_only`` the derivatives are those by the unknowns of each view.
     """
     rotated, points, cameras = _points_and_cameras(problem, state)
-    jacobians = project_points_with_jacobians(cameras, points, problem.norm_px)
+    jacobians = project_points_with_jacobians(cameras, points, problem.raster)
     miss = problem.observed_px - jacobians.xy - _drift_shift(problem, state)
     huber = _huber(whitened_norm(problem, miss))[1]
     shift = np.moveaxis(jacobians.d_xyz, 0, -1)
@@ -421,20 +450,20 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
     columns = list(range(pose, pose + problem.pose_columns + 1))
     if not poses_only:
         visit = range(first, first + problem.visit_columns // 2)
-        columns = [*range(10), *_grid_columns(problem), *visit, *columns]
+        columns = [*range(len(problem.parameters)), *_grid_columns(problem), *visit, *columns]
     rows = np.empty((2, len(columns), len(points)))
     by_grid = np.zeros((2, 3, 0))
     if len(state.lattices) or (not poses_only and len(_grid_columns(problem)) > 0):
         by_grid = np.einsum("kin,nij->kjn", shift, state.rotations[view])
     if not poses_only:
-        rows[:, :10] = np.moveaxis(jacobians.d_parameters, 0, -1)
-        at = 10
+        at = len(problem.parameters)
+        rows[:, :at] = np.moveaxis(jacobians.d_parameters, 0, -1)[:, problem.parameter_index]
         if len(_grid_columns(problem)) > 0:
             for derivative in _by_grid_shape(problem, state, by_grid):
                 rows[:, at] = derivative
                 at += 1
         if problem.effects is not None:
-            rows[:, at] = rows[:, 0] / problem.unit_m[view]
+            rows[:, at] = rows[:, problem.column("m")] / problem.unit_m[view]
     at = len(columns) - 1 - problem.pose_columns
     x, y, z = rotated.T
     rows[:, at] = y * shift[:, 2] - z * shift[:, 1]
@@ -457,8 +486,9 @@ def whitened_rows(problem: Problem, state: State, *, poses_only: bool = False) -
 
 def _grid_columns(problem: Problem) -> list[int]:
     """Return the columns of the shared unknowns that describe the shape of the grid."""
-    own = [10 + k for k, name in enumerate(problem.shared) if name in GRID_NAMES]
-    return own + [column for _, column in _square_columns(problem)]
+    own = [name for name in problem.shared if name in GRID_NAMES]
+    own += [name for _, name in _square_names(problem)]
+    return [problem.column(name) for name in own]
 
 
 def _by_stretch(problem: Problem, by_grid: Array) -> Array:
@@ -480,10 +510,10 @@ def _by_grid_shape(problem: Problem, state: State, by_grid: Array) -> Iterator[A
     ``by_grid`` (2, 3, N) is that by the points of the grid.
     """
     x, y, _ = problem.board_m.T
-    squares = {column: k for k, column in _square_columns(problem)}
+    squares = {name: k for k, name in _square_names(problem)}
     along_shape = None
     for column in _grid_columns(problem):
-        name = problem.shared[column - 10]
+        name = (*problem.parameters, *problem.shared)[column]
         if name == "grid_stretch":
             yield _by_stretch(problem, by_grid)
         elif name == "grid_shear":
@@ -494,7 +524,7 @@ def _by_grid_shape(problem: Problem, state: State, by_grid: Array) -> Iterator[A
             assert problem.square_class is not None
             if along_shape is None:
                 along_shape = np.einsum("kjn,nj->kn", by_grid, _shaped_grid(problem, state))
-            yield along_shape * (problem.square_class == squares[column])[problem.view_of_point]
+            yield along_shape * (problem.square_class == squares[name])[problem.view_of_point]
 
 
 def whiten(whitening: Array, rows: Array, huber: Array) -> None:
@@ -550,7 +580,7 @@ def _fill(problem: Problem, rows: Array, names: Sequence[str], values: Array) ->
     """Set the columns of shared unknowns in rows (V, P + 1), in place."""
     for k, name in enumerate(names):
         if name in problem.shared:
-            rows[:, 10 + problem.shared.index(name)] = values[:, k]
+            rows[:, problem.column(name)] = values[:, k]
 
 
 def normal_equations(

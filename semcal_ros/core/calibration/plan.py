@@ -36,9 +36,9 @@ from semcal_ros.core.calibration.revision import CHANGING, positive_number
 from semcal_ros.core.calibration.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
-    FUNCTION_NAMES,
     CalibrationModel,
     design_matrix,
+    names_of,
     pixel_size_gradient,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -192,7 +192,7 @@ def _mean_variance(precision: Array, rows: Array, fixed: Array) -> float:
 
 def _root(model: CalibrationModel) -> Array:
     """(K, K) the covariance of the coefficients as root root'."""
-    size = sum(model.functions[name].size for name in FUNCTION_NAMES)
+    size = sum(model.functions[name].size for name in names_of(model.functions))
     variances, directions = np.linalg.eigh(model.covariance[:size, :size])
     return directions * np.sqrt(np.maximum(variances, 0.0))
 
@@ -218,7 +218,7 @@ def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:
 
 
 def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Array:
-    """(10, 10) information of a visit on the camera, all that is not the camera eliminated."""
+    """(P, P) information of a visit on the camera, all that is not the camera eliminated."""
     camera = replace(model.at(g), residual=None)
     fit, priors = (model.statistics.get(key) for key in ("fit", "priors"))
     usual = Priors()
@@ -242,7 +242,8 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         views,
         np.array([g]),
         camera.parameters[None, :, None],
-        norm_px=camera.norm_px,
+        parameters=camera.names,
+        raster=camera.raster,
         nominal_px_per_m=np.array([camera.m]),
         prior_mean=np.ones(1),
         prior_sigma=np.full(1, HELD_SIGMA),
@@ -259,7 +260,7 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
     )
     state = State(np.ones(1), np.stack(rotations), np.zeros((len(views), 3)))
     result = refine(replace(problem, effects=effects), state, max_iterations=0)
-    return result.information[0, :10, :10]
+    return result.information[0]
 
 
 def _tilt(angle: float) -> Array:

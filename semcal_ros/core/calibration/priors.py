@@ -25,6 +25,7 @@ from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.normal_equations import MISS_NAMES
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
 __all__ = ["HELD_SIGMA", "Priors", "Setup"]
 
@@ -48,13 +49,13 @@ class Priors:
     rho_mean, rho_sigma
         Inverse pivot distance, 1/m: 20 mm is typical, and 8 mm as well as a parallel projection are
         within 1.5 sigma.
-    xi_r_sigma, xi_t_sigma
-        Distortion about zero.
+    xi_r_sigma, xi_t_sigma, xi_s_sigma, scan_sigma
+        Distortion about zero, of the lens and of the scan: the latter is some px at a width of 512.
     aspect_sigma, skew_sigma, scale_sigma
         About 1, 0 and the nominal scale.
     scale_jump, aspect_jump, skew_jump
         1-sigma of the jump at a breakpoint.
-    scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, centre_change_fraction
+    scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, xi_s_change, scan_change, centre_change_fraction
         1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times
         k squared. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
         what vendors promise of a magnification. A change that the data do not determine is
@@ -82,6 +83,8 @@ class Priors:
     rho_sigma: float = 60.0
     xi_r_sigma: float = 0.3
     xi_t_sigma: float = 0.1
+    xi_s_sigma: float = 0.05
+    scan_sigma: float = 0.02
     aspect_sigma: float = 0.05
     skew_sigma: float = 0.02
     scale_sigma: float = 0.5
@@ -90,6 +93,8 @@ class Priors:
     skew_change: float = 0.002
     xi_r_change: float = 0.02
     xi_t_change: float = 0.005
+    xi_s_change: float = 0.01
+    scan_change: float = 0.002
     centre_change_fraction: float = 0.02
     scale_jump: float = 0.03
     aspect_jump: float = 0.01
@@ -137,6 +142,13 @@ class Setup:
     axis: StageAxis = field(default_factory=StageAxis)
     stage_rotation_rad: float = 0.0
     tempering: float = 1.0
+    raster_ratio: float | None = None
+
+    @property
+    def raster(self) -> Raster:
+        """Where the raster lies in the pictures; ``raster_ratio`` is that of an older calibration."""
+        whole = Raster.of(*self.image_size)
+        return whole if self.raster_ratio is None else replace(whole, ratio=self.raster_ratio)
 
     @property
     def norm_px(self) -> float:
@@ -208,8 +220,10 @@ class Setup:
             "skew": p.skew_change,
             "xi_r": p.xi_r_change,
             "xi_t": p.xi_t_change,
+            "xi_s": p.xi_s_change,
             "ex": centre,
             "ey": centre,
+            **dict.fromkeys(SCAN_NAMES, p.scan_change),
         }.get(name, self.prior_of(name)[1])
 
     def breaks_of(self, name: str) -> Array:
@@ -248,4 +262,6 @@ class Setup:
             "xi_t": (0.0, p.xi_t_sigma),
             "ex": (cx, p.distortion_centre_fraction * width),
             "ey": (cy, p.distortion_centre_fraction * width),
+            "xi_s": (0.0, p.xi_s_sigma),
+            **dict.fromkeys(SCAN_NAMES, (0.0, p.scan_sigma)),
         }[name]

@@ -37,10 +37,15 @@ from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.stage import attitudes
 from semcal_ros.core.calibration.variance_components import VarianceComponents
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, design_matrix
+from semcal_ros.core.camera.calibration_model import (
+    ALL_FUNCTIONS,
+    FUNCTION_NAMES,
+    design_matrix,
+    names_of,
+)
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.plane_geometry import mirrored_tilt
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
@@ -76,15 +81,19 @@ def build_problem(
     functions: Functions,
     views: Sequence[GridView],
     spread: VarianceComponents | float,
+    *,
+    candidates: Sequence[str] = (),
 ) -> Problem:
     """Set up the adjustment of ``views`` with functions of the given kinds and sizes.
 
-    Given one number, the 1-sigma of the heights, it has neither shared unknowns nor effects.
+    Given one number, the 1-sigma of the heights, it has neither shared unknowns nor effects. ``candidates`` are
+    parameters without a function, of which only the information is asked.
     """
     nominal = setup.nominal_px_per_m(setup.magnifications)
+    rows = tuple(name for name in ALL_FUNCTIONS if name in functions or name in candidates)
     designs = np.stack(
         [
-            design_matrix(functions, float(g), float(scale))
+            design_matrix(functions, float(g), float(scale), rows)
             for g, scale in zip(setup.magnifications, nominal, strict=True)
         ]
     )
@@ -98,7 +107,8 @@ def build_problem(
         views,
         setup.magnifications,
         designs,
-        norm_px=setup.norm_px,
+        raster=setup.raster,
+        parameters=tuple(ALL_NAMES[ALL_FUNCTIONS.index(name)] for name in rows),
         nominal_px_per_m=nominal,
         prior_mean=mean,
         prior_sigma=sigma,
@@ -136,7 +146,7 @@ def build_problem(
 
 
 def with_shared(designs: Array, count: int) -> Array:
-    """Return designs (M, 10, K) with ``count`` more unknowns, the same at every magnification."""
+    """Return designs (M, P, K) with ``count`` more unknowns, the same at every magnification."""
     groups, rows, columns = designs.shape
     out = np.zeros((groups, rows + count, columns + count))
     out[:, :rows, :columns] = designs
@@ -153,16 +163,16 @@ def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
     """Return (K,) means and sigmas of all coefficients, as in :meth:`Setup.coefficient_priors`."""
     parts = [
         setup.coefficient_priors(name, functions[name].kind, functions[name].smooth_size)
-        for name in FUNCTION_NAMES
+        for name in names_of(functions)
     ]
     return np.concatenate([m for m, _ in parts]), np.concatenate([s for _, s in parts])
 
 
 def with_coefficients(functions: Functions, theta: Array) -> dict[str, ContinuousFunction]:
-    """Return the functions with coefficients from a vector in the order of ``FUNCTION_NAMES``."""
+    """Return the functions with coefficients from a vector in the order of ``ALL_FUNCTIONS``."""
     out: dict[str, ContinuousFunction] = {}
     start = 0
-    for name in FUNCTION_NAMES:
+    for name in names_of(functions):
         stop = start + functions[name].size
         out[name] = replace(functions[name], coefficients=theta[start:stop].copy())
         start = stop
@@ -186,8 +196,8 @@ def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, C
 
 
 def stack_coefficients(functions: Functions) -> Array:
-    """Return (K,) all coefficients in the order of ``FUNCTION_NAMES``."""
-    return np.concatenate([functions[name].coefficients for name in FUNCTION_NAMES])
+    """Return (K,) all coefficients in the order of ``ALL_FUNCTIONS``."""
+    return np.concatenate([functions[name].coefficients for name in names_of(functions)])
 
 
 def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> BundleResult:
@@ -207,7 +217,7 @@ def mirror(functions: Functions, problem: Problem, state: State) -> State:
     Every point stays where it is seen, so that views and poses alone do not tell the two states apart; priors do, and
     what a stage says. Exact where rho is a constant and the stage has no offsets.
     """
-    names = list(FUNCTION_NAMES)
+    names = list(names_of(functions))
     first = sum(functions[name].size for name in names[: names.index("rho")])
     theta = state.theta.copy()
     theta[first : first + functions["rho"].size] *= -1.0
@@ -245,7 +255,7 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
 
     A pose that has got into an optimum of its own while the camera was still wrong comes out of it.
     """
-    table = problem.designs[:, : len(FUNCTION_NAMES)] @ state.theta
+    table = problem.cameras(state.theta)
     count = 0
     own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
     best = own.state
@@ -280,8 +290,9 @@ def _affine_poses(setup: Setup, view: GridView, parameters: Array) -> tuple[Arra
     try:
         camera = ScanCamera(
             magnification=view.magnification,
-            **dict(zip(PARAMETER_NAMES, parameters.tolist(), strict=True)),
+            **dict(zip(ALL_NAMES, parameters.tolist(), strict=False)),
             norm_px=setup.norm_px,
+            raster_ratio=setup.raster_ratio,
             width=width,
             height=height,
         )

@@ -50,11 +50,12 @@ from semcal_ros.core.calibration.variance_components import (
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import (
-    FUNCTION_NAMES,
+    ALL_FUNCTIONS,
     CalibrationModel,
     design_matrix,
+    names_of,
 )
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.errors import CalibrationError
 
 __all__ = [
@@ -104,7 +105,7 @@ class Revision:
     @property
     def components(self) -> slice:
         """Where the components of the calibration's covariance are among the unknowns."""
-        return slice(1, 1 + sum(self.model.functions[name].size for name in FUNCTION_NAMES))
+        return slice(1, 1 + sum(own.size for own in self.model.functions.values()))
 
     @property
     def changes(self) -> slice:
@@ -167,6 +168,7 @@ def make_setup(
         priors = priors.of_wide_views(cameras[flat[0].magnification].rho)
     magnifications = np.unique([v.magnification for v in flat])
     setup = Setup(flat, magnifications, image_size, model.display_width_m, priors, axis=axis)
+    setup = replace(setup, raster_ratio=model.image_height / model.image_width)
     return add_shared_unknowns(align_lattices(mark_untilted(setup, untilted)))
 
 
@@ -193,12 +195,14 @@ def positive_number(values: object, key: str, default: float) -> float:
 
 
 def _camera_designs(model: CalibrationModel, setup: Setup) -> tuple[Array, Array]:
-    """Designs (M, 10, 1 + P + 2) of the camera as calibrated, and the prior 1-sigma of its unknowns.
+    """Designs (M, P, 1 + P + 2) of the camera as calibrated, and the prior 1-sigma of its unknowns.
 
     The first unknown is 1; the next are the principal components of the calibration's covariance, in sigmas;
     the last are the height of the grid and the size of its squares.
     """
-    theta = np.concatenate([model.functions[name].coefficients for name in FUNCTION_NAMES])
+    theta = np.concatenate(
+        [model.functions[name].coefficients for name in names_of(model.functions)]
+    )
     size = len(theta)
     variances, directions = np.linalg.eigh(model.covariance[:size, :size])
     root = directions * np.sqrt(np.maximum(variances, 0.0))
@@ -222,15 +226,15 @@ def _camera_designs(model: CalibrationModel, setup: Setup) -> tuple[Array, Array
 def _designs_of_size(
     model: CalibrationModel, magnifications: Array, size: tuple[int, int]
 ) -> Array:
-    """(M, 10, K + 1) from the coefficients of a calibration, and 1, to the cameras of images of some size."""
+    """(M, P, K + 1) from the coefficients of a calibration, and 1, to the cameras of images of some size."""
     s = size[0] / model.image_width
     shift_y = 0.5 * (size[1] - s * model.image_height)
     out = []
     for g in magnifications:
         design = design_matrix(model.functions, float(g), model.nominal_px_per_m(float(g)))
-        constant = np.zeros(10)
+        constant = np.zeros(len(design))
         for name in ("px", "py", "ex", "ey"):
-            row = PARAMETER_NAMES.index(name)
+            row = ALL_NAMES.index(name)
             design[row] *= s
             constant[row] = 0.5 * s - 0.5 + (shift_y if name.endswith("y") else 0.0)
         design[0] *= s
@@ -290,11 +294,9 @@ def _build(
     """Make the adjustment: the camera as calibrated, then :data:`CHANGING`, then what all views share."""
     problem = build_problem(setup, model.functions, setup.views, spread)
     designs, sigma = _camera_designs(model, setup)
-    changes = np.zeros((len(designs), 10, len(CHANGING)))
+    changes = np.zeros((*designs.shape[:2], len(CHANGING)))
     for column, name in enumerate(CHANGING):
-        changes[:, FUNCTION_NAMES.index(name), column] = (
-            designs[:, 0, 0] if name == "scale" else 1.0
-        )
+        changes[:, ALL_FUNCTIONS.index(name), column] = designs[:, 0, 0] if name == "scale" else 1.0
     free = [max(sigmas[name], HELD_SIGMA) for name in CHANGING]
     cameras = np.concatenate([designs, changes], axis=2)
     mean = np.append(1.0, np.zeros(cameras.shape[2] - 1))
@@ -302,6 +304,7 @@ def _build(
     own_mean, own_sigma = setup.shared_priors() if shared else (np.zeros(0), np.zeros(0))
     return replace(
         problem,
+        parameters=ALL_NAMES[: designs.shape[1]],
         designs=with_shared(cameras, shared),
         prior_mean=np.concatenate([mean, own_mean]),
         prior_sigma=np.concatenate([sigma, free, own_sigma]),

@@ -44,7 +44,7 @@ from semcal_ros.core.calibration.revision import (
 )
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
@@ -187,13 +187,13 @@ def change_directions(model: CalibrationModel, image_width: int) -> Array:
     image_width
         Of the images in whose pixels a centre moves.
     """
-    functions = [model.functions[name] for name in FUNCTION_NAMES]
+    functions = [model.functions[name] for name in names_of(model.functions)]
     starts = np.cumsum([0, *(own.size for own in functions)])
     # Images of another size have their centre at another pixel, in other units.
     per_px = model.image_width / image_width
     changes = np.zeros((int(starts[-1]), len(CHANGING)))
     for column, name in enumerate(CHANGING):
-        k = FUNCTION_NAMES.index(name)
+        k = names_of(model.functions).index(name)
         own = slice(int(starts[k]), int(starts[k + 1]))
         if name == "scale":
             changes[own, column] = functions[k].coefficients
@@ -216,7 +216,7 @@ def _steps(revision: Revision) -> tuple[Array, Array]:
     former alone.
     """
     model = revision.model
-    size = sum(model.functions[name].size for name in FUNCTION_NAMES)
+    size = sum(model.functions[name].size for name in names_of(model.functions))
     variances, directions = np.linalg.eigh(model.covariance[:size, :size])
     root = directions * np.sqrt(np.maximum(variances, 0.0))
     changes = change_directions(model, revision.setup.image_size[0])
@@ -233,7 +233,9 @@ def _apply(revision: Revision) -> CalibrationModel:
     steps, root = _steps(revision)
     size = len(root)
     index = np.r_[revision.components, revision.changes]
-    values = np.concatenate([model.functions[name].coefficients for name in FUNCTION_NAMES])
+    values = np.concatenate(
+        [model.functions[name].coefficients for name in names_of(model.functions)]
+    )
     values = values + steps @ theta[index]
     own = revision.covariance[np.ix_(index, index)]
     covariance = model.covariance.copy()
@@ -245,7 +247,7 @@ def _apply(revision: Revision) -> CalibrationModel:
         covariance[size:, :size] = covariance[:size, size:].T
     covariance = 0.5 * (covariance + covariance.T)
     functions, start = {}, 0
-    for name in FUNCTION_NAMES:
+    for name in names_of(model.functions):
         function = model.functions[name]
         functions[name] = replace(function, coefficients=values[start : start + function.size])
         start += function.size

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -25,25 +25,38 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
+    "ALL_FUNCTIONS",
     "FUNCTION_NAMES",
+    "TERM_NAMES",
     "CalibrationModel",
     "ScaleSigma",
     "checked_magnification",
     "design_matrix",
+    "names_of",
     "pixel_size_gradient",
 ]
 
 
 # The scale is kept relative to the nominal one, width g / display width, so that it is a number
 # near 1 at every g.
-FUNCTION_NAMES: tuple[str, ...] = ("scale", *PARAMETER_NAMES[1:])
+ALL_FUNCTIONS: tuple[str, ...] = ("scale", *ALL_NAMES[1:])
+"""The functions of a calibration, in the order of the parameters of the camera."""
+FUNCTION_NAMES: tuple[str, ...] = ALL_FUNCTIONS[: len(PARAMETER_NAMES)]
+"""Those that every calibration has."""
+TERM_NAMES: tuple[str, ...] = ALL_NAMES[len(PARAMETER_NAMES) :]
+"""Those that a calibration need not have; the parameter is zero then."""
+
+
+def names_of(functions: Mapping[str, ContinuousFunction]) -> tuple[str, ...]:
+    """Return the names of the functions that are there, in the order of ``ALL_FUNCTIONS``."""
+    return tuple(name for name in ALL_FUNCTIONS if name in functions)
 
 
 def checked_magnification(magnification: float) -> float:
@@ -58,27 +71,32 @@ def checked_magnification(magnification: float) -> float:
 
 
 def design_matrix(
-    functions: Mapping[str, ContinuousFunction], g: float, nominal_px_per_m: float
+    functions: Mapping[str, ContinuousFunction],
+    g: float,
+    nominal_px_per_m: float,
+    rows: Sequence[str] | None = None,
 ) -> Array:
-    """Return the (10, K) matrix from all coefficients to the camera parameters at ``g``.
+    """Return the (P, K) matrix from all coefficients to the camera parameters at ``g``.
 
-    The coefficients are in the order of ``FUNCTION_NAMES``.
+    The coefficients are in the order of ``ALL_FUNCTIONS``. The parameters are those of ``rows``, which are names of
+    functions that need not be there; without ``rows`` they are those of the camera at ``g``.
     """
-    rows: dict[object, Array] = {}
-    blocks = []
-    for name in FUNCTION_NAMES:
+    known: dict[object, Array] = {}
+    names = names_of(functions)
+    if rows is None:
+        rows = FUNCTION_NAMES if len(names) == len(FUNCTION_NAMES) else ALL_FUNCTIONS
+    place = {name: row for row, name in enumerate(rows)}
+    matrix = np.zeros((len(rows), sum(functions[name].size for name in names)))
+    column = 0
+    for name in names:
         function = functions[name]
         # Most functions share their basis.
         key = function.basis_key
-        if key not in rows:
-            rows[key] = function.basis(g)
-        blocks.append(rows[key])
-    blocks[0] = blocks[0] * nominal_px_per_m
-    matrix = np.zeros((len(blocks), sum(len(b) for b in blocks)))
-    column = 0
-    for row, block in enumerate(blocks):
-        matrix[row, column : column + len(block)] = block
-        column += len(block)
+        if key not in known:
+            known[key] = function.basis(g)
+        row = known[key] * nominal_px_per_m if name == "scale" else known[key]
+        matrix[place[name], column : column + len(row)] = row
+        column += len(row)
     return matrix
 
 
@@ -120,9 +138,9 @@ class CalibrationModel:
     Attributes
     ----------
     functions
-        One :class:`ContinuousFunction` per name in ``FUNCTION_NAMES``.
+        One :class:`ContinuousFunction` per name in ``ALL_FUNCTIONS``; those of ``TERM_NAMES`` may be missing.
     covariance
-        (K, K) covariance of all coefficients, in the order of ``FUNCTION_NAMES``, then of the
+        (K, K) covariance of all coefficients, in the order of ``ALL_FUNCTIONS``, then of the
         residual field.
     image_width, image_height
         Size in px of the calibration images (without databar).
@@ -161,7 +179,7 @@ class CalibrationModel:
             raise InvalidValueError(
                 f"a calibration without {', '.join(missing)}", expected=", ".join(FUNCTION_NAMES)
             )
-        size = sum(self.functions[name].size for name in FUNCTION_NAMES)
+        size = sum(self.functions[name].size for name in names_of(self.functions))
         size += 0 if self.residual is None else self.residual.size
         if self.covariance.shape != (size, size):
             raise InvalidValueError(
@@ -184,8 +202,10 @@ class CalibrationModel:
 
     @cached_property
     def _coefficients(self) -> Array:
-        """All coefficients of the functions, in the order of ``FUNCTION_NAMES``."""
-        return np.concatenate([self.functions[name].coefficients for name in FUNCTION_NAMES])
+        """All coefficients of the functions, in the order of ``ALL_FUNCTIONS``."""
+        return np.concatenate(
+            [self.functions[name].coefficients for name in names_of(self.functions)]
+        )
 
     @property
     def norm_px(self) -> float:
@@ -227,7 +247,7 @@ class CalibrationModel:
         parameters = design @ theta
         with np.errstate(over="ignore"):
             covariance[0, 0] += (parameters[0] * self.scale_sigma.relative(parameters[5])) ** 2
-        values = dict(zip(PARAMETER_NAMES, parameters.tolist(), strict=True))
+        values = dict(zip(ALL_NAMES, parameters.tolist(), strict=False))
         try:
             return ScanCamera(
                 magnification=g,
@@ -255,7 +275,7 @@ class CalibrationModel:
         return float(np.sqrt(self._extrapolation_covariance(g)[0, 0]) / self.at(g).m)
 
     def _extrapolation_covariance(self, g: float) -> Array:
-        """Return a diagonal (10, 10) allowance for the unknown course of the functions.
+        """Return a diagonal (P, P) allowance for the unknown course of the functions.
 
         The 1-sigma of a parameter is twice its variation over the calibrated range (highest minus
         lowest value), times the distance from the range in log g over the length of the range in
@@ -267,10 +287,13 @@ class CalibrationModel:
         span = max(float(np.log(high / low)), 1.0)
         distance = abs(float(np.log(g / edge))) / span
         grid = np.geomspace(low, high, 33)
-        sigma = np.empty(len(FUNCTION_NAMES))
-        for i, name in enumerate(FUNCTION_NAMES):
+        names = names_of(self.functions)
+        sigma = np.zeros(
+            len(FUNCTION_NAMES if len(names) == len(FUNCTION_NAMES) else ALL_FUNCTIONS)
+        )
+        for name in names:
             values = [self.functions[name](x) for x in grid]
-            sigma[i] = 2.0 * (max(values) - min(values)) * distance
+            sigma[ALL_FUNCTIONS.index(name)] = 2.0 * (max(values) - min(values)) * distance
         sigma[0] *= self.nominal_px_per_m(g)
         return np.diag(sigma**2)
 

@@ -12,17 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Static distortion of the scan, forwards and backwards.
+"""Distortion by the lens, forwards and backwards.
 
 The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and
 half the image width ``n``:
 
-    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q),      r2 = |q|^2
+    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q) + xi_s r2 (-q_y, q_x),      r2 = |q|^2
 
 The radial term is the closed form of the division model (Fitzgibbon 2001,
 doi:10.1109/CVPR.2001.990465), the tangential one is the consistent reading of equation (2) of Malti
 et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed bracket adds a squared displacement vector
-to a scalar.
+to a scalar. The spiral term is the third-order anisotropic distortion of a magnetic lens, which turns what
+is farther from its axis more (Hawkes and Kasper, Principles of Electron Optics, ch. 24).
 """
 
 from __future__ import annotations
@@ -72,28 +73,34 @@ def _radial(r2: Array, xi_r: Array) -> tuple[Array, Array]:
     return root, 2.0 / (1.0 + root)
 
 
-def distort_normalised(q: Array, xi_r: Array | float, xi_t: Array | float) -> Array:
+def distort_normalised(
+    q: Array, xi_r: Array | float, xi_t: Array | float, xi_s: Array | float = 0.0
+) -> Array:
     """Distort (n, 2) normalised points; NaN rows where ``4 xi_r r2 >= 1``.
 
-    ``xi_r`` and ``xi_t`` are scalars or arrays of shape (n,).
+    ``xi_r``, ``xi_t`` and ``xi_s`` are scalars or arrays of shape (n,).
     """
     squares = q * q
     r2 = squares[:, 0] + squares[:, 1]
     _, factor = _radial(r2, np.asarray(xi_r, dtype=np.float64))
     tangential = np.asarray(xi_t, dtype=np.float64)[..., None] * (r2[:, None] + 2.0 * squares)
-    return factor[:, None] * q + tangential
+    spiral = np.asarray(xi_s, dtype=np.float64)
+    if not np.any(spiral):
+        return factor[:, None] * q + tangential
+    turned = (spiral * r2)[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
+    return factor[:, None] * q + tangential + turned
 
 
 def distort_jacobians(
-    q: Array, xi_r: Array | float, xi_t: Array | float
+    q: Array, xi_r: Array | float, xi_t: Array | float, xi_s: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
     """Distort points, with derivatives.
 
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 2); the last axis of ``df_dxi`` is (xi_r,
-        xi_t).
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 3); the last axis of ``df_dxi`` is (xi_r,
+        xi_t, xi_s).
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
     xi_tangential = np.asarray(xi_t, dtype=np.float64)
@@ -107,17 +114,25 @@ def distort_jacobians(
     along = 2.0 * growth * xi_radial
     tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
     # In memory the points come last, which is faster; in shape they come first, as elsewhere.
-    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((2, 2, len(q)))
+    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((3, 2, len(q)))
     df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
     df_dq[0, 1] = along * x * y + tangential_y
     df_dq[1, 0] = along * x * y + tangential_x
     df_dq[1, 1] = along * y * y + factor + 3.0 * tangential_y
-    df_dxi[:, 0] = growth * r2 * q.T
-    df_dxi[:, 1] = bracket.T
-    return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, -1, 0)
+    df_dxi[0] = growth * r2 * q.T
+    df_dxi[1] = bracket.T
+    df_dxi[2, 0], df_dxi[2, 1] = -r2 * y, r2 * x
+    spiral = np.asarray(xi_s, dtype=np.float64)
+    if np.any(spiral):
+        f = f + spiral[..., None] * df_dxi[2].T
+        df_dq[0, 0] -= 2.0 * spiral * x * y
+        df_dq[0, 1] -= spiral * (x * x + 3.0 * y * y)
+        df_dq[1, 0] += spiral * (3.0 * x * x + y * y)
+        df_dq[1, 1] += 2.0 * spiral * x * y
+    return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 
-def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
+def undistort_normalised(q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0) -> Undistortion:
     """Invert the distortion of (n, 2) normalised points.
 
     The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's
@@ -127,7 +142,7 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
     rd2 = np.sum(q_d * q_d, axis=1)
     branch = np.isfinite(rd2) & (1.0 + xi_r * rd2 > 0.0) & (xi_r * rd2 < 1.0)
     start = q_d / np.where(branch, 1.0 + xi_r * rd2, np.nan)[:, None]
-    if xi_t == 0.0:
+    if xi_t == xi_s == 0.0:
         return Undistortion(start, branch, 0, np.where(branch, 0.0, np.nan))
 
     q = np.where(branch[:, None], start, np.nan)
@@ -137,7 +152,7 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float) -> Undistortion:
     active = np.flatnonzero(branch)
     while active.size and iterations < _MAX_ITERATIONS:
         iterations += 1
-        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t)
+        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s)
         miss = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.

@@ -68,7 +68,7 @@ def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
         return np.zeros(len(xy))
     points = camera.sem_from_ideal(xy)
     # The moves of the specimen span the same images with and without the small residual field.
-    moved = project_points_with_jacobians(camera.parameters, points, camera.norm_px).d_xyz
+    moved = project_points_with_jacobians(camera.parameters, points, camera.raster).d_xyz
     jacobian = camera.project_jacobian(points)
     known = np.all(np.isfinite(jacobian), axis=(1, 2))
     if not np.any(known):

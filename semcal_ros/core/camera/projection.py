@@ -22,7 +22,8 @@ so that nothing diverges at ``rho = 0``:
     x_u = px + m (a X + sigma Y) / w
     y_u = py + m (Y / a) / w
 
-followed by the distortion of :mod:`semcal_ros.core.camera.distortion`.
+followed by the distortion of the lens (:mod:`semcal_ros.core.camera.distortion`) and that of the scan
+(:mod:`semcal_ros.core.camera.scan_distortion`).
 """
 
 from __future__ import annotations
@@ -33,8 +34,15 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import distort_jacobians, distort_normalised
+from semcal_ros.core.camera.scan_distortion import (
+    ALONG_COUNT,
+    SCAN_NAMES,
+    Raster,
+    raw_from_deflection,
+)
 
 __all__ = [
+    "ALL_NAMES",
     "PARAMETER_NAMES",
     "ProjectionJacobians",
     "project_ideal_points",
@@ -55,6 +63,9 @@ PARAMETER_NAMES: tuple[str, ...] = (
     "ex",
     "ey",
 )
+"""The parameters that every camera has."""
+ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, "xi_s", *SCAN_NAMES)
+"""All parameters: after those of every camera the spiral distortion of the lens, and the distortion of the scan."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +79,8 @@ class ProjectionJacobians:
     d_xyz
         (n, 2, 3) derivative with respect to the sem-frame point, px per m.
     d_parameters
-        (n, 2, 10) derivative with respect to the parameters in the order of
-        :data:`PARAMETER_NAMES`.
+        (n, 2, P) derivative with respect to the parameters in the order of
+        :data:`ALL_NAMES`.
     """
 
     xy: Array
@@ -80,7 +91,7 @@ class ProjectionJacobians:
 def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
     """Project points to undistorted pixels (n, 2); NaN at or behind the pivot.
 
-    ``parameters`` has shape (10,) or (n, 10).
+    ``parameters`` has shape (P,) or (n, P), with the first P of :data:`ALL_NAMES`: 10 or all.
     """
     m, a, skew, px, py, rho = np.moveaxis(parameters[..., :6], -1, 0)
     w = 1.0 + rho * xyz_m[:, 2]
@@ -90,22 +101,35 @@ def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
     return np.stack([x, y], axis=1)
 
 
-def project_points(parameters: Array, xyz_m: Array, norm_px: float) -> Array:
+def project_points(parameters: Array, xyz_m: Array, raster: Raster) -> Array:
     """Project points to raw (distorted) pixels (n, 2); NaN where the model has no answer."""
-    centre = parameters[..., 8:10]
+    centre, norm_px = parameters[..., 8:10], raster.norm_px
     q = (project_ideal_points(parameters, xyz_m) - centre) / norm_px
-    return centre + norm_px * distort_normalised(q, parameters[..., 6], parameters[..., 7])
+    xi_r, xi_t, xi_s, amplitudes = _distortion(parameters)
+    deflection = centre + norm_px * distort_normalised(q, xi_r, xi_t, xi_s)
+    if amplitudes is None or not np.any(amplitudes):
+        return deflection
+    return raw_from_deflection(deflection, amplitudes, raster).xy
+
+
+def _distortion(parameters: Array) -> tuple[Array, Array, Array | float, Array | None]:
+    """Return radial, tangential and spiral distortion, and the amplitudes of that of the scan, where there are any."""
+    xi_r, xi_t = parameters[..., 6], parameters[..., 7]
+    if parameters.shape[-1] == len(PARAMETER_NAMES):
+        return xi_r, xi_t, 0.0, None
+    return xi_r, xi_t, parameters[..., 10], parameters[..., 11:]
 
 
 def project_points_with_jacobians(
-    parameters: Array, xyz_m: Array, norm_px: float
+    parameters: Array, xyz_m: Array, raster: Raster
 ) -> ProjectionJacobians:
     """Project points to raw pixels, with analytic derivatives.
 
     In memory the points come last, so that each derivative of all points is contiguous.
     """
-    n = len(xyz_m)
-    table = np.broadcast_to(parameters, (n, 10))
+    n, norm_px = len(xyz_m), raster.norm_px
+    count = np.shape(parameters)[-1]
+    table = np.broadcast_to(parameters, (n, count))
     m, a, skew, px, py, rho, xi_r, xi_t = table[:, :8].T
     centre = table[:, 8:10]
     x, y, z = xyz_m.T
@@ -117,11 +141,18 @@ def project_points_with_jacobians(
     scaled_u, scaled_v = scale * u, scale * v
     ideal = np.stack([px + scaled_u, py + scaled_v], axis=1)
 
-    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, xi_r, xi_t)
-    d_xyz, d_parameters = np.empty((2, 3, n)), np.empty((2, 10, n))
+    _, _, xi_s, amplitudes = _distortion(table)
+    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, xi_r, xi_t, xi_s)
+    xy = centre + norm_px * f
+    scan = None if amplitudes is None else raw_from_deflection(xy, amplitudes, raster)
+    d_xyz, d_parameters = np.empty((2, 3, n)), np.zeros((2, count, n))
     up, tilt = rho * inverse_w, z * inverse_w
     for row in (0, 1):
-        by_x, by_y = df_dq[:, row, 0], df_dq[:, row, 1]
+        by_x, by_y, by_xi = df_dq[:, row, 0], df_dq[:, row, 1], norm_px * df_dxi[:, row].T
+        own = 1.0
+        if scan is not None:
+            own = 1.0 / scan.stretch[row]
+            by_x, by_y, by_xi = own * by_x, own * by_y, own * by_xi
         along = by_x * scaled_u + by_y * scaled_v
         d_xyz[row, 0] = by_x * scale * a
         d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
@@ -132,9 +163,16 @@ def project_points_with_jacobians(
         d_parameters[row, 3] = by_x
         d_parameters[row, 4] = by_y
         d_parameters[row, 5] = -along * tilt
-        d_parameters[row, 6:8] = norm_px * df_dxi[:, row].T
-        d_parameters[row, 8:10] = -df_dq[:, row].T
-        d_parameters[row, 8 + row] += 1.0
+        d_parameters[row, 6:8] = by_xi[:2]
+        d_parameters[row, 8] = -by_x
+        d_parameters[row, 9] = -by_y
+        d_parameters[row, 8 + row] += own
+        if scan is not None:
+            d_parameters[row, 10] = by_xi[2]
+            functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
+            d_parameters[row, 11:][functions] = -own * scan.basis[functions]
     return ProjectionJacobians(
-        centre + norm_px * f, np.moveaxis(d_xyz, -1, 0), np.moveaxis(d_parameters, -1, 0)
+        xy if scan is None else scan.xy,
+        np.moveaxis(d_xyz, -1, 0),
+        np.moveaxis(d_parameters, -1, 0),
     )

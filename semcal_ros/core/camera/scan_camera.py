@@ -31,13 +31,27 @@ from semcal_ros.core.camera.distortion import (
     undistort_normalised,
 )
 from semcal_ros.core.camera.projection import (
+    ALL_NAMES,
+    PARAMETER_NAMES,
     project_ideal_points,
     project_points_with_jacobians,
 )
 from semcal_ros.core.camera.residual_field import FieldSlice
+from semcal_ros.core.camera.scan_distortion import (
+    SCAN_NAMES,
+    SETTLING,
+    Raster,
+    deflect_along,
+    deflection_shift,
+    deflection_stretch,
+    raw_from_deflection,
+)
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["RectifiedCamera", "ScanCamera", "as_points"]
+
+# Parameters that grow with the number of pixels of an image.
+_IN_PX = ("m", "px", "py", "ex", "ey")
 
 
 def as_points(values: ArrayLike, dimensions: int) -> Array:
@@ -84,13 +98,19 @@ class ScanCamera:
         Radial and tangential distortion in normalised coordinates.
     ex, ey
         Centre of the distortion, px.
+    xi_s
+        Spiral distortion in normalised coordinates.
+    coil_x2, coil_x3, settling_1, settling_2, settling_3, settling_4, coil_y2, coil_y3
+        Distortion of the scan along the lines and across them (see
+        :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
+    raster_ratio
+        Height over width of the pictures to which the distortion of the scan refers; None for this one's.
     norm_px
         Normalisation length of the distortion, px (half the image width).
     width, height
         Image size, px.
     covariance
-        (10, 10) covariance of the parameters in the order of
-        :data:`semcal_ros.core.camera.projection.PARAMETER_NAMES`, or None where it is not known.
+        (P, P) covariance of :attr:`parameters`, or None where it is not known.
     in_range
         False when ``magnification`` lies outside the calibrated range.
     residual
@@ -123,10 +143,19 @@ class ScanCamera:
     covariance: Array | None = None
     in_range: bool = True
     residual: FieldSlice | None = None
+    xi_s: float = 0.0
+    coil_x2: float = 0.0
+    coil_x3: float = 0.0
+    settling_1: float = 0.0
+    settling_2: float = 0.0
+    settling_3: float = 0.0
+    settling_4: float = 0.0
+    coil_y2: float = 0.0
+    coil_y3: float = 0.0
+    raster_ratio: float | None = None
 
     def __post_init__(self) -> None:
-        values = [self.m, self.aspect, self.skew, self.px, self.py, self.rho, self.xi_r, self.xi_t]
-        values += [self.ex, self.ey, self.magnification, self.norm_px]
+        values = [*self.all_parameters.tolist(), self.magnification, self.norm_px]
         if not all(map(math.isfinite, values)):
             raise InvalidValueError(
                 f"camera parameters {[float(value) for value in values]}", expected="finite numbers"
@@ -171,13 +200,34 @@ class ScanCamera:
         )
 
     @property
-    def parameters(self) -> Array:
-        """(10,) parameter vector in the order of ``PARAMETER_NAMES``."""
-        return np.array(
-            [self.m, self.aspect, self.skew, self.px, self.py]
-            + [self.rho, self.xi_r, self.xi_t, self.ex, self.ey],
-            dtype=np.float64,
+    def all_parameters(self) -> Array:
+        """(19,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
+        return np.array([getattr(self, name) for name in ALL_NAMES], dtype=np.float64)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of :attr:`parameters`: all, or those that every camera has where it has no other."""
+        plain = len(PARAMETER_NAMES)
+        known = plain if self.covariance is None else len(self.covariance)
+        return (
+            ALL_NAMES if known > plain or np.any(self.all_parameters[plain:]) else PARAMETER_NAMES
         )
+
+    @property
+    def parameters(self) -> Array:
+        """(P,) parameter vector in the order of :attr:`names`."""
+        return self.all_parameters[: len(self.names)]
+
+    @cached_property
+    def raster(self) -> Raster:
+        """Where the raster lies in the picture."""
+        whole = Raster.of(self.width, self.height)
+        ratio = whole.ratio if self.raster_ratio is None else self.raster_ratio
+        return Raster(whole.middle_px, self.norm_px, ratio)
+
+    @property
+    def _scan_amplitudes(self) -> Array:
+        return np.array([getattr(self, name) for name in SCAN_NAMES])
 
     # -- projection -------------------------------------------------------------------------------
 
@@ -209,9 +259,9 @@ class ScanCamera:
         return np.sqrt(np.maximum(variance, 0.0))
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
-        """Return the derivative (n, 2, 10 + F) of :meth:`project`.
+        """Return the derivative (n, 2, P + F) of :meth:`project`.
 
-        It is by the 10 parameters, followed by the F coefficients of the residual field.
+        It is by the P parameters, followed by the F coefficients of the residual field.
         """
         points = as_points(xyz_m, 3)
         known, xy, jacobian = self._parametric_jacobian(points)
@@ -226,10 +276,10 @@ class ScanCamera:
         Returns
         -------
         Indices (k,) of the sem-frame points that have a raw pixel, these pixels (k, 2), and the
-        derivative (k, 2, 10 + F) of the pixels under the parametric distortion alone: by the 10
+        derivative (k, 2, P + F) of the pixels under the parametric distortion alone: by the P
         parameters, and, where the raw pixels stay, minus that by the F coefficients of the field.
         """
-        jacobians = project_points_with_jacobians(self.parameters, points, self.norm_px)
+        jacobians = project_points_with_jacobians(self.parameters, points, self.raster)
         known = np.flatnonzero(np.all(np.isfinite(jacobians.xy), axis=1))
         xy = self._with_residual(jacobians.xy[known])
         found = np.all(np.isfinite(xy), axis=1)
@@ -244,7 +294,7 @@ class ScanCamera:
 
     @property
     def joint_covariance(self) -> Array | None:
-        """(10 + F, 10 + F) covariance of the parameters and the coefficients of the field."""
+        """(P + F, P + F) covariance of the parameters and the coefficients of the field."""
         field = self.residual
         if self.covariance is None or field is None:
             return self.covariance
@@ -284,12 +334,37 @@ class ScanCamera:
         """The camera without its residual field."""
         return self if self.residual is None else replace(self, residual=None)
 
+    @property
+    def settles(self) -> bool:
+        """Whether the beam settles at the start of the lines."""
+        return bool(np.any(self._scan_amplitudes[SETTLING]))
+
+    @cached_property
+    def without_settling(self) -> ScanCamera:
+        """The camera without the settling of the beam at the start of the lines."""
+        return replace(self, settling_1=0.0, settling_2=0.0, settling_3=0.0, settling_4=0.0)
+
+    def deflect_columns(self, x: Array) -> Array:
+        """Return the deflections along the lines, px, at raw columns, without the residual field; shapes are kept."""
+        return deflect_along(x, self._scan_amplitudes, self.raster)
+
     def without_residual(self, xy: ArrayLike) -> Array:
         """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
         points = as_points(xy, 2)
         if self.residual is None:
             return points
         return points + self.norm_px * self.residual.displacement(self._normalised(points))
+
+    def _deflection(self, xy: Array) -> Array:
+        """Return the deflections (n, 2) of raw pixels (n, 2): without residual field and distortion of the scan."""
+        straight, amplitudes = self.without_residual(xy), self._scan_amplitudes
+        if not np.any(amplitudes):
+            return straight
+        return straight + deflection_shift(straight, amplitudes, self.raster)
+
+    def _stretch(self, xy: Array) -> Array:
+        """(n, 2) derivative of the deflection along each axis by the raw pixel (n, 2) without the residual field."""
+        return deflection_stretch(self.without_residual(xy), self._scan_amplitudes, self.raster)
 
     def _with_residual(self, xy: Array) -> Array:
         """Invert :meth:`without_residual`."""
@@ -301,8 +376,11 @@ class ScanCamera:
     def distort(self, xy: ArrayLike) -> Array:
         """Distort undistorted pixels (n, 2) to raw pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
         q = (as_points(xy, 2) - self._centre) / self.norm_px
-        parametric = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t)
-        return self._with_residual(parametric)
+        seen = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t, self.xi_s)
+        amplitudes = self._scan_amplitudes
+        if np.any(amplitudes):
+            seen = raw_from_deflection(seen, amplitudes, self.raster).xy
+        return self._with_residual(seen)
 
     def undistort(self, xy: ArrayLike) -> Array:
         """Undistort raw pixels (n, 2) to undistorted pixels (n, 2).
@@ -313,8 +391,8 @@ class ScanCamera:
 
     def undistort_report(self, xy: ArrayLike) -> Undistortion:
         """Undistort to normalised coordinates, with convergence flags and residuals."""
-        q_d = (self.without_residual(xy) - self._centre) / self.norm_px
-        return undistort_normalised(q_d, self.xi_r, self.xi_t)
+        q_d = (self._deflection(as_points(xy, 2)) - self._centre) / self.norm_px
+        return undistort_normalised(q_d, self.xi_r, self.xi_t, self.xi_s)
 
     # -- rectified pixels -------------------------------------------------------------------------
 
@@ -390,12 +468,12 @@ class ScanCamera:
 
     @property
     def _rectified_from_own(self) -> Array:
-        """(10, 10) from errors of the parameters to those of the parameters of :attr:`rectified`.
+        """(P, P) from errors of the parameters to those of the parameters of :attr:`rectified`.
 
         The rectification is done with the parameters as they are estimated, so an error dM of the
         matrix ``M = m [[a, sigma], [0, 1/a]]`` is left over in the image: m (I + M^-1 dM).
         """
-        matrix = np.eye(10)
+        matrix = np.eye(len(self.names))
         matrix[1:3, 1:3] = [
             [1.0 / self.aspect, 0.0],
             [self.skew / self.aspect**2, 1.0 / self.aspect],
@@ -526,7 +604,7 @@ class ScanCamera:
         def y_resized(y: float) -> float:
             return (y + 0.5) * s - 0.5 + shift_y
 
-        factors = np.array([s, 1.0, 1.0, s, s, 1.0, 1.0, 1.0, s, s])
+        factors = np.array([s if name in _IN_PX else 1.0 for name in self.names])
         covariance, residual = self.covariance, self.residual
         if covariance is not None:
             covariance = covariance * np.outer(factors, factors)
@@ -542,6 +620,7 @@ class ScanCamera:
             ex=x_resized(self.ex),
             ey=y_resized(self.ey),
             norm_px=self.norm_px * s,
+            raster_ratio=self.raster.ratio,
             width=int(width),
             height=int(height),
             covariance=covariance,
@@ -558,7 +637,7 @@ class RectifiedCamera(ScanCamera):
 
     The image is rectified with the parameters as they are estimated, and their errors stay in it.
     ``covariance`` is that of the rectified image's own m, aspect, skew, px, py and rho, followed by
-    xi_r, xi_t, ex and ey of the distortion that was taken out; in :attr:`joint_covariance` and
+    the parameters of the distortion that was taken out; in :attr:`joint_covariance` and
     :meth:`project_jacobian` the coefficients of the residual field that was taken out come last.
 
     Parameters
@@ -587,18 +666,18 @@ class RectifiedCamera(ScanCamera):
         return _congruent(_extend(self.source._rectified_from_own, len(covariance)), covariance)
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
-        """Return the derivative (n, 2, 10 + F) of the rectified pixel of a point.
+        """Return the derivative (n, 2, P + F) of the rectified pixel of a point.
 
         The point is seen at a raw pixel that depends on the true parameters, which is then mapped
         with the estimated ones.
         """
         source, points = self.source, as_points(xyz_m, 3)
-        known, _, by = source._parametric_jacobian(points)
+        known, xy, by = source._parametric_jacobian(points)
         q = (source.project_ideal(points[known]) - source._centre) / source.norm_px
         # The residual field displaces a pixel and is inverted at the same place: it cancels.
-        by = source._rect_from_ideal @ np.linalg.solve(
-            distort_jacobians(q, source.xi_r, source.xi_t)[1], by
-        )
+        by = by * source._stretch(xy)[:, :, None]
+        lens = distort_jacobians(q, source.xi_r, source.xi_t, source.xi_s)[1]
+        by = source._rect_from_ideal @ np.linalg.solve(lens, by)
         own = by @ np.linalg.inv(_extend(source._rectified_from_own, by.shape[2]))
         return _scatter_rows(own, known, len(points))
 

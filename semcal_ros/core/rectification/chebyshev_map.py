@@ -70,6 +70,11 @@ _COMPARED_ROWS = 49
 _COMPARED_IN_ONE_COLUMN = 2.0
 # Degrees down the image of what the field adds; across it, every column has its own values.
 _FIELD_DEGREES = (12, 24, 48)
+# Degrees down the image of what the settling of the beam adds; across it, every column has its own values.
+_SETTLING_DEGREES = (6, 12, 24, 48)
+# Step of the table of settled columns, px, and part of the width by which it goes on beyond the image: the error is an
+# eighth of the square of the step times the curvature of the decay, 3 px over the square of 8 columns.
+_SETTLING_STEP_PX, _SETTLING_BEYOND = 0.125, 0.125
 # Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
 _BEYOND_STEP = 0.125
 # Whole tables of residual fields that are kept: two magnifications may take turns.
@@ -270,6 +275,7 @@ class SmoothMaps:
         self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
         self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._seen: tuple[object, float] | None = None
+        self._settling_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._tested: deque[_TestedMap] = deque(maxlen=_MAX_TESTED)
         # Of the frame before: where to begin.
@@ -289,7 +295,69 @@ class SmoothMaps:
             found = self._map_with_field(size, camera, drift, timing)
             if found is not None:
                 return found
+        return self._map_without_field(size, camera, drift, timing)
+
+    def _map_without_field(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera | None,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> RawMap:
+        """The map by polynomials, with the settling of the beam from a table where there is any.
+
+        The beam is displaced by some columns while it settles, which is too short a time for a drift to be seen.
+        """
+        if camera is not None and camera.settles:
+            found = self._map_with_settling(size, camera, drift, timing)
+            if found is not None:
+                return found
         return self._map_by_polynomials(size, camera, drift, timing)
+
+    def _map_with_settling(
+        self,
+        size: tuple[int, int],
+        camera: ScanCamera,
+        drift: RasterDrift | None,
+        timing: ScanTiming | None,
+    ) -> RawMap | None:
+        width, height = size
+        plain = camera.without_settling
+        smooth = self._map_by_polynomials(size, plain, drift, timing)
+        if smooth._columns is None:
+            return None
+        beyond = _SETTLING_BEYOND * width
+        # A decay is as much longer as a picture is wider.
+        step = _SETTLING_STEP_PX * max(width / 512.0, 1.0)
+        raw = np.arange(-beyond, width + beyond, step)
+        deflected = camera.deflect_columns(raw)
+        if not np.all(np.diff(deflected) > 0.0):
+            return None
+        departure = raw - deflected
+
+        def settle(column: Array) -> Array:
+            """By how much columns without settling are displaced by it."""
+            target = plain.deflect_columns(column)
+            return np.asarray(target + np.interp(target, deflected, departure) - column)
+
+        smooth_degree = len(smooth._columns) - 3
+        for degree in [d for d in _SETTLING_DEGREES if d >= self._settling_degrees.get(size, 0)]:
+            rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
+            columns = np.empty((len(rows.places) + 2, 2 * width), dtype=np.float32)
+            columns[-2:] = smooth._columns[-2:]
+            np.matmul(rows.at_nodes, smooth._columns[:-2], out=columns[:-2])
+            plain_at = columns[:-2, :width].astype(np.float64) + np.arange(width)
+            added = settle(plain_at)
+            # Halfway between the nodes, where interpolation is worst.
+            at_x, at_y = _test_pixels(size)
+            matrix = rows.at_pixels[at_y, :-2].astype(np.float64)
+            error = matrix @ added[:, at_x] - settle(matrix @ plain_at[:, at_x])
+            if not _largest(error) <= _MAX_MAP_ERROR_PX:
+                continue
+            self._settling_degrees.put(size, degree)
+            columns[:-2, :width] += added
+            return RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
+        return None
 
     def _map_with_field(
         self,
@@ -302,7 +370,7 @@ class SmoothMaps:
         width, height = size
         plain = camera.parametric
         moving = None if drift is None else PixelDrift(size, plain, drift, timing)
-        smooth = self._map_by_polynomials(size, plain, drift, timing)
+        smooth = self._map_without_field(size, plain, drift, timing)
         if smooth._columns is None:
             return None
         step = _BEYOND_STEP * height

@@ -52,7 +52,7 @@ def remove_residual_field(camera: ScanCamera) -> ScanCamera:
 
 
 def _compute_jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
-    return project_points_with_jacobians(camera.parameters, points, camera.norm_px)
+    return project_points_with_jacobians(camera.parameters, points, camera.raster)
 
 
 def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, float]:

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     draw_curve,
@@ -126,9 +126,9 @@ def compute_focal_length_px(camera: ScanCamera) -> tuple[float, float]:
     f = camera.m / camera.rho
     if camera.covariance is None:
         return f, 0.0
-    gradient = np.zeros(len(PARAMETER_NAMES))
-    gradient[PARAMETER_NAMES.index("m")] = 1.0 / camera.rho
-    gradient[PARAMETER_NAMES.index("rho")] = -f / camera.rho
+    gradient = np.zeros(len(camera.names))
+    gradient[ALL_NAMES.index("m")] = 1.0 / camera.rho
+    gradient[ALL_NAMES.index("rho")] = -f / camera.rho
     return f, float(np.sqrt(max(float(gradient @ camera.covariance @ gradient), 0.0)))
 
 
@@ -139,7 +139,7 @@ def _collect_values(
     if name == "f":
         pairs = np.array([compute_focal_length_px(c) for c in cameras])
         return pairs[:, 0], pairs[:, 1]
-    k = PARAMETER_NAMES.index(name)
+    k = ALL_NAMES.index(name)
     values = np.array([c.parameters[k] for c in cameras])
     variances = np.array(
         [0.0 if c.covariance is None else float(c.covariance[k, k]) for c in cameras]

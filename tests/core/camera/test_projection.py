@@ -20,13 +20,16 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.camera.projection import (
-    PARAMETER_NAMES,
+    ALL_NAMES,
     project_points,
     project_points_with_jacobians,
 )
+from semcal_ros.core.camera.scan_distortion import Raster
 
-NORM = 256.0
-PARAMETERS = np.array([4.3e5, 1.01, 0.003, 245.0, 262.0, 50.0, 0.06, -0.012, 231.0, 274.0])
+RASTER = Raster.of(512, 448)
+BASIC = np.array([4.3e5, 1.01, 0.003, 245.0, 262.0, 50.0, 0.06, -0.012, 231.0, 274.0])
+TERMS = np.array([-0.008, 0.004, -0.006, 0.002, 0.01, -0.003, 0.002, 0.003, 0.005])
+PARAMETERS = np.concatenate([BASIC, TERMS])
 POINTS = np.random.default_rng(3).uniform(-5e-4, 5e-4, (60, 3))
 
 
@@ -34,16 +37,16 @@ def _central(function, x, step):
     return (function(x + step) - function(x - step)) / 2.0
 
 
-@pytest.mark.parametrize("index", range(10), ids=PARAMETER_NAMES)
+@pytest.mark.parametrize("index", range(19), ids=ALL_NAMES)
 @pytest.mark.parametrize("rho", [50.0, 0.0])
 def test_parameter_derivatives(index, rho):
     parameters = PARAMETERS.copy()
     parameters[5] = rho
     step = max(abs(parameters[index]) * 1e-5, 1e-6)
-    delta = np.zeros(10)
+    delta = np.zeros(19)
     delta[index] = step
-    numeric = _central(lambda p: project_points(p, POINTS, NORM), parameters, delta) / step
-    analytic = project_points_with_jacobians(parameters, POINTS, NORM).d_parameters[:, :, index]
+    numeric = _central(lambda p: project_points(p, POINTS, RASTER), parameters, delta) / step
+    analytic = project_points_with_jacobians(parameters, POINTS, RASTER).d_parameters[:, :, index]
     # Central differences with a relative step of 1e-5 are good to 1e-7 or so of the largest value.
     np.testing.assert_allclose(analytic, numeric, atol=2e-6 * np.abs(numeric).max())
 
@@ -53,13 +56,23 @@ def test_point_derivatives(axis):
     step = 1e-8
     delta = np.zeros(3)
     delta[axis] = step
-    numeric = _central(lambda x: project_points(PARAMETERS, x, NORM), POINTS, delta) / step
-    analytic = project_points_with_jacobians(PARAMETERS, POINTS, NORM).d_xyz[:, :, axis]
+    numeric = _central(lambda x: project_points(PARAMETERS, x, RASTER), POINTS, delta) / step
+    analytic = project_points_with_jacobians(PARAMETERS, POINTS, RASTER).d_xyz[:, :, axis]
     np.testing.assert_allclose(analytic, numeric, atol=2e-6 * np.abs(numeric).max())
 
 
 def test_one_camera_per_point_equals_one_camera():
     table = np.tile(PARAMETERS, (len(POINTS), 1))
     np.testing.assert_array_equal(
-        project_points(table, POINTS, NORM), project_points(PARAMETERS, POINTS, NORM)
+        project_points(table, POINTS, RASTER), project_points(PARAMETERS, POINTS, RASTER)
     )
+
+
+def test_a_camera_without_terms_is_that_with_terms_of_zero():
+    whole = np.concatenate([BASIC, np.zeros(9)])
+    np.testing.assert_array_equal(
+        project_points(BASIC, POINTS, RASTER), project_points(whole, POINTS, RASTER)
+    )
+    few, many = (project_points_with_jacobians(p, POINTS, RASTER) for p in (BASIC, whole))
+    np.testing.assert_array_equal(few.d_parameters, many.d_parameters[:, :, :10])
+    np.testing.assert_array_equal(few.d_xyz, many.d_xyz)

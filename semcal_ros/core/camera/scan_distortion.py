@@ -1,0 +1,238 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Distortion along the axes of the raster: what coils, amplifiers and the flyback do to the position of the beam.
+
+Each axis has a smooth function of its own. Where the beam should be at ``p``, in px, it is at the raw pixel x with
+
+    p = x + n s(u),    u = (x - c) / n
+
+with the middle ``c`` of the picture along this axis, and half its width ``n``. Along the lines
+
+    s(u) = a2 P2(u) + a3 P3(u) + sum_k b_k E_k(u)
+
+has Legendre polynomials, for coils and amplifiers that are not linear, and decays E_k = exp(-(1 + u) / T_k) with the
+time since the line began, for the settling of the beam after the flyback. A few time constants a factor of two apart
+stand for any decay. Across the lines there are the polynomials alone, of (y - c) over half the height.
+
+What shift, scale and rotation describe is no part of any of these functions: a straight line is taken out of each
+decay, and the polynomials have none. So the pixel size stays that of the whole picture, as with the residual field.
+
+Scanning microscopes: Sutton et al. (2007), doi:10.1007/s11340-007-9042-z, find distortion of this kind, constant in
+time, and remove it; they do not model its cause.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+
+__all__ = [
+    "ALONG_COUNT",
+    "SCAN_NAMES",
+    "SETTLING",
+    "SETTLING_TIMES",
+    "Raster",
+    "Undeflection",
+    "deflect_along",
+    "deflection_shift",
+    "deflection_stretch",
+    "raw_from_deflection",
+]
+
+SETTLING_TIMES: tuple[float, ...] = (0.0234, 0.0469, 0.0938, 0.1875)
+"""Time constants of the settling, in half lines: 6, 12, 24 and 48 columns of 512."""
+SCAN_NAMES: tuple[str, ...] = (
+    "coil_x2",
+    "coil_x3",
+    "settling_1",
+    "settling_2",
+    "settling_3",
+    "settling_4",
+    "coil_y2",
+    "coil_y3",
+)
+"""Amplitudes in half image widths: of the functions along the lines, then of those across them."""
+SETTLING = slice(2, 6)
+"""Which of these are the settling."""
+ALONG_COUNT = 6
+"""How many of them are along the lines."""
+# Beyond the picture the functions go on as straight lines.
+_END = 1.0
+# Newton's method converges quadratically; a function as steep as it may be takes five steps.
+_MAX_STEPS = 30
+_TOLERANCE_PX = 1e-10
+_LARGEST_SLOPE = 0.9
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Where a raster lies in its picture.
+
+    Attributes
+    ----------
+    middle_px
+        Middle (x, y) of the picture, px.
+    norm_px
+        Half the width of the picture, px.
+    ratio
+        Height over width of the picture that was calibrated; another one may be a part of it.
+    """
+
+    middle_px: tuple[float, float]
+    norm_px: float
+    ratio: float
+
+    @classmethod
+    def of(cls, width: int, height: int) -> Raster:
+        """Return the raster of a whole picture."""
+        return cls((0.5 * (width - 1.0), 0.5 * (height - 1.0)), 0.5 * width, height / width)
+
+
+@dataclass(frozen=True)
+class Undeflection:
+    """Raw pixels of deflections, and what their derivatives are made of.
+
+    Attributes
+    ----------
+    xy
+        (n, 2) raw pixels; NaN where there is none.
+    stretch
+        (2, n) derivative of the deflection by the raw pixel along each axis.
+    basis
+        (8, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
+    """
+
+    xy: Array
+    stretch: Array
+    basis: Array
+
+
+def _polynomials(u: Array) -> tuple[Array, Array]:
+    """Return P2 and P3, (2, n), and their slopes."""
+    square = u * u
+    values = np.stack([1.5 * square - 0.5, u * (2.5 * square - 1.5)])
+    return values, np.stack([3.0 * u, 7.5 * square - 1.5])
+
+
+def _line_of_decay(time: float) -> tuple[float, float]:
+    """Return the constant and the slope of the straight line that is nearest to a decay over the picture."""
+    end = np.exp(-2.0 / time)
+    mean = 0.5 * time * (1.0 - end)
+    # The mean of u times the decay, three times over, since that of u squared is a third.
+    first = 0.5 * time * (time * (1.0 - end) - (1.0 + end))
+    return mean, 3.0 * first
+
+
+_LINES = np.array([_line_of_decay(time) for time in SETTLING_TIMES])
+_RATES = -1.0 / np.array(SETTLING_TIMES)
+
+
+def _decays(u: Array) -> tuple[Array, Array]:
+    """Return the decays without their straight lines, (k, n), and their slopes."""
+    values = np.exp(_RATES[:, None] * (1.0 + u))
+    slopes = _RATES[:, None] * values
+    return (
+        values - _LINES[:, :1] - _LINES[:, 1:] * u,
+        slopes - _LINES[:, 1:],
+    )
+
+
+def _functions(u: Array, axis: int) -> tuple[Array, Array]:
+    """Return the functions of an axis, (k, n), and their slopes; straight lines beyond the picture."""
+    inside = np.clip(u, -_END, _END)
+    values, slopes = _polynomials(inside)
+    if axis == 0:
+        decays, decay_slopes = _decays(inside)
+        values, slopes = np.concatenate([values, decays]), np.concatenate([slopes, decay_slopes])
+    return values + slopes * (u - inside), slopes
+
+
+def _scale(raster: Raster, axis: int) -> float:
+    return raster.norm_px * (1.0 if axis == 0 else raster.ratio)
+
+
+def _amplitudes(amplitudes: Array, axis: int) -> Array:
+    """Return those of an axis, (k, 1) or (k, n)."""
+    own = amplitudes[..., :ALONG_COUNT] if axis == 0 else amplitudes[..., ALONG_COUNT:]
+    return np.moveaxis(np.atleast_2d(own), -1, 0)
+
+
+def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
+    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (8,) or (n, 8)."""
+    out = np.empty_like(xy)
+    for axis in (0, 1):
+        values, _ = _functions((xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis), axis)
+        out[:, axis] = raster.norm_px * np.sum(_amplitudes(amplitudes, axis) * values, axis=0)
+    return out
+
+
+def deflect_along(x: Array, amplitudes: Array, raster: Raster) -> Array:
+    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (8,)."""
+    flat = x.ravel()
+    own = amplitudes[:ALONG_COUNT]
+    if not np.any(own):
+        return x
+    # Without settling there is no need of the decays, which cost the most.
+    u = (flat - raster.middle_px[0]) / raster.norm_px
+    if np.any(own[2:]):
+        values, _ = _functions(u, 0)
+        return (flat + raster.norm_px * (own @ values)).reshape(x.shape)
+    values, _ = _functions(u, 1)
+    return (flat + raster.norm_px * (own[:2] @ values)).reshape(x.shape)
+
+
+def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
+    """Return the (n, 2) derivative of the deflection along each axis by the raw pixel, at raw pixels (n, 2)."""
+    out = np.ones_like(xy)
+    for axis in (0, 1) if np.any(amplitudes) else ():
+        scale = _scale(raster, axis)
+        _, slopes = _functions((xy[:, axis] - raster.middle_px[axis]) / scale, axis)
+        own = _amplitudes(amplitudes, axis)
+        out[:, axis] += raster.norm_px / scale * np.sum(own * slopes, axis=0)
+    return out
+
+
+def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Undeflection:
+    """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
+
+    Newton's method along each axis on its own. A point without a raw pixel, where the beam would stand still or go
+    back, is NaN. ``amplitudes`` are (8,) or (n, 8).
+    """
+    xy, stretch = deflection.copy(), np.ones((2, len(deflection)))
+    basis = np.zeros((len(SCAN_NAMES), len(deflection)))
+    for axis in (0, 1):
+        own = _amplitudes(amplitudes, axis)
+        rows = slice(0, ALONG_COUNT) if axis == 0 else slice(ALONG_COUNT, None)
+        scale, middle, target = _scale(raster, axis), raster.middle_px[axis], deflection[:, axis]
+        x, steps = target.copy(), _MAX_STEPS if np.any(own) else 0
+        values, slopes = _functions((x - middle) / scale, axis)
+        for _ in range(steps):
+            slope = 1.0 + raster.norm_px / scale * np.sum(own * slopes, axis=0)
+            miss = x + raster.norm_px * np.sum(own * values, axis=0) - target
+            change = miss / np.where(slope > 1.0 - _LARGEST_SLOPE, slope, np.nan)
+            x = x - change
+            values, slopes = _functions((x - middle) / scale, axis)
+            if not np.any(np.abs(change) > _TOLERANCE_PX):
+                break
+        else:
+            if steps:
+                x = np.where(np.abs(change) > _TOLERANCE_PX, np.nan, x)
+        xy[:, axis] = x
+        stretch[axis] = 1.0 + raster.norm_px / scale * np.sum(own * slopes, axis=0)
+        basis[rows] = raster.norm_px * values
+    return Undeflection(xy, stretch, basis)
