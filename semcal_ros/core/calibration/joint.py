@@ -93,6 +93,8 @@ _SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
 # Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
+# Rounds of other poses, each after an adjustment to the last ones.
+_MAX_TURNS = 5
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
 # the views leave open of them enters the covariance.
 _RESERVE, _LEAST_SIZE = 2, 5
@@ -542,6 +544,11 @@ def _select_and_adjust(
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
     result = _refine_coarsely(problem, state)
+    for _ in range(_MAX_TURNS):
+        state, count = _try_other_poses(setup, functions, spread, result.state)
+        if count == 0:
+            break
+        result = _refine_coarsely(problem, state)
     converged, rounds = False, 0
     terms = () if setup.priors.is_wide else TERM_NAMES
     while rounds < _MAX_ROUNDS and not converged:
@@ -562,19 +569,30 @@ def _select_and_adjust(
     return Adjustment(functions, problem, result, spread, rounds, converged)
 
 
+def _try_other_poses(
+    setup: Setup, functions: Functions, spread: VarianceComponents, state: State
+) -> tuple[State, int]:
+    """Try the mirrored tilt of every view, and a pose from the affine part of it; return how many fit better.
+
+    A tilt that was chosen while the camera was still wrong may have the wrong sign, and then holds the camera back.
+    """
+    thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
+    few = build_problem(thin, functions, thin.views, spread)
+    state, mirrored = resolve_mirrored_tilts(few, state)
+    state, restarted = restart_poses(thin, few, state)
+    return state, mirrored + restarted
+
+
 def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     """Adjust exactly with the chosen functions, after trying both signs of every tilt.
 
     The variance components are updated until they no longer change.
     """
-    thin = replace(setup, views=tuple(_thin_view(v) for v in setup.views))
     functions = adjustment.functions
     # From what is usual: spreads that were wide while the model was wrong would hold it there.
     spread = update_components(setup, adjustment.problem, adjustment.result)
     spread = limit_components(setup, spread)
-    few = build_problem(thin, functions, thin.views, spread)
-    state, _ = resolve_mirrored_tilts(few, adjustment.result.state)
-    state, _ = restart_poses(thin, few, state)
+    state, _ = _try_other_poses(setup, functions, spread, adjustment.result.state)
     for _ in range(_LAST_UPDATES):
         problem = build_problem(setup, functions, setup.views, spread)
         result = _right_way_up(setup, functions, problem, _refine_coarsely(problem, state))

@@ -67,7 +67,7 @@ class Summary:
         magnification i is ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of
         the noise variance.
     shared_mean, shared_precision
-        (C - 19,) prior of the shared unknowns.
+        (C - 23,) prior of the shared unknowns.
     """
 
     information: Array

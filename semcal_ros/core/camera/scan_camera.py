@@ -100,7 +100,7 @@ class ScanCamera:
         Centre of the distortion, px.
     xi_s
         Spiral distortion in normalised coordinates.
-    coil_x2, coil_x3, settling_1, settling_2, settling_3, settling_4, coil_y2, coil_y3
+    coil_x2 to coil_x5, settling_1 to settling_4, coil_y2 to coil_y5
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
     raster_ratio
@@ -146,12 +146,16 @@ class ScanCamera:
     xi_s: float = 0.0
     coil_x2: float = 0.0
     coil_x3: float = 0.0
+    coil_x4: float = 0.0
+    coil_x5: float = 0.0
     settling_1: float = 0.0
     settling_2: float = 0.0
     settling_3: float = 0.0
     settling_4: float = 0.0
     coil_y2: float = 0.0
     coil_y3: float = 0.0
+    coil_y4: float = 0.0
+    coil_y5: float = 0.0
     raster_ratio: float | None = None
 
     def __post_init__(self) -> None:
@@ -201,7 +205,7 @@ class ScanCamera:
 
     @property
     def all_parameters(self) -> Array:
-        """(19,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
+        """(23,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
         return np.array([getattr(self, name) for name in ALL_NAMES], dtype=np.float64)
 
     @property

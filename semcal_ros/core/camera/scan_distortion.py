@@ -20,9 +20,9 @@ Each axis has a smooth function of its own. Where the beam should be at ``p``, i
 
 with the middle ``c`` of the picture along this axis, and half its width ``n``. Along the lines
 
-    s(u) = a2 P2(u) + a3 P3(u) + sum_k b_k E_k(u)
+    s(u) = sum_k a_k P_k(u) + sum_k b_k E_k(u)
 
-has Legendre polynomials, for coils and amplifiers that are not linear, and decays E_k = exp(-(1 + u) / T_k) with the
+has Legendre polynomials P2 to P5, for coils and amplifiers that are not linear, and decays E_k = exp(-(1 + u) / T_k) with the
 time since the line began, for the settling of the beam after the flyback. A few time constants a factor of two apart
 stand for any decay. Across the lines there are the polynomials alone, of (y - c) over half the height.
 
@@ -59,17 +59,21 @@ SETTLING_TIMES: tuple[float, ...] = (0.0234, 0.0469, 0.0938, 0.1875)
 SCAN_NAMES: tuple[str, ...] = (
     "coil_x2",
     "coil_x3",
+    "coil_x4",
+    "coil_x5",
     "settling_1",
     "settling_2",
     "settling_3",
     "settling_4",
     "coil_y2",
     "coil_y3",
+    "coil_y4",
+    "coil_y5",
 )
 """Amplitudes in half image widths: of the functions along the lines, then of those across them."""
-SETTLING = slice(2, 6)
+SETTLING = slice(4, 8)
 """Which of these are the settling."""
-ALONG_COUNT = 6
+ALONG_COUNT = 8
 """How many of them are along the lines."""
 # Beyond the picture the functions go on as straight lines.
 _END = 1.0
@@ -114,7 +118,7 @@ class Undeflection:
     stretch
         (2, n) derivative of the deflection by the raw pixel along each axis.
     basis
-        (8, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
+        (12, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
     """
 
     xy: Array
@@ -123,10 +127,14 @@ class Undeflection:
 
 
 def _polynomials(u: Array) -> tuple[Array, Array]:
-    """Return P2 and P3, (2, n), and their slopes."""
-    square = u * u
-    values = np.stack([1.5 * square - 0.5, u * (2.5 * square - 1.5)])
-    return values, np.stack([3.0 * u, 7.5 * square - 1.5])
+    """Return P2 to P5, (4, n), and their slopes."""
+    u2 = u * u
+    u4 = u2 * u2
+    values = [1.5 * u2 - 0.5, u * (2.5 * u2 - 1.5)]
+    values += [4.375 * u4 - 3.75 * u2 + 0.375, u * (7.875 * u4 - 8.75 * u2 + 1.875)]
+    slopes = [3.0 * u, 7.5 * u2 - 1.5]
+    slopes += [u * (17.5 * u2 - 7.5), 39.375 * u4 - 26.25 * u2 + 1.875]
+    return np.stack(values), np.stack(slopes)
 
 
 def _line_of_decay(time: float) -> tuple[float, float]:
@@ -173,7 +181,7 @@ def _amplitudes(amplitudes: Array, axis: int) -> Array:
 
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (8,) or (n, 8)."""
+    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (12,) or (n, 12)."""
     out = np.empty_like(xy)
     for axis in (0, 1):
         values, _ = _functions((xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis), axis)
@@ -182,18 +190,18 @@ def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
 
 
 def deflect_along(x: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (8,)."""
+    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (12,)."""
     flat = x.ravel()
     own = amplitudes[:ALONG_COUNT]
     if not np.any(own):
         return x
     # Without settling there is no need of the decays, which cost the most.
     u = (flat - raster.middle_px[0]) / raster.norm_px
-    if np.any(own[2:]):
+    if np.any(own[SETTLING]):
         values, _ = _functions(u, 0)
         return (flat + raster.norm_px * (own @ values)).reshape(x.shape)
     values, _ = _functions(u, 1)
-    return (flat + raster.norm_px * (own[:2] @ values)).reshape(x.shape)
+    return (flat + raster.norm_px * (own[: SETTLING.start] @ values)).reshape(x.shape)
 
 
 def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
@@ -211,7 +219,7 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
     """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
 
     Newton's method along each axis on its own. A point without a raw pixel, where the beam would stand still or go
-    back, is NaN. ``amplitudes`` are (8,) or (n, 8).
+    back, is NaN. ``amplitudes`` are (12,) or (n, 12).
     """
     xy, stretch = deflection.copy(), np.ones((2, len(deflection)))
     basis = np.zeros((len(SCAN_NAMES), len(deflection)))
