@@ -539,26 +539,30 @@ def _select_and_adjust(
     state: State,
     spread: VarianceComponents,
     sizes: Mapping[str, tuple[str, int]] | None = None,
+    *,
+    choose_terms: bool = True,
 ) -> Adjustment:
-    """Choose the number of coefficients of every function until the choice no longer changes."""
+    """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
+    changes.
+
+    Beside a residual field the terms stay as they are, since it takes the place of those that are not there.
+    """
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=_theta(setup, functions, state))
-    result = _refine_coarsely(problem, state)
-    for _ in range(_MAX_TURNS):
-        state, count = _try_other_poses(setup, functions, spread, result.state)
-        if count == 0:
-            break
-        result = _refine_coarsely(problem, state)
+    result, _ = _adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
-    terms = () if setup.priors.is_wide else TERM_NAMES
+    terms = () if setup.priors.is_wide or not choose_terms else TERM_NAMES
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
-        every = build_problem(setup, functions, setup.views, spread, candidates=ALL_FUNCTIONS)
+        every = build_problem(setup, functions, setup.views, spread, candidates=terms)
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
         chosen = select_functions(summary, setup, functions, _SMOOTH, terms, sizes)
-        converged = chosen == sizes
-        if converged:
-            break
+        if chosen == sizes:
+            result, count = _adjust_with_other_poses(
+                setup, functions, spread, problem, result.state
+            )
+            converged = count == 0
+            continue
         sizes = chosen
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
         spread = update_components(setup, problem, result)
@@ -567,6 +571,23 @@ def _select_and_adjust(
         result = _refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
     return Adjustment(functions, problem, result, spread, rounds, converged)
+
+
+def _adjust_with_other_poses(
+    setup: Setup,
+    functions: Functions,
+    spread: VarianceComponents,
+    problem: Problem,
+    state: State,
+) -> tuple[BundleResult, int]:
+    """Adjust, and adjust to other poses as long as some fit better; return how many did."""
+    result, total = _refine_coarsely(problem, state), 0
+    for _ in range(_MAX_TURNS):
+        state, count = _try_other_poses(setup, functions, spread, result.state)
+        if count == 0:
+            break
+        result, total = _refine_coarsely(problem, state), total + count
+    return result, total
 
 
 def _try_other_poses(
@@ -646,6 +667,9 @@ def _add_field(
     field = blank = blank_field(setup)
     start, before = adjustment, setup
     for turn in range(_MAX_FIELD_TURNS):
+        if np.any(adjustment.result.lost):
+            # A field that moves corners to where the camera shows nothing is none.
+            return start, None, None
         system = field_system(setup, adjustment.problem, adjustment.result, field)
         if turn < _CHOOSING_TURNS:
             choice = choose_field(setup, system, blank)
@@ -669,12 +693,7 @@ def _add_field(
 
 def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
     own = adjustment.functions
-    none = dict.fromkeys(TERM_NAMES, ("chebyshev_log", 0))
-    return none | {
-        name: (own[name].kind, own[name].smooth_size)
-        for name in names_of(own)
-        if name in _SMOOTH or name in TERM_NAMES
-    }
+    return {name: (own[name].kind, own[name].smooth_size) for name in _SMOOTH}
 
 
 def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:
@@ -683,7 +702,8 @@ def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: b
     spread = update_components(setup, adjustment.problem, adjustment.result)
     state = replace(adjustment.result.state, theta=theta)
     if choosing:
-        return _select_and_adjust(setup, functions, state, spread, _current_sizes(adjustment))
+        sizes = _current_sizes(adjustment)
+        return _select_and_adjust(setup, functions, state, spread, sizes, choose_terms=False)
     problem = build_problem(setup, functions, setup.views, spread)
     result = _refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
@@ -725,7 +745,7 @@ def fit_joint(
     if excess > 0.0 or start_px > 0.0:
         spread = update_components(setup, adjustment.problem, adjustment.result)
         adjustment = _select_and_adjust(
-            final, adjustment.functions, adjustment.result.state, spread
+            final, adjustment.functions, adjustment.result.state, spread, choose_terms=field is None
         )
     on_stage("final adjustment", 0.75)
     adjustment = _adjust_exactly(final, adjustment)

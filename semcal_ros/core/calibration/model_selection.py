@@ -34,10 +34,10 @@ from semcal_ros.core.calibration.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.normal_equations import Problem
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor, with_shared
-from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES
+from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
-__all__ = ["Summary", "select_functions"]
+__all__ = ["Summary", "candidate_names", "select_functions"]
 
 
 # Most coefficients of one function. It bounds the search; with few magnifications their number is
@@ -67,7 +67,7 @@ class Summary:
         magnification i is ``0.5 c' information[i] c - right[i]' c`` plus a constant, in units of
         the noise variance.
     shared_mean, shared_precision
-        (C - 23,) prior of the shared unknowns.
+        (C - P,) prior of the shared unknowns.
     """
 
     information: Array
@@ -90,6 +90,13 @@ class Summary:
         )
 
 
+def candidate_names(
+    functions: Mapping[str, ContinuousFunction], terms: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the names of functions that are there, or may be chosen from ``terms``, in the order of all."""
+    return tuple(name for name in ALL_FUNCTIONS if name in functions or name in terms)
+
+
 class _Candidates:
     """Cross-validation scores of candidate function sets.
 
@@ -97,7 +104,14 @@ class _Candidates:
     choice among them.
     """
 
-    def __init__(self, summary: Summary, setup: Setup, base: Mapping[str, ContinuousFunction]):
+    def __init__(
+        self,
+        summary: Summary,
+        setup: Setup,
+        base: Mapping[str, ContinuousFunction],
+        terms: Sequence[str],
+    ):
+        self.names = candidate_names(base, terms)
         self.setup = setup
         self.scores: dict[tuple[tuple[str, int], ...], float] = {}
         self.priors: dict[tuple[str, str, int], tuple[Array, Array]] = {}
@@ -107,8 +121,8 @@ class _Candidates:
         magnifications = [float(g) for g in setup.magnifications]
         blocks: list[Array] = []
         rows: list[int] = []
-        for row, name in enumerate(ALL_FUNCTIONS):
-            most = _MAX_TERM_SIZE if name in TERM_NAMES else _MAX_SIZE
+        for row, name in enumerate(self.names):
+            most = _MAX_TERM_SIZE if name in terms else _MAX_SIZE
             most = max(most, base[name].smooth_size if name in base else 0)
             for kind in _POLYNOMIALS:
                 blank = ContinuousFunction(kind, np.zeros(most), base["scale"].g_range)
@@ -126,7 +140,7 @@ class _Candidates:
         # The scale is the first of the functions.
         nominal = setup.nominal_px_per_m(setup.magnifications)
         values[:, np.array(rows) == 0] *= nominal[:, None]
-        designs = np.zeros((len(magnifications), len(ALL_FUNCTIONS), len(rows)))
+        designs = np.zeros((len(magnifications), len(self.names), len(rows)))
         designs[:, rows, np.arange(len(rows))] = values
         designs = with_shared(designs, shared)
         transposed = np.swapaxes(designs, 1, 2)
@@ -144,18 +158,18 @@ class _Candidates:
 
     def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
         """Return the cost of predicting inner magnifications and of fitting the outermost ones."""
-        key = tuple(sizes[name] for name in ALL_FUNCTIONS)
+        key = tuple(sizes[name] for name in self.names)
         if key not in self.scores:
             self.scores[key] = self._score(sizes)
         return self.scores[key]
 
     def _score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
         chosen: list[Indices] = []
-        for name in ALL_FUNCTIONS:
+        for name in self.names:
             kind, size = sizes[name]
             chosen += [self.columns[name, kind][:size], self.jumps[name]]
         columns = np.concatenate([*chosen, self.shared])
-        priors = [self._prior(name, *sizes[name]) for name in ALL_FUNCTIONS]
+        priors = [self._prior(name, *sizes[name]) for name in self.names]
         mean, precision = (
             np.concatenate(parts) for parts in zip(*priors, self.shared_prior, strict=True)
         )
@@ -186,12 +200,11 @@ def select_functions(
     costs less. One of ``terms`` may have none, and needs more of a gain for the first. The ``current``
     choice stays unless another one is clearly better.
     """
-    candidates = _Candidates(summary, setup, functions)
+    candidates = _Candidates(summary, setup, functions, terms)
     most = len(setup.magnifications) - 1
     limits = {name: min(_MAX_SIZE, most) for name in free}
     limits |= {name: min(_MAX_TERM_SIZE, max(most, 1)) for name in terms}
-    sizes = dict.fromkeys(ALL_FUNCTIONS, ("chebyshev_log", 0))
-    sizes |= {name: (own.kind, own.smooth_size) for name, own in functions.items()}
+    sizes = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
     sizes.update(dict.fromkeys(terms, ("chebyshev_log", 0)))
     while True:

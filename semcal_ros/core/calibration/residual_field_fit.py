@@ -77,6 +77,9 @@ _MAX_FOLDS = 6
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)
 # Least gain of a worthwhile field, in held-out half chi-squares and in standard errors.
 _LEAST_GAIN, _CLEARLY = 6.0, 2.5
+# Least RMS size of a field at the corners, in sigmas of a corner: a smaller one costs more certainty, where there are
+# no corners, than it is worth.
+_LEAST_SIGMAS = 0.15
 # Part of the members that must gain: what is in a few of them only is no distortion of the microscope.
 _MOST_MEMBERS = 2.0 / 3.0
 
@@ -103,6 +106,8 @@ class FieldSystem:
         (K,) prior of theta.
     excess
         (N,) half chi-squares of the residuals beyond those that the corners' own noise explains.
+    observations
+        (N,) number of coordinates of corners.
     """
 
     information: Array
@@ -113,6 +118,7 @@ class FieldSystem:
     theta_mean: Array
     theta_precision: Array
     excess: Array
+    observations: Array
 
     def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
         """Assemble the normal equations of theta and the field, which has precision ``prior``."""
@@ -283,8 +289,10 @@ def field_system(
     excess = np.add.reduceat(
         result.huber_weight * (1.0 - own_variance / variance), problem.starts[:-1]
     )
+    observations = 2.0 * np.diff(problem.starts)
     if not few:
         count = len(setup.magnifications)
+        observations = sum_by(problem.group, count, observations)
         excess = sum_by(problem.group, count, excess)
         information, right = (sum_by(group, count, a) for a in (information, right))
         group = np.arange(count, dtype=np.intp)
@@ -297,6 +305,7 @@ def field_system(
         problem.prior_mean,
         problem.prior_sigma**-2.0,
         excess,
+        observations,
     )
 
 
@@ -390,12 +399,15 @@ def choose_field(
     sigma = float(np.sqrt(2.0 * max(gain, 0.0)))
     most = np.mean(gains[best] > 0.0) >= _MOST_MEMBERS
     prior = _prior(blank, best, setup.norm_px)
-    excess = float(np.sum(system.excess[np.any(folds, axis=0)]))
+    judged = np.any(folds, axis=0)
+    excess = float(np.sum(system.excess[judged]))
+    # A displacement of so many sigmas in each coordinate gains half its square.
+    least = 0.5 * _LEAST_SIGMAS**2 * float(np.sum(system.observations[judged]))
     return FieldChoice(
         strength_px=best,
         gain=gain,
         gain_sigma=sigma,
-        worthwhile=bool(most and gain > max(_LEAST_GAIN, _CLEARLY * sigma)),
+        worthwhile=bool(most and gain > max(_LEAST_GAIN, _CLEARLY * sigma, least)),
         explained=gain / excess if excess > 0.0 else np.inf,
         prior=prior,
     )

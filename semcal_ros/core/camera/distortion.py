@@ -17,13 +17,14 @@
 The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and
 half the image width ``n``:
 
-    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + xi_t (r2 + 2 q*q) + xi_s r2 (-q_y, q_x),      r2 = |q|^2
+    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + (xi_t + xi_u (1, -1)) * (r2 + 2 q*q) + xi_s r2 (-q_y, q_x),   r2 = |q|^2
 
 The radial term is the closed form of the division model (Fitzgibbon 2001,
 doi:10.1109/CVPR.2001.990465), the tangential one is the consistent reading of equation (2) of Malti
 et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed bracket adds a squared displacement vector
-to a scalar. The spiral term is the third-order anisotropic distortion of a magnetic lens, which turns what
-is farther from its axis more (Hawkes and Kasper, Principles of Electron Optics, ch. 24).
+to a scalar. It stands for decentring along one diagonal, and xi_u for decentring along the other. The spiral term is
+the third-order anisotropic distortion of a magnetic lens, which turns what is farther from its axis more (Hawkes and
+Kasper, Principles of Electron Optics, ch. 24).
 """
 
 from __future__ import annotations
@@ -74,33 +75,43 @@ def _radial(r2: Array, xi_r: Array) -> tuple[Array, Array]:
 
 
 def distort_normalised(
-    q: Array, xi_r: Array | float, xi_t: Array | float, xi_s: Array | float = 0.0
+    q: Array,
+    xi_r: Array | float,
+    xi_t: Array | float,
+    xi_s: Array | float = 0.0,
+    xi_u: Array | float = 0.0,
 ) -> Array:
     """Distort (n, 2) normalised points; NaN rows where ``4 xi_r r2 >= 1``.
 
-    ``xi_r``, ``xi_t`` and ``xi_s`` are scalars or arrays of shape (n,).
+    The coefficients are scalars or arrays of shape (n,).
     """
     squares = q * q
     r2 = squares[:, 0] + squares[:, 1]
     _, factor = _radial(r2, np.asarray(xi_r, dtype=np.float64))
     tangential = np.asarray(xi_t, dtype=np.float64)[..., None] * (r2[:, None] + 2.0 * squares)
-    spiral = np.asarray(xi_s, dtype=np.float64)
-    if not np.any(spiral):
-        return factor[:, None] * q + tangential
-    turned = (spiral * r2)[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
-    return factor[:, None] * q + tangential + turned
+    out = factor[:, None] * q + tangential
+    spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
+    if np.any(spiral):
+        out += (spiral * r2)[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
+    if np.any(across):
+        out += across[..., None] * (r2[:, None] + 2.0 * squares) * [1.0, -1.0]
+    return out
 
 
 def distort_jacobians(
-    q: Array, xi_r: Array | float, xi_t: Array | float, xi_s: Array | float = 0.0
+    q: Array,
+    xi_r: Array | float,
+    xi_t: Array | float,
+    xi_s: Array | float = 0.0,
+    xi_u: Array | float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Distort points, with derivatives.
 
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 3); the last axis of ``df_dxi`` is (xi_r,
-        xi_t, xi_s).
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 4); the last axis of ``df_dxi`` is (xi_r,
+        xi_t, xi_s, xi_u).
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
     xi_tangential = np.asarray(xi_t, dtype=np.float64)
@@ -114,7 +125,7 @@ def distort_jacobians(
     along = 2.0 * growth * xi_radial
     tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
     # In memory the points come last, which is faster; in shape they come first, as elsewhere.
-    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((3, 2, len(q)))
+    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((4, 2, len(q)))
     df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
     df_dq[0, 1] = along * x * y + tangential_y
     df_dq[1, 0] = along * x * y + tangential_x
@@ -122,7 +133,14 @@ def distort_jacobians(
     df_dxi[0] = growth * r2 * q.T
     df_dxi[1] = bracket.T
     df_dxi[2, 0], df_dxi[2, 1] = -r2 * y, r2 * x
-    spiral = np.asarray(xi_s, dtype=np.float64)
+    df_dxi[3, 0], df_dxi[3, 1] = bracket[:, 0], -bracket[:, 1]
+    spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
+    if np.any(across):
+        f = f + across[..., None] * df_dxi[3].T
+        df_dq[0, 0] += 6.0 * across * x
+        df_dq[0, 1] += 2.0 * across * y
+        df_dq[1, 0] -= 2.0 * across * x
+        df_dq[1, 1] -= 6.0 * across * y
     if np.any(spiral):
         f = f + spiral[..., None] * df_dxi[2].T
         df_dq[0, 0] -= 2.0 * spiral * x * y
@@ -132,7 +150,9 @@ def distort_jacobians(
     return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 
-def undistort_normalised(q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0) -> Undistortion:
+def undistort_normalised(
+    q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0, xi_u: float = 0.0
+) -> Undistortion:
     """Invert the distortion of (n, 2) normalised points.
 
     The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's
@@ -142,7 +162,7 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0
     rd2 = np.sum(q_d * q_d, axis=1)
     branch = np.isfinite(rd2) & (1.0 + xi_r * rd2 > 0.0) & (xi_r * rd2 < 1.0)
     start = q_d / np.where(branch, 1.0 + xi_r * rd2, np.nan)[:, None]
-    if xi_t == xi_s == 0.0:
+    if xi_t == xi_s == xi_u == 0.0:
         return Undistortion(start, branch, 0, np.where(branch, 0.0, np.nan))
 
     q = np.where(branch[:, None], start, np.nan)
@@ -152,7 +172,7 @@ def undistort_normalised(q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0
     active = np.flatnonzero(branch)
     while active.size and iterations < _MAX_ITERATIONS:
         iterations += 1
-        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s)
+        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s, xi_u)
         miss = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.

@@ -38,6 +38,7 @@ from semcal_ros.core.camera.scan_distortion import (
     ALONG_COUNT,
     SCAN_NAMES,
     Raster,
+    linearise_scan,
     raw_from_deflection,
 )
 
@@ -64,8 +65,8 @@ PARAMETER_NAMES: tuple[str, ...] = (
     "ey",
 )
 """The parameters that every camera has."""
-ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, "xi_s", *SCAN_NAMES)
-"""All parameters: after those of every camera the spiral distortion of the lens, and the distortion of the scan."""
+ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, "xi_s", "xi_u", *SCAN_NAMES)
+"""All parameters: after those of every camera further distortion of the lens, and the distortion of the scan."""
 
 
 @dataclass(frozen=True)
@@ -105,19 +106,19 @@ def project_points(parameters: Array, xyz_m: Array, raster: Raster) -> Array:
     """Project points to raw (distorted) pixels (n, 2); NaN where the model has no answer."""
     centre, norm_px = parameters[..., 8:10], raster.norm_px
     q = (project_ideal_points(parameters, xyz_m) - centre) / norm_px
-    xi_r, xi_t, xi_s, amplitudes = _distortion(parameters)
-    deflection = centre + norm_px * distort_normalised(q, xi_r, xi_t, xi_s)
+    lens, amplitudes = _distortion(parameters)
+    deflection = centre + norm_px * distort_normalised(q, *lens)
     if amplitudes is None or not np.any(amplitudes):
         return deflection
-    return raw_from_deflection(deflection, amplitudes, raster).xy
+    return raw_from_deflection(deflection, amplitudes, raster)
 
 
-def _distortion(parameters: Array) -> tuple[Array, Array, Array | float, Array | None]:
-    """Return radial, tangential and spiral distortion, and the amplitudes of that of the scan, where there are any."""
-    xi_r, xi_t = parameters[..., 6], parameters[..., 7]
+def _distortion(parameters: Array) -> tuple[list[Array], Array | None]:
+    """Return the coefficients of the lens, and the amplitudes of the scan where there are any."""
+    lens = [parameters[..., 6], parameters[..., 7]]
     if parameters.shape[-1] == len(PARAMETER_NAMES):
-        return xi_r, xi_t, 0.0, None
-    return xi_r, xi_t, parameters[..., 10], parameters[..., 11:]
+        return lens, None
+    return [*lens, parameters[..., 10], parameters[..., 11]], parameters[..., 12:]
 
 
 def project_points_with_jacobians(
@@ -130,7 +131,7 @@ def project_points_with_jacobians(
     n, norm_px = len(xyz_m), raster.norm_px
     count = np.shape(parameters)[-1]
     table = np.broadcast_to(parameters, (n, count))
-    m, a, skew, px, py, rho, xi_r, xi_t = table[:, :8].T
+    m, a, skew, px, py, rho = table[:, :6].T
     centre = table[:, 8:10]
     x, y, z = xyz_m.T
     w = 1.0 + rho * z
@@ -141,10 +142,13 @@ def project_points_with_jacobians(
     scaled_u, scaled_v = scale * u, scale * v
     ideal = np.stack([px + scaled_u, py + scaled_v], axis=1)
 
-    _, _, xi_s, amplitudes = _distortion(table)
-    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, xi_r, xi_t, xi_s)
+    lens, amplitudes = _distortion(table)
+    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, *lens)
     xy = centre + norm_px * f
-    scan = None if amplitudes is None else raw_from_deflection(xy, amplitudes, raster)
+    scan = None
+    if amplitudes is not None:
+        xy = raw_from_deflection(xy, amplitudes, raster)
+        scan = linearise_scan(xy, amplitudes, raster)
     d_xyz, d_parameters = np.empty((2, 3, n)), np.zeros((2, count, n))
     up, tilt = rho * inverse_w, z * inverse_w
     for row in (0, 1):
@@ -168,11 +172,11 @@ def project_points_with_jacobians(
         d_parameters[row, 9] = -by_y
         d_parameters[row, 8 + row] += own
         if scan is not None:
-            d_parameters[row, 10] = by_xi[2]
+            d_parameters[row, 10:12] = by_xi[2:]
             functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
-            d_parameters[row, 11:][functions] = -own * scan.basis[functions]
+            d_parameters[row, 12:][functions] = -own * scan.basis[functions]
     return ProjectionJacobians(
-        xy if scan is None else scan.xy,
+        xy,
         np.moveaxis(d_xyz, -1, 0),
         np.moveaxis(d_parameters, -1, 0),
     )

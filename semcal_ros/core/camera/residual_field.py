@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
+from semcal_ros.core.camera.scan_distortion import scan_functions
 from semcal_ros.core.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -325,17 +326,20 @@ class ResidualField:
         return float(np.max(total))
 
     def overlaps(self) -> Array:
-        """Return (8, slice_size) inner products with the patterns of the rest of the model.
+        """Return (22, slice_size) inner products with the patterns of the rest of the model.
 
-        These are the shifts, the linear maps, and the patterns of the radial and of the tangential
-        distortion, each with a mean square of 1 over the domain. A field whose coefficients they
-        annul leaves all of that to the camera and to the poses.
+        These are the shifts, the linear maps, the patterns of the distortion of the lens about the middle of the
+        picture, and those of the distortion of the scan, each with a mean square of 1 over the domain. A field whose
+        coefficients they annul leaves all of that to the camera and to the poses.
         """
         q, weight = _quadrature(self.knots_x, self.knots_y)
         x, y = q.T
         zero, one, r2 = np.zeros_like(x), np.ones_like(x), x * x + y * y
         patterns = [(one, zero), (zero, one), (x, zero), (y, zero), (zero, x), (zero, y)]
         patterns += [(r2 * x, r2 * y), (r2 + 2.0 * x * x, r2 + 2.0 * y * y)]
+        patterns += [(-r2 * y, r2 * x), (r2 + 2.0 * x * x, -r2 - 2.0 * y * y)]
+        patterns += [(along, zero) for along in scan_functions(x, 0)]
+        patterns += [(zero, across) for across in scan_functions(y / np.max(np.abs(y)), 1)]
         basis = self.at(self.g_range[0]).basis(q) * weight[:, None]
         rows = []
         for pattern in patterns:

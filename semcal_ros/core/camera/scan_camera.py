@@ -98,8 +98,8 @@ class ScanCamera:
         Radial and tangential distortion in normalised coordinates.
     ex, ey
         Centre of the distortion, px.
-    xi_s
-        Spiral distortion in normalised coordinates.
+    xi_s, xi_u
+        Spiral distortion, and the tangential one along the other diagonal, in normalised coordinates.
     coil_x2 to coil_x5, settling_1 to settling_4, coil_y2 to coil_y5
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
@@ -144,6 +144,7 @@ class ScanCamera:
     in_range: bool = True
     residual: FieldSlice | None = None
     xi_s: float = 0.0
+    xi_u: float = 0.0
     coil_x2: float = 0.0
     coil_x3: float = 0.0
     coil_x4: float = 0.0
@@ -205,7 +206,7 @@ class ScanCamera:
 
     @property
     def all_parameters(self) -> Array:
-        """(23,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
+        """(24,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
         return np.array([getattr(self, name) for name in ALL_NAMES], dtype=np.float64)
 
     @property
@@ -228,6 +229,10 @@ class ScanCamera:
         whole = Raster.of(self.width, self.height)
         ratio = whole.ratio if self.raster_ratio is None else self.raster_ratio
         return Raster(whole.middle_px, self.norm_px, ratio)
+
+    @property
+    def _lens(self) -> tuple[float, ...]:
+        return self.xi_r, self.xi_t, self.xi_s, self.xi_u
 
     @property
     def _scan_amplitudes(self) -> Array:
@@ -380,10 +385,10 @@ class ScanCamera:
     def distort(self, xy: ArrayLike) -> Array:
         """Distort undistorted pixels (n, 2) to raw pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
         q = (as_points(xy, 2) - self._centre) / self.norm_px
-        seen = self._centre + self.norm_px * distort_normalised(q, self.xi_r, self.xi_t, self.xi_s)
+        seen = self._centre + self.norm_px * distort_normalised(q, *self._lens)
         amplitudes = self._scan_amplitudes
         if np.any(amplitudes):
-            seen = raw_from_deflection(seen, amplitudes, self.raster).xy
+            seen = raw_from_deflection(seen, amplitudes, self.raster)
         return self._with_residual(seen)
 
     def undistort(self, xy: ArrayLike) -> Array:
@@ -396,7 +401,7 @@ class ScanCamera:
     def undistort_report(self, xy: ArrayLike) -> Undistortion:
         """Undistort to normalised coordinates, with convergence flags and residuals."""
         q_d = (self._deflection(as_points(xy, 2)) - self._centre) / self.norm_px
-        return undistort_normalised(q_d, self.xi_r, self.xi_t, self.xi_s)
+        return undistort_normalised(q_d, *self._lens)
 
     # -- rectified pixels -------------------------------------------------------------------------
 
@@ -680,7 +685,7 @@ class RectifiedCamera(ScanCamera):
         q = (source.project_ideal(points[known]) - source._centre) / source.norm_px
         # The residual field displaces a pixel and is inverted at the same place: it cancels.
         by = by * source._stretch(xy)[:, :, None]
-        lens = distort_jacobians(q, source.xi_r, source.xi_t, source.xi_s)[1]
+        lens = distort_jacobians(q, *source._lens)[1]
         by = source._rect_from_ideal @ np.linalg.solve(lens, by)
         own = by @ np.linalg.inv(_extend(source._rectified_from_own, by.shape[2]))
         return _scatter_rows(own, known, len(points))

@@ -22,9 +22,10 @@ with the middle ``c`` of the picture along this axis, and half its width ``n``. 
 
     s(u) = sum_k a_k P_k(u) + sum_k b_k E_k(u)
 
-has Legendre polynomials P2 to P5, for coils and amplifiers that are not linear, and decays E_k = exp(-(1 + u) / T_k) with the
-time since the line began, for the settling of the beam after the flyback. A few time constants a factor of two apart
-stand for any decay. Across the lines there are the polynomials alone, of (y - c) over half the height.
+has Legendre polynomials P2 to P5, for coils and amplifiers that are not linear, and decays
+E_k = exp(-(1 + u) / T_k) with the time since the line began, for the settling of the beam after the flyback. A few time
+constants a factor of two apart stand for any decay. Across the lines there are the polynomials alone, of (y - c) over
+half the height.
 
 What shift, scale and rotation describe is no part of any of these functions: a straight line is taken out of each
 decay, and the polynomials have none. So the pixel size stays that of the whole picture, as with the residual field.
@@ -47,11 +48,13 @@ __all__ = [
     "SETTLING",
     "SETTLING_TIMES",
     "Raster",
-    "Undeflection",
+    "ScanDerivatives",
     "deflect_along",
     "deflection_shift",
     "deflection_stretch",
+    "linearise_scan",
     "raw_from_deflection",
+    "scan_functions",
 ]
 
 SETTLING_TIMES: tuple[float, ...] = (0.0234, 0.0469, 0.0938, 0.1875)
@@ -79,7 +82,7 @@ ALONG_COUNT = 8
 _END = 1.0
 # Newton's method converges quadratically; a function as steep as it may be takes five steps.
 _MAX_STEPS = 30
-_TOLERANCE_PX = 1e-10
+_TOLERANCE = 1e-12
 _LARGEST_SLOPE = 0.9
 
 
@@ -108,33 +111,19 @@ class Raster:
 
 
 @dataclass(frozen=True)
-class Undeflection:
-    """Raw pixels of deflections, and what their derivatives are made of.
+class ScanDerivatives:
+    """Derivatives of the deflection.
 
     Attributes
     ----------
-    xy
-        (n, 2) raw pixels; NaN where there is none.
     stretch
         (2, n) derivative of the deflection by the raw pixel along each axis.
     basis
         (12, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
     """
 
-    xy: Array
     stretch: Array
     basis: Array
-
-
-def _polynomials(u: Array) -> tuple[Array, Array]:
-    """Return P2 to P5, (4, n), and their slopes."""
-    u2 = u * u
-    u4 = u2 * u2
-    values = [1.5 * u2 - 0.5, u * (2.5 * u2 - 1.5)]
-    values += [4.375 * u4 - 3.75 * u2 + 0.375, u * (7.875 * u4 - 8.75 * u2 + 1.875)]
-    slopes = [3.0 * u, 7.5 * u2 - 1.5]
-    slopes += [u * (17.5 * u2 - 7.5), 39.375 * u4 - 26.25 * u2 + 1.875]
-    return np.stack(values), np.stack(slopes)
 
 
 def _line_of_decay(time: float) -> tuple[float, float]:
@@ -148,6 +137,15 @@ def _line_of_decay(time: float) -> tuple[float, float]:
 
 _LINES = np.array([_line_of_decay(time) for time in SETTLING_TIMES])
 _RATES = -1.0 / np.array(SETTLING_TIMES)
+# Coefficients of the powers of u in P2 to P5.
+_POWERS = np.array(
+    [
+        [-0.5, 0.0, 1.5, 0.0, 0.0, 0.0],
+        [0.0, -1.5, 0.0, 2.5, 0.0, 0.0],
+        [0.375, 0.0, -3.75, 0.0, 4.375, 0.0],
+        [0.0, 1.875, 0.0, -8.75, 0.0, 7.875],
+    ]
+)
 
 
 def _decays(u: Array) -> tuple[Array, Array]:
@@ -163,11 +161,17 @@ def _decays(u: Array) -> tuple[Array, Array]:
 def _functions(u: Array, axis: int) -> tuple[Array, Array]:
     """Return the functions of an axis, (k, n), and their slopes; straight lines beyond the picture."""
     inside = np.clip(u, -_END, _END)
-    values, slopes = _polynomials(inside)
+    powers = np.stack([np.ones_like(inside), *np.cumprod(np.stack([inside] * 5), axis=0)])
+    values, slopes = _POWERS @ powers, (_POWERS[:, 1:] * np.arange(1.0, 6.0)) @ powers[:-1]
     if axis == 0:
         decays, decay_slopes = _decays(inside)
         values, slopes = np.concatenate([values, decays]), np.concatenate([slopes, decay_slopes])
     return values + slopes * (u - inside), slopes
+
+
+def scan_functions(u: Array, axis: int) -> Array:
+    """Return the functions along the lines (``axis`` 0) or across them at ``u`` in half pictures, (8 or 4, n)."""
+    return _functions(u, axis)[0]
 
 
 def _scale(raster: Raster, axis: int) -> float:
@@ -206,41 +210,95 @@ def deflect_along(x: Array, amplitudes: Array, raster: Raster) -> Array:
 
 def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return the (n, 2) derivative of the deflection along each axis by the raw pixel, at raw pixels (n, 2)."""
-    out = np.ones_like(xy)
-    for axis in (0, 1) if np.any(amplitudes) else ():
-        scale = _scale(raster, axis)
-        _, slopes = _functions((xy[:, axis] - raster.middle_px[axis]) / scale, axis)
-        own = _amplitudes(amplitudes, axis)
-        out[:, axis] += raster.norm_px / scale * np.sum(own * slopes, axis=0)
-    return out
+    if not np.any(amplitudes):
+        return np.ones_like(xy)
+    return linearise_scan(xy, amplitudes, raster).stretch.T
 
 
-def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Undeflection:
+def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
 
     Newton's method along each axis on its own. A point without a raw pixel, where the beam would stand still or go
     back, is NaN. ``amplitudes`` are (12,) or (n, 12).
     """
-    xy, stretch = deflection.copy(), np.ones((2, len(deflection)))
-    basis = np.zeros((len(SCAN_NAMES), len(deflection)))
+    raw = deflection.copy()
     for axis in (0, 1):
         own = _amplitudes(amplitudes, axis)
-        rows = slice(0, ALONG_COUNT) if axis == 0 else slice(ALONG_COUNT, None)
-        scale, middle, target = _scale(raster, axis), raster.middle_px[axis], deflection[:, axis]
-        x, steps = target.copy(), _MAX_STEPS if np.any(own) else 0
-        values, slopes = _functions((x - middle) / scale, axis)
-        for _ in range(steps):
-            slope = 1.0 + raster.norm_px / scale * np.sum(own * slopes, axis=0)
-            miss = x + raster.norm_px * np.sum(own * values, axis=0) - target
-            change = miss / np.where(slope > 1.0 - _LARGEST_SLOPE, slope, np.nan)
-            x = x - change
-            values, slopes = _functions((x - middle) / scale, axis)
-            if not np.any(np.abs(change) > _TOLERANCE_PX):
-                break
-        else:
-            if steps:
-                x = np.where(np.abs(change) > _TOLERANCE_PX, np.nan, x)
-        xy[:, axis] = x
-        stretch[axis] = 1.0 + raster.norm_px / scale * np.sum(own * slopes, axis=0)
+        if np.any(own):
+            raw[:, axis] = _invert(deflection[:, axis], own, raster, axis)
+    return raw
+
+
+def _invert(target: Array, own: Array, raster: Raster, axis: int) -> Array:
+    scale = _scale(raster, axis)
+    curve = _Curve.of(own)
+    # In half pictures of this axis.
+    goal, part = (target - raster.middle_px[axis]) / scale, raster.norm_px / scale
+    u = goal - part * curve.value(goal)[0]
+    for _ in range(_MAX_STEPS):
+        value, slope = curve.value(u)
+        stretch = 1.0 + part * slope
+        change = (u + part * value - goal) / np.where(
+            stretch > 1.0 - _LARGEST_SLOPE, stretch, np.nan
+        )
+        u = u - change
+        late = np.abs(change) > _TOLERANCE
+        if not np.any(late):
+            return raster.middle_px[axis] + scale * u
+    return np.where(late, np.nan, raster.middle_px[axis] + scale * u)
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """The sum of the functions of an axis, prepared for many values.
+
+    Attributes
+    ----------
+    powers
+        (6, ...) coefficients of the powers of u.
+    decays
+        Amplitude and rate of each decay.
+    """
+
+    powers: Array
+    decays: tuple[tuple[Array, float], ...]
+
+    @classmethod
+    def of(cls, own: Array) -> _Curve:
+        polynomials = len(_POWERS)
+        powers = np.tensordot(_POWERS, own[:polynomials], axes=(0, 0))
+        decays = []
+        for amplitude, line, rate in zip(own[polynomials:], _LINES, _RATES, strict=False):
+            if np.any(amplitude):
+                powers[0] -= amplitude * line[0]
+                powers[1] -= amplitude * line[1]
+                decays.append((amplitude, float(rate)))
+        return cls(powers, tuple(decays))
+
+    def value(self, u: Array) -> tuple[Array, Array]:
+        """Return the value and the slope at ``u`` (n,); a straight line beyond the picture."""
+        inside = np.clip(u, -_END, _END)
+        value, slope = self.powers[5] * np.ones_like(u), np.zeros_like(u)
+        for power in self.powers[4::-1]:
+            slope *= inside
+            slope += value
+            value *= inside
+            value += power
+        for amplitude, rate in self.decays:
+            decay = amplitude * np.exp(rate * (1.0 + inside))
+            value += decay
+            slope += rate * decay
+        return value + slope * (u - inside), slope
+
+
+def linearise_scan(raw: Array, amplitudes: Array, raster: Raster) -> ScanDerivatives:
+    """Return the derivatives of the deflection at raw pixels (n, 2)."""
+    stretch, basis = np.ones((2, len(raw))), np.empty((len(SCAN_NAMES), len(raw)))
+    for axis, rows in ((0, slice(0, ALONG_COUNT)), (1, slice(ALONG_COUNT, None))):
+        scale = _scale(raster, axis)
+        values, slopes = _functions((raw[:, axis] - raster.middle_px[axis]) / scale, axis)
         basis[rows] = raster.norm_px * values
-    return Undeflection(xy, stretch, basis)
+        stretch[axis] += (
+            raster.norm_px / scale * np.sum(_amplitudes(amplitudes, axis) * slopes, axis=0)
+        )
+    return ScanDerivatives(stretch, basis)

@@ -26,6 +26,7 @@ from semcal_ros.core.calibration.normal_equations import State, make_problem, re
 from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
+from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
@@ -44,7 +45,7 @@ def _problem(noise_px, views=None, height_sigma_m=4e-5):
         views,
         GS,
         designs,
-        norm_px=256.0,
+        raster=Raster.of(512, 512),
         nominal_px_per_m=cameras[:, 0],
         prior_mean=np.ones(20),
         prior_sigma=np.full(20, 0.2),

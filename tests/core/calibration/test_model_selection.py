@@ -33,7 +33,7 @@ def _aspect_size(values: np.ndarray, information: float) -> int:
     matrices[:, 1, 1] = information
     rights[:, 1] = information * values
     chosen = select_functions(
-        Summary(matrices, rights), setup, constant_functions(setup, {}), ("aspect",)
+        Summary(matrices, rights), setup, constant_functions(setup, {}), ("aspect",), ()
     )
     return chosen["aspect"][1]
 

@@ -27,6 +27,7 @@ from semcal_ros.core.calibration.normal_equations import Problem, State
 from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.priors import Priors, Setup
 from semcal_ros.core.calibration.views import ViewStatus
+from semcal_ros.core.camera.scan_distortion import Raster
 from tests.helpers.calibrations import CALIBRATED, calibrated, seen_views
 
 OFF = CalibrationOptions(residual="off")
@@ -114,7 +115,7 @@ def _adjusted(group, residual_sigmas, *, heights_m=0.0, pull=0.0, weight=1.0):
         group=np.asarray(group),
         designs=designs,
         unit_m=np.ones(count),
-        norm_px=256.0,
+        raster=Raster.of(512, 512),
         prior_mean=np.zeros(1),
         prior_sigma=np.full(1, np.inf),
         height_sigma_m=np.ones(count),
