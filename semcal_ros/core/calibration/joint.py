@@ -40,6 +40,7 @@ from semcal_ros.core.calibration.normal_equations import (
 )
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import (
+    LEAST_DECREASE,
     Functions,
     adjust,
     build_problem,
@@ -584,9 +585,11 @@ def _adjust_with_other_poses(
     result, total = _refine_coarsely(problem, state), 0
     for _ in range(_MAX_TURNS):
         state, count = _try_other_poses(setup, functions, spread, result.state)
-        if count == 0:
+        other = _refine_coarsely(problem, state) if count else result
+        if other.cost > result.cost - LEAST_DECREASE:
+            # Better for some of the corners, and not for all.
             break
-        result, total = _refine_coarsely(problem, state), total + count
+        result, total = other, total + count
     return result, total
 
 

@@ -36,6 +36,7 @@ from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.problem import variance_factor, with_shared
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 
 __all__ = ["Summary", "candidate_names", "select_functions"]
 
@@ -50,8 +51,8 @@ _GAIN_PER_COEFFICIENT = 1.0
 # That of a term that is not there yet: by chance in one of 70 terms that are not needed, as the chance of a chi-square
 # of one degree of freedom above 6.
 _GAIN_OF_TERM = 3.0
-# Most coefficients of a term that a calibration need not have: these change slowly.
-_MAX_TERM_SIZE = 4
+# Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
+_MAX_SCAN_SIZE = 3
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
 _CLEARLY = 2.0
 
@@ -122,7 +123,7 @@ class _Candidates:
         blocks: list[Array] = []
         rows: list[int] = []
         for row, name in enumerate(self.names):
-            most = _MAX_TERM_SIZE if name in terms else _MAX_SIZE
+            most = _most_of(name)
             most = max(most, base[name].smooth_size if name in base else 0)
             for kind in _POLYNOMIALS:
                 blank = ContinuousFunction(kind, np.zeros(most), base["scale"].g_range)
@@ -203,7 +204,7 @@ def select_functions(
     candidates = _Candidates(summary, setup, functions, terms)
     most = len(setup.magnifications) - 1
     limits = {name: min(_MAX_SIZE, most) for name in free}
-    limits |= {name: min(_MAX_TERM_SIZE, max(most, 1)) for name in terms}
+    limits |= {name: min(_most_of(name), max(most, 1)) for name in terms}
     sizes = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
     sizes.update(dict.fromkeys(terms, ("chebyshev_log", 0)))
@@ -227,6 +228,11 @@ def select_functions(
         if candidates.score(kept) + more < score + _CLEARLY:
             sizes = kept
     return {name: sizes[name] for name in (*free, *terms)}
+
+
+def _most_of(name: str) -> int:
+    """Return the most coefficients that a function may have."""
+    return _MAX_SCAN_SIZE if name in SCAN_NAMES else _MAX_SIZE
 
 
 def _price(size: int) -> float:

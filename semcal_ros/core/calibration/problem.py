@@ -50,6 +50,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = [
+    "LEAST_DECREASE",
     "Functions",
     "adjust",
     "build_problem",
@@ -72,6 +73,8 @@ _ODD = ("grid_curvature_m", "axis_z_m")
 # Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
 # no view turns.
 _MAX_TURNS = 5
+LEAST_DECREASE = 0.1
+"""Least decrease of a sum of squares, in sigmas, that makes another pose of a view: what few steps leave is less."""
 # Steps from either sign of a tilt, enough to say which fits better; the adjustment does the rest.
 _POSE_ITERATIONS = 12
 
@@ -245,7 +248,7 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     mirrored = replace(state, rotations=rotations, translations_m=state.translations_m + moved)
     own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
     other = refine(problem, mirrored, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    better = _view_costs(problem, other) < _view_costs(problem, own) * (1.0 - 1e-6)
+    better = _view_costs(problem, other) < _view_costs(problem, own) - LEAST_DECREASE
     return pick_views(better, other.state, own.state), int(better.sum())
 
 
@@ -278,7 +281,7 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
         )
         other = refine(problem, fresh, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
         other_costs = _view_costs(problem, other)
-        better = other_costs < costs * (1.0 - 1e-6) - 1e-3
+        better = other_costs < costs - LEAST_DECREASE
         best, costs = pick_views(better, other.state, best), np.where(better, other_costs, costs)
         count += int(better.sum())
     return best, count
