@@ -36,6 +36,7 @@ from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.fit_record import Certificate, FitRecord, ScaleShares
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
@@ -134,6 +135,8 @@ def format_calibration(model: CalibrationModel) -> str:
     }
     if model.scale_sigma != ScaleSigma():
         data["scale_sigma"] = asdict(model.scale_sigma)
+    if model.record is not None:
+        data["fit_record"] = _write_record(model.record)
     if model.provenance != Provenance():
         known = asdict(model.provenance).items()
         data["provenance"] = {name: _to_plain(value) for name, value in known if value}
@@ -239,8 +242,45 @@ def _read_fields(data: Mapping[str, Any]) -> dict[str, Any]:
         "statistics": data.get("statistics", {}),
         "residual": field,
         "scale_sigma": ScaleSigma(**data.get("scale_sigma", {})),
+        "record": _read_record(data),
         "provenance": _read_provenance(data.get("provenance", {})),
     }
+
+
+def _write_record(record: FitRecord) -> dict[str, Any]:
+    known = {name: value for name, value in asdict(record).items() if value is not None}
+    return {name: _to_plain(value) for name, value in known.items()}
+
+
+def _read_record(data: Mapping[str, Any]) -> FitRecord | None:
+    if "fit_record" not in data:
+        return _record_of_notes(data.get("statistics", {}))
+    values = dict(data["fit_record"])
+    values["squares_m"] = tuple(values.get("squares_m", ()))
+    if shares := values.get("scale_shares"):
+        values["scale_shares"] = ScaleShares(tuple(shares["corners"]), tuple(shares["visits"]))
+    if certificate := values.get("certificate"):
+        held = tuple(certificate.get("held", ()))
+        values["certificate"] = Certificate(**{**certificate, "held": held})
+    return FitRecord(**values)
+
+
+def _record_of_notes(notes: Mapping[str, Any]) -> FitRecord | None:
+    """Return the record of a file of version 1 or 2, which kept it among its notes; None where they do not say it."""
+    try:
+        fit, priors = notes["fit"], notes["priors"]
+        visits = fit.get("visit_height_sigma_m")
+        shares = fit.get("scale_shares")
+        return FitRecord(
+            float(priors["height_sigma_m"]),
+            None if visits is None else float(visits),
+            tuple(float(side) for side in notes.get("squares_m", ())),
+            bool(priors.get("is_wide", False)),
+            ScaleShares(tuple(shares["corners"]), tuple(shares["visits"])) if shares else None,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, InvalidValueError):
+        # Notes may have been edited.
+        return None
 
 
 def _read_provenance(data: Mapping[str, Any]) -> Provenance:

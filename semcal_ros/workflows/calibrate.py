@@ -292,7 +292,10 @@ def calibrate_found(
         views=tuple(seen),
         conditions=sum_up_conditions(seen.values()),
     )
-    model = replace(result.model, statistics=statistics, provenance=origin)
+    record = result.model.record
+    if record is not None:
+        record = replace(record, squares_m=tuple(statistics["squares_m"]))
+    model = replace(result.model, statistics=statistics, provenance=origin, record=record)
     result = replace(result, model=model)
     return RecordingCalibration(Calibration.from_model(model), result, collected)
 

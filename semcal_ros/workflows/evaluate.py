@@ -16,10 +16,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from semcal_ros.core.calibration.evaluate import compare_scales, fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.views import RejectedView
@@ -155,7 +152,8 @@ def evaluate(
         squares_m=microscope.squares_m,
     )
     on_progress("fitting the views", 0, None)
-    height_m = _height_sigma_m(model.statistics)
+    record = model.record or FitRecord(_HEIGHT_SIGMA_M)
+    height_m = record.height_sigma_m
     fit = fit_poses(
         collected.views,
         lambda g: model.at(g).resized(*collected.image_size),
@@ -166,7 +164,7 @@ def evaluate(
         lambda g: model.at(g).resized(*collected.image_size),
         fit,
         height_sigma_m=height_m,
-        visit_height_sigma_m=_visit_height_sigma_m(model.statistics),
+        visit_height_sigma_m=record.visit_height_sigma_m or 0.0,
     )
     errors = (
         MagnificationError(
@@ -181,21 +179,3 @@ def evaluate(
     )
     views, rejections = len(collected.views), collected.rejected
     return Evaluation(fit.rms_px(), views, len(rejections), tuple(errors), rejections, notes)
-
-
-def _visit_height_sigma_m(statistics: Mapping[str, Any]) -> float:
-    """Return the spread of the height of a visit in the calibration, or 0 where it says nothing."""
-    fit = statistics.get("fit")
-    height = fit.get("visit_height_sigma_m") if isinstance(fit, Mapping) else None
-    return float(height) if isinstance(height, (int, float)) and 0.0 <= height < math.inf else 0.0
-
-
-def _height_sigma_m(statistics: Mapping[str, Any]) -> float:
-    """Return the prior of the heights in the calibration; its statistics are notes, which a user
-    may have edited.
-    """
-    priors = statistics.get("priors")
-    height = priors.get("height_sigma_m") if isinstance(priors, Mapping) else None
-    if isinstance(height, (int, float)) and 0.0 < height < math.inf:
-        return float(height)
-    return _HEIGHT_SIGMA_M

@@ -20,7 +20,7 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -108,6 +108,8 @@ class BundleResult:
         (J, 2) posterior variance of the scale and of the height in m2 of each visit.
     iterations, status
         Number of steps, and why there were no more.
+    last_decrease
+        Relative decrease of the cost in the last step.
     """
 
     state: State
@@ -122,6 +124,7 @@ class BundleResult:
     visit_variance: Array
     iterations: int
     status: BundleStatus
+    last_decrease: float = 0.0
 
     @property
     def converged(self) -> bool:
@@ -214,6 +217,7 @@ def refine(
         cost = float(costs.sum()) + prior_cost(problem, state)
         return _make_result(problem, state, cost, iterations, status)
     damping, iterations, status = _FIRST_DAMPING, 0, BundleStatus.ITERATION_LIMIT
+    relative = 0.0
     while iterations < max_iterations:
         iterations += 1
         normal = normal_equations(problem, state)
@@ -230,11 +234,13 @@ def refine(
             break
         decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
         damping = max(0.1 * damping, _MIN_DAMPING)
+        relative = decrease / max(cost, np.finfo(np.float64).tiny)
         predicted = float(step.predicted.sum()) + step.predicted_prior
         if decrease <= tolerance * cost and predicted <= 1e3 * tolerance * (1.0 + cost):
             status = BundleStatus.SMALL_DECREASE
             break
-    return _make_result(problem, state, cost, iterations, status)
+    result = _make_result(problem, state, cost, iterations, status)
+    return replace(result, last_decrease=float(relative))
 
 
 def _refine_following_poses(

@@ -28,6 +28,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, solve_scaled
 from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.certificate import certify
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.calibration.line_jitter import LineJitter, estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.model_selection import Summary, select_functions
@@ -73,6 +74,7 @@ from semcal_ros.core.calibration.variance_components import (
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.fit_record import Certificate
 from semcal_ros.core.camera.plane_geometry import fit_homography
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -229,6 +231,8 @@ class JointFit:
         1-sigma per axis, px, by which all corners scatter beyond their own.
     parts
         What the covariance of the functions consists of.
+    certificate
+        That the adjustment ended at a minimum.
     """
 
     adjustment: Adjustment
@@ -239,6 +243,7 @@ class JointFit:
     pattern: GridPattern | None
     excess_px: float
     parts: CovarianceParts
+    certificate: Certificate
 
 
 def refit_functions(
@@ -753,6 +758,7 @@ def fit_joint(
     on_stage("final adjustment", 0.75)
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)
+    certificate = certify(adjustment.functions, adjustment.problem, adjustment.result)
     if field is not None:
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
@@ -763,7 +769,7 @@ def fit_joint(
     if pattern is not None:
         covariance = covariance + _pattern_covariance(setup, padded, adjustment, pattern)
     parts = _split_covariance(setup, padded, adjustment, final.views, jitter)
-    return JointFit(adjustment, padded, covariance, jitter, field, pattern, excess, parts)
+    return JointFit(adjustment, padded, covariance, jitter, field, pattern, excess, parts, certificate)
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:

@@ -32,7 +32,7 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.calibration.bundle_adjustment import refine
 from semcal_ros.core.calibration.normal_equations import Effects, State, make_problem
 from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors
-from semcal_ros.core.calibration.revision import CHANGING, positive_number
+from semcal_ros.core.calibration.revision import CHANGING, record_of
 from semcal_ros.core.calibration.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
@@ -220,9 +220,8 @@ def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:
 def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Array:
     """(P, P) information of a visit on the camera, all that is not the camera eliminated."""
     camera = replace(model.at(g), residual=None)
-    fit, priors = (model.statistics.get(key) for key in ("fit", "priors"))
     usual = Priors()
-
+    heights = record_of(model, usual)
     views, rotations = [], []
     field = camera.width * camera.pixel_size_m[0]
     count = min(int(1.5 * field / square_m) + 2, 2 * _MOST_CORNERS_ACROSS)
@@ -247,14 +246,14 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         nominal_px_per_m=np.array([camera.m]),
         prior_mean=np.ones(1),
         prior_sigma=np.full(1, HELD_SIGMA),
-        height_sigma_m=positive_number(priors, "height_sigma_m", usual.height_sigma_m),
+        height_sigma_m=heights.height_sigma_m,
     )
     y = np.concatenate([v.image_xy[:, 1] for v in views])
     effects = Effects(
         np.zeros(len(views), dtype=np.intp),
         np.zeros(1, dtype=np.intp),
         max(model.scale_sigma.repeatability, 1e-6),
-        positive_number(fit, "visit_height_sigma_m", usual.visit_height_sigma_m),
+        heights.visit_height_sigma_m or usual.visit_height_sigma_m,
         np.full(len(views), usual.drift_sigma_px),
         y / camera.height - 0.5,
     )

@@ -55,6 +55,7 @@ from semcal_ros.core.camera.calibration_model import (
     design_matrix,
     names_of,
 )
+from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.errors import CalibrationError
 
@@ -63,7 +64,7 @@ __all__ = [
     "Revision",
     "free_sigmas",
     "make_setup",
-    "positive_number",
+    "record_of",
     "revise",
 ]
 
@@ -162,9 +163,8 @@ def make_setup(
     flat = tuple(
         replace(v, image_xy=cameras[v.magnification].without_residual(v.image_xy)) for v in ordered
     )
-    known = model.statistics.get("priors")
     priors = Priors()
-    if isinstance(known, Mapping) and known.get("is_wide"):
+    if model.record is not None and model.record.is_wide:
         priors = priors.of_wide_views(cameras[flat[0].magnification].rho)
     magnifications = np.unique([v.magnification for v in flat])
     setup = Setup(flat, magnifications, image_size, model.display_width_m, priors, axis=axis)
@@ -175,23 +175,20 @@ def make_setup(
 def _spread(model: CalibrationModel, setup: Setup) -> VarianceComponents:
     """The spread of visits and heights that the calibration found, which a few views cannot tell."""
     start = initial_components(setup)
-    fit, priors = (model.statistics.get(key) for key in ("fit", "priors"))
-    visit_height = positive_number(fit, "visit_height_sigma_m", start.visit_height.sigma)
-    height = positive_number(priors, "height_sigma_m", setup.priors.height_sigma_m)
+    heights = record_of(model, setup.priors)
     return replace(
         start,
         # A spread of zero would be one that no view can contradict.
         scale=Spread(max(model.scale_sigma.repeatability, 1e-6), 0.0),
-        visit_height=Spread(visit_height, 0.0),
-        height_sigma_m=np.full(len(setup.views), height),
+        visit_height=Spread(heights.visit_height_sigma_m or start.visit_height.sigma, 0.0),
+        height_sigma_m=np.full(len(setup.views), heights.height_sigma_m),
     )
 
 
-def positive_number(values: object, key: str, default: float) -> float:
-    """A positive number of the statistics, which are notes that a user may have edited."""
-    value = values.get(key) if isinstance(values, Mapping) else None
-    usable = isinstance(value, (int, float)) and 0.0 < value < np.inf
-    return float(value) if usable and value is not None else default
+def record_of(model: CalibrationModel, priors: Priors) -> FitRecord:
+    """Return the record of the fit, or what is usual where an old file does not have it."""
+    usual = FitRecord(priors.height_sigma_m, priors.visit_height_sigma_m)
+    return usual if model.record is None else model.record
 
 
 def _camera_designs(model: CalibrationModel, setup: Setup) -> tuple[Array, Array]:

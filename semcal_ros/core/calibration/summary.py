@@ -28,6 +28,7 @@ from semcal_ros.core.calibration.finding import Finding
 from semcal_ros.core.calibration.joint import CovarianceParts, FittedField, JointFit
 from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.camera.calibration_model import CalibrationModel, pixel_size_gradient
+from semcal_ros.core.camera.fit_record import ScaleShares
 
 __all__ = [
     "collect_statistics",
@@ -78,13 +79,13 @@ def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
     }
 
 
-def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> dict[str, list[float]]:
+def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> ScaleShares:
     """Return the parts of the variance of nm per pixel at each calibrated magnification, of the less certain axis.
 
     What is missing to 1 is the form of the functions: coefficients that were left out, and what would move with them.
     """
     size = len(parts.corners)
-    shares: dict[str, list[float]] = {"corners": [], "visits": []}
+    corners, visits = [], []
     for g in model.magnifications:
         rows = pixel_size_gradient(model, g)
         whole = np.einsum("ai,ij,aj->a", rows, model.covariance[:size, :size], rows)
@@ -92,9 +93,9 @@ def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> dict[str
         own = [max(float(row @ part @ row), 0.0) for part in (parts.corners, parts.visits)]
         # A residual field takes over some of what the functions alone would have to explain.
         most = max(variance, sum(own), np.finfo(np.float64).tiny)
-        shares["corners"].append(own[0] / most)
-        shares["visits"].append(own[1] / most)
-    return shares
+        corners.append(own[0] / most)
+        visits.append(own[1] / most)
+    return ScaleShares(tuple(corners), tuple(visits))
 
 
 def _finite_or_none(value: float) -> float | None:

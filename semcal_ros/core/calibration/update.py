@@ -23,7 +23,7 @@ other views continues from it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,11 +153,12 @@ def update_calibration(
         "scale_sigma": check.scale_sigma,
     }
     statistics = {**model.statistics, "updates": [*(log if isinstance(log, list) else []), entry]}
-    fit = statistics.get("fit")
-    if isinstance(fit, Mapping):
+    record = model.record
+    if record is not None:
         # What the covariance consists of is no longer what the calibration says.
-        statistics["fit"] = {key: value for key, value in fit.items() if key != "scale_shares"}
-    return CalibrationUpdate(replace(renewed, statistics=statistics), check, ageing, rms_px)
+        record = replace(record, scale_shares=None)
+    renewed = replace(renewed, statistics=statistics, record=record)
+    return CalibrationUpdate(renewed, check, ageing, rms_px)
 
 
 def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:

@@ -109,13 +109,13 @@ def judge_calibration(model: CalibrationModel) -> Verdict:
     largest, at = worst_pixel_size(model)
     low, high = model.magnification_range
     size_m = float(np.mean(model.at(at).pixel_size_m))
-    squares = model.statistics.get("squares_m")
+    squares = () if model.record is None else model.record.squares_m
     floor, visit = math.nan, None
-    if isinstance(squares, (list, tuple)) and squares and math.isfinite(largest) and largest > 0.0:
+    if squares and math.isfinite(largest) and largest > 0.0:
         try:
-            plan = plan_views(model, 1e-9, squares_m=[float(s) for s in squares], most_visits=1)
-        except (SemcalError, ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError):
-            pass  # statistics of a file can be anything; the sentence is then left out
+            plan = plan_views(model, 1e-9, squares_m=squares, most_visits=1)
+        except (SemcalError, ArithmeticError, np.linalg.LinAlgError):
+            pass  # a calibration that was edited can be anything; the sentence is then left out
         else:
             floor = plan.floor
             first = plan.visits[0] if plan.visits else None

@@ -25,6 +25,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -157,6 +158,9 @@ class CalibrationModel:
         Distortion that the parameters do not describe, or None.
     scale_sigma
         Uncertainty of the scale beyond the covariance.
+    record
+        What the fit leaves for checks, updates and plans; None for a calibration that was not fitted to views, and for
+        old files that do not say it.
     provenance
         Where it comes from.
     """
@@ -171,6 +175,7 @@ class CalibrationModel:
     statistics: Mapping[str, Any] = field(default_factory=dict)
     residual: ResidualField | None = None
     scale_sigma: ScaleSigma = ScaleSigma()
+    record: FitRecord | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
@@ -184,6 +189,12 @@ class CalibrationModel:
         if self.covariance.shape != (size, size):
             raise InvalidValueError(
                 f"covariance of shape {self.covariance.shape}", expected=f"({size}, {size})"
+            )
+        shares = None if self.record is None else self.record.scale_shares
+        if shares is not None and len(shares.corners) != len(self.magnifications):
+            raise InvalidValueError(
+                f"shares of the variance at {len(shares.corners)} magnifications",
+                expected=f"{len(self.magnifications)}",
             )
         if not self.magnifications or list(self.magnifications) != sorted(self.magnifications):
             raise InvalidValueError(

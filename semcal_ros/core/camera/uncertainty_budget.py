@@ -21,7 +21,6 @@ factor 2, which is 95 % for a normal distribution (6.2.1).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +45,6 @@ _COVERAGE = 2.0
 _JUDGED = 25
 # Where a length may lie in the image, as a part of width and height: the worst of these places counts.
 _PLACES = (0.25, 0.5, 0.75)
-# Names in the statistics of a calibration, and what they are called.
-_OF_VIEWS = {
-    "corners": "corners of the calibration",
-    "visits": "visits, poses and heights of the calibration",
-}
-
-
 @dataclass(frozen=True)
 class BudgetPart:
     """One source of uncertainty.
@@ -150,30 +142,20 @@ def _split_views(
     model: CalibrationModel, magnification: float, variance: float
 ) -> dict[str, float]:
     """What the covariance of the calibration adds, by its sources where the calibration tells them."""
-    fit = model.statistics.get("fit")
-    told = fit.get("scale_shares") if isinstance(fit, Mapping) else None
-    shares = [_share_at(told, name, model.magnifications, magnification) for name in _OF_VIEWS]
-    known = [share for share in shares if share is not None]
-    if len(known) < len(_OF_VIEWS) or not 0.0 <= sum(known) <= 1.0 + 1e-9:
+    shares = None if model.record is None else model.record.scale_shares
+    if shares is None:
         return {"views of the calibration": math.sqrt(variance)}
+    at, calibrated = np.log(magnification), np.log(model.magnifications)
+    corners, visits = (
+        float(np.interp(at, calibrated, part)) for part in (shares.corners, shares.visits)
+    )
     parts = {
-        source: math.sqrt(variance * share)
-        for source, share in zip(_OF_VIEWS.values(), known, strict=True)
+        "corners of the calibration": math.sqrt(variance * corners),
+        "visits, poses and heights of the calibration": math.sqrt(variance * visits),
     }
-    left = max(1.0 - sum(known), 0.0)
+    left = max(1.0 - corners - visits, 0.0)
     return parts | {"form of the functions of the calibration": math.sqrt(variance * left)}
 
-
-def _share_at(
-    told: object, name: str, magnifications: Sequence[float], magnification: float
-) -> float | None:
-    """A share at a magnification; None for statistics that are not those of this version, or that were edited."""
-    values = told.get(name) if isinstance(told, Mapping) else None
-    if not isinstance(values, (list, tuple)) or len(values) != len(magnifications):
-        return None
-    if not all(isinstance(v, (int, float)) and 0.0 <= v <= 1.0 for v in values):
-        return None
-    return float(np.interp(math.log(magnification), np.log(magnifications), values))
 
 
 def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:
