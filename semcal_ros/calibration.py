@@ -36,7 +36,7 @@ from semcal_ros.files.calibration_file import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from semcal_ros.core.calibration.pda import FittedEquation
+    from semcal_ros.core.calibration.paper.pda import FittedEquation
 
 __all__ = ["Calibration"]
 
@@ -104,7 +104,7 @@ class Calibration(CalibrationModel):
     def equations(self) -> tuple[FittedEquation, ...]:
         """The differential equation of each parameter, of method ``"pda"``; empty for the others."""
         # Here, so that those who only ask for a camera do not wait for the calibration's modules.
-        from semcal_ros.core.calibration.pda import list_equations
+        from semcal_ros.core.calibration.paper.pda import list_equations
 
         return list_equations(self.functions)
 

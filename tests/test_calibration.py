@@ -24,7 +24,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from semcal_ros import Calibration, SemcalError
-from semcal_ros.core.calibration.calibrate import calibrate_views
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views

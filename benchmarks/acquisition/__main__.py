@@ -35,8 +35,9 @@ import numpy as np
 
 from benchmarks.table import quick_from_command_line, show
 from semcal_ros.core.calibration.acquisition import AcquisitionGoal, plan_survey
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.plan import ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.plan import ViewPlan, plan_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.synthetic import STAGES, TYPICAL_GRID, preset

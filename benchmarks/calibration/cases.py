@@ -28,7 +28,7 @@ import numpy as np
 
 from semcal_ros.config.config import load_config
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.recordings import open_recording

@@ -54,8 +54,9 @@ from benchmarks.calibration.reference import (
     visits_of,
 )
 from benchmarks.table import show
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.check import CalibrationCheck, Verdict, check_calibration
+from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Verdict, check_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import SimulatedStage, stage_views

@@ -34,7 +34,8 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from benchmarks.table import quick_from_command_line, show
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views

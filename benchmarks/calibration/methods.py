@@ -27,11 +27,12 @@ from scipy.interpolate import PchipInterpolator
 
 from benchmarks.calibration.cases import HEIGHT_SIGMA_M, Array, Case, PixelSize
 from benchmarks.calibration.opencv import OpenCv
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.discrete import DiscreteFit, fit_discrete, table_functions
-from semcal_ros.core.calibration.evaluate import fit_poses
-from semcal_ros.core.calibration.pda import pda_functions
-from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.paper.discrete import DiscreteFit, fit_discrete, table_functions
+from semcal_ros.core.calibration.paper.pda import pda_functions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction

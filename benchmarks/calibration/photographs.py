@@ -35,8 +35,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.calibration.cases import Array
 from benchmarks.table import show
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import view_affine
 from semcal_ros.core.corners import LatticeDetection, find_lattice

@@ -38,10 +38,11 @@ from joblib import Parallel, delayed
 from benchmarks.calibration.check import STAGE
 from benchmarks.calibration.coverage import PRESETS
 from benchmarks.table import quick_from_command_line, show
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.calibration.judgement.update import update_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.update import update_calibration
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size

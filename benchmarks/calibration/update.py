@@ -37,9 +37,10 @@ from joblib import Parallel, delayed
 from benchmarks.calibration.check import STAGE
 from benchmarks.calibration.coverage import PRESETS, UPWARDS, VISITS
 from benchmarks.table import quick_from_command_line, show
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.judgement.update import update_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.update import update_calibration
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera

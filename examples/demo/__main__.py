@@ -45,7 +45,7 @@ from examples.demo.correction_page import DemoRow, overlay_change, write_correct
 from examples.demo.live_suite import LiveSuite, Received
 from examples.demo.overview import overview
 from semcal_ros import Calibration
-from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection

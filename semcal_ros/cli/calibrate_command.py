@@ -28,13 +28,13 @@ from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_opt
 from semcal_ros.cli.output import echo_notes, echo_rejected, echo_table, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.calibrate import (
+from semcal_ros.core.calibration.options import (
     METHODS,
     RESIDUAL_MODES,
     CalibrationOptions,
     MethodOptions,
 )
-from semcal_ros.core.calibration.pda import focal_length_and_skew, prime
+from semcal_ros.core.calibration.paper.pda import focal_length_and_skew, prime
 from semcal_ros.core.corners import PATTERN_NAMES
 from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.files.recordings import RecordedFiles

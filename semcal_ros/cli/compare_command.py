@@ -24,7 +24,10 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import FIGURE_SUFFIXES, PATH, json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, echo_table
-from semcal_ros.core.calibration.compare import CalibrationDifference, compare_calibrations
+from semcal_ros.core.calibration.judgement.compare import (
+    CalibrationDifference,
+    compare_calibrations,
+)
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
 

@@ -31,8 +31,8 @@ from semcal_ros.cli.options import (
     squares_option,
 )
 from semcal_ros.cli.output import echo_json, echo_table
-from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, ViewPlan, plan_views
-from semcal_ros.core.calibration.update import DEFAULT_AGEING
+from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
 

@@ -41,10 +41,10 @@ from semcal_ros.core.calibration.acquisition import (
     find_picture_fault,
     is_magnification_of,
 )
-from semcal_ros.core.calibration.calibrate import METHODS, RESIDUAL_MODES, CalibrationOptions
-from semcal_ros.core.calibration.check import Verdict
+from semcal_ros.core.calibration.judgement.check import Verdict
+from semcal_ros.core.calibration.judgement.view_coverage import measure_view_coverage
+from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.calibration.view_coverage import measure_view_coverage
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.corners import LatticeDetection, find_lattice

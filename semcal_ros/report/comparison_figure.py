@@ -24,7 +24,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from semcal_ros.core.calibration.compare import CalibrationDifference, DifferenceAt
+from semcal_ros.core.calibration.judgement.compare import CalibrationDifference, DifferenceAt
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.report.html.style import (
     ACCENT,

@@ -23,13 +23,13 @@ from typing import NamedTuple
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.check import CalibrationCheck, check_calibration
-from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.update import (
+from semcal_ros.core.calibration.judgement.check import CalibrationCheck, check_calibration
+from semcal_ros.core.calibration.judgement.update import (
     DEFAULT_AGEING,
     CalibrationUpdate,
     update_calibration,
 )
+from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.files.recordings import RecordedFrame
@@ -180,7 +180,7 @@ def update(
     calibration, source, config, squares_m, untilted, pattern, on_progress
         As for :func:`check`.
     ageing
-        As for :func:`~semcal_ros.core.calibration.update.update_calibration`.
+        As for :func:`~semcal_ros.core.calibration.judgement.update.update_calibration`.
 
     Raises
     ------

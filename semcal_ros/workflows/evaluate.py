@@ -18,8 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from semcal_ros.core.calibration.evaluate import compare_scales, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.judgement.evaluate import (
+    compare_scales,
+    fit_poses,
+    rms_by_magnification,
+)
 from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (

@@ -25,7 +25,7 @@ from scipy.integrate import solve_ivp
 
 from semcal_ros import Calibration
 from semcal_ros.cli import calibrate_command
-from semcal_ros.core.calibration.calibrate import CalibrationOptions
+from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import SquareAssignment
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES

@@ -24,7 +24,8 @@ import yaml
 
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset

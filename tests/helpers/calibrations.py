@@ -19,11 +19,9 @@ from __future__ import annotations
 import hashlib
 from functools import cache
 
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views

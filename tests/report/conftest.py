@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult, calibrate_views
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.report import write_calibration_report
 from tests.helpers.made_once import folder_once, made_once
 from tests.helpers.report_samples import (

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 
 from examples.demo.correction_page import DemoRow, write_correction_report
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.html.page import render
 from semcal_ros.report.html.text import format_length

@@ -24,12 +24,10 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
-from semcal_ros.core.calibration.compare import CalibrationDifference, DifferenceAt
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.compare import CalibrationDifference, DifferenceAt
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.files.images.write import PixelScale
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.ball_figures import plot_ball

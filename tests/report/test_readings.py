@@ -25,8 +25,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.report.calibration.field_error_figures import plot_distortion
 from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes

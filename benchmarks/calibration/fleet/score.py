@@ -47,11 +47,9 @@ from benchmarks.calibration.fleet.microscope import (
     record,
     tilted,
 )
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError

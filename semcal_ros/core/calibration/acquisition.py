@@ -14,10 +14,10 @@
 
 """Which views a calibration that records itself takes: first a survey of the range, then what helps most.
 
-The survey visits magnifications at equal ratios. What follows is chosen by :func:`~semcal_ros.core.calibration.plan.
-plan_views` from the calibration that the views so far give, until nm per pixel is as certain as asked. Each visit has
-one view for each tilt, differently turned in the plane, so that the faults of the grid and those of the camera are told
-apart.
+The survey visits magnifications at equal ratios. What follows is chosen by
+:func:`~semcal_ros.core.calibration.judgement.plan.plan_views` from the calibration that the views so far give, until nm
+per pixel is as certain as asked. Each visit has one view for each tilt, differently turned in the plane, so that the
+faults of the grid and those of the camera are told apart.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, check_positive
-from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, plan_views
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.corners import LatticeDetection

@@ -26,8 +26,8 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.initial_values import initial_values
-from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.calibration.stage import Attitudes, attitudes, stage_rotations
 from semcal_ros.core.calibration.views import GridView
 

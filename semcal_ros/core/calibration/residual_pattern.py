@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.coverage import assign_cells, concatenate_corners
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.coverage import assign_cells, concatenate_corners
 
 __all__ = ["estimate_pattern_px", "normalise_residuals"]
 

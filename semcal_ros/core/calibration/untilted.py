@@ -21,8 +21,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.initial_values import initial_values
-from semcal_ros.core.calibration.priors import Setup
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["UNTILTED_MODES", "mark_untilted"]

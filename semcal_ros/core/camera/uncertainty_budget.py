@@ -45,6 +45,8 @@ _COVERAGE = 2.0
 _JUDGED = 25
 # Where a length may lie in the image, as a part of width and height: the worst of these places counts.
 _PLACES = (0.25, 0.5, 0.75)
+
+
 @dataclass(frozen=True)
 class BudgetPart:
     """One source of uncertainty.
@@ -155,7 +157,6 @@ def _split_views(
     }
     left = max(1.0 - corners - visits, 0.0)
     return parts | {"form of the functions of the calibration": math.sqrt(variance * left)}
-
 
 
 def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:

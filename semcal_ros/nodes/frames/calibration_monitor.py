@@ -31,7 +31,7 @@ from semcal_ros.bridge.headers import stamp_ns_from_msg
 from semcal_ros.bridge.images import to_gray, without_databar
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.check import CalibrationCheck, Verdict
+from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Verdict
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection, SemcalError

@@ -23,8 +23,8 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.coverage import (
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.coverage import (
     assign_cells,
     compute_reached_shares,
     compute_tilts_deg,

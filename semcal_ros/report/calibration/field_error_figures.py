@@ -24,8 +24,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.coverage import assign_cells, concatenate_corners
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.coverage import assign_cells, concatenate_corners
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.wording import counted

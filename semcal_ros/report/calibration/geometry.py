@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, equilibrate
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.camera.predicted_error import make_field_lattice
 from semcal_ros.core.camera.projection import ProjectionJacobians, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera

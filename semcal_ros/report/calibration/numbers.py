@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.findings import find_all
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance

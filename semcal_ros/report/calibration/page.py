@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.verdict import judge_calibration
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.verdict import judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX, compute_held_out_px
 from semcal_ros.report.html.text import format_px
 

@@ -22,8 +22,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.residual_pattern import normalise_residuals
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
 from semcal_ros.report.html.encode import Picture, Readings, encode_figure

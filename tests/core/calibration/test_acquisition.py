@@ -31,7 +31,8 @@ from semcal_ros.core.calibration.acquisition import (
     propose_visits,
     request_of_picture,
 )
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.corners import LatticeDetection, find_lattice

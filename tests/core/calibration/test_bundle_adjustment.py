@@ -21,8 +21,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.bundle_adjustment import refine
-from semcal_ros.core.calibration.normal_equations import State, make_problem, residuals
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.normal_equations import State, make_problem, residuals
 from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
@@ -55,7 +55,7 @@ def _problem(noise_px, views=None, height_sigma_m=4e-5):
 
 def _true_poses(seed=1):
     """The poses that ``grid_views`` draws, recovered by fitting them with the true cameras."""
-    from semcal_ros.core.calibration.evaluate import fit_poses
+    from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 
     clean = grid_views(MICROSCOPE.camera_at, GS, seed=seed)
     return fit_poses(clean, MICROSCOPE.camera_at, height_sigma_m=1.0)

@@ -21,12 +21,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, MethodOptions, calibrate_views
-from semcal_ros.core.calibration.evaluate import (
+from semcal_ros.core.calibration.judgement.evaluate import (
     compare_scales,
     fit_poses,
     rms_by_magnification,
 )
+from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views

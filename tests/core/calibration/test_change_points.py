@@ -22,7 +22,8 @@ import numpy as np
 import pytest
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset

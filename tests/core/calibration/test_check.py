@@ -21,12 +21,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
-from semcal_ros.core.calibration.check import CalibrationCheck, Verdict, check_calibration
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Verdict, check_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera

@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views

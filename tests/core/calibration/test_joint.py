@@ -22,18 +22,21 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import solve_scaled
-from semcal_ros.core.calibration import joint as joint_module
-from semcal_ros.core.calibration.bundle_adjustment import refine
-from semcal_ros.core.calibration.joint import JointFit, fit_joint, measure_misfit_px
-from semcal_ros.core.calibration.normal_equations import reduced_normal_equations, residuals
-from semcal_ros.core.calibration.priors import Priors, Setup
-from semcal_ros.core.calibration.problem import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.normal_equations import (
+    reduced_normal_equations,
+    residuals,
+)
+from semcal_ros.core.calibration.estimator.poses import mirror, restart_poses, right_way_up
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
-    mirror,
-    restart_poses,
     stack_coefficients,
     variance_factor,
 )
+from semcal_ros.core.calibration.pipeline import fit_joint
+from semcal_ros.core.calibration.solve import JointFit
+from semcal_ros.core.calibration.start import measure_misfit_px
 from semcal_ros.core.camera.calibration_model import design_matrix
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -110,7 +113,7 @@ def test_what_is_mirrored_in_the_reference_plane_is_seen_at_the_same_places_and_
         residuals(own.problem, flipped), own.result.residuals_px, rtol=0.0, atol=1e-9
     )
     wrong = refine(own.problem, flipped)
-    right = joint_module._right_way_up(setup, own.functions, own.problem, wrong)
+    right = right_way_up(setup, own.functions, own.problem, wrong)
     assert right.cost < wrong.cost
     # The sixth of the functions is constant.
     rho = sum(own.functions[name].size for name in list(own.functions)[:5])

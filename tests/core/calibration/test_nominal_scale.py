@@ -22,11 +22,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration import calibrate as calibrate_module
-from semcal_ros.core.calibration import joint as joint_module
-from semcal_ros.core.calibration.bundle_adjustment import BundleStatus
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration import pipeline
+from semcal_ros.core.calibration import solve as solve_module
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleStatus
 from semcal_ros.core.calibration.nominal_scale import check_nominal_scale, check_square_sides
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import CalibrationError, UnusableCalibrationError
 from semcal_ros.synthetic import preset
 from tests.helpers.calibrations import seen_views
@@ -49,8 +50,8 @@ def test_a_display_width_far_off_is_refused_before_the_fit(monkeypatch, wrong, m
     def fit(*_given, **_options):
         raise AssertionError("the fit has begun")
 
-    monkeypatch.setattr(calibrate_module, "fit_joint", fit)
-    monkeypatch.setattr(calibrate_module, "fit_discrete", fit)
+    monkeypatch.setattr(pipeline, "fit_joint", fit)
+    monkeypatch.setattr(pipeline, "fit_separately", fit)
     width = wrong * JSM.display_width_m
     with pytest.raises(UnusableCalibrationError, match="give --display-width") as error:
         _calibrate(width, method=method)
@@ -117,18 +118,18 @@ def _lose_the_first_corner(result):
     ],
 )
 def test_a_fit_that_does_not_converge_is_refused(monkeypatch, spoil, told):
-    refine = joint_module.refine
+    refine = solve_module.refine
 
     def never(*given, **options):
         return spoil(refine(*given, **options))
 
-    monkeypatch.setattr(joint_module, "refine", never)
+    monkeypatch.setattr(solve_module, "refine", never)
     with pytest.raises(UnusableCalibrationError, match=told):
         _calibrate(JSM.display_width_m, residual="off")
 
 
 def test_a_fit_that_ends_far_from_the_nominal_scale_is_refused(monkeypatch):
-    fit = calibrate_module._fit_joint
+    fit = pipeline.describe_fit
 
     def astray(*given):
         done = fit(*given)
@@ -136,6 +137,6 @@ def test_a_fit_that_ends_far_from_the_nominal_scale_is_refused(monkeypatch):
         away = replace(scale, coefficients=4.0 * scale.coefficients)
         return replace(done, functions={**done.functions, "scale": away})
 
-    monkeypatch.setattr(calibrate_module, "_fit_joint", astray)
+    monkeypatch.setattr(pipeline, "describe_fit", astray)
     with pytest.raises(UnusableCalibrationError, match=r"show [34]\.\d* times"):
         _calibrate(JSM.display_width_m, residual="off")

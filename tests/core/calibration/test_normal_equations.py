@@ -25,10 +25,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.bundle_adjustment import refine
-from semcal_ros.core.calibration.grid_orientation import align_lattices
-from semcal_ros.core.calibration.joint import add_shared_unknowns
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.normal_equations import (
     State,
     empty_effects,
     normal_equations,
@@ -38,14 +36,16 @@ from semcal_ros.core.calibration.normal_equations import (
     schur_complement,
     visit_sigmas,
 )
-from semcal_ros.core.calibration.priors import Priors, Setup
-from semcal_ros.core.calibration.problem import (
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     constant_functions,
     stack_coefficients,
 )
+from semcal_ros.core.calibration.estimator.variance_components import Spread, VarianceComponents
+from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.variance_components import Spread, VarianceComponents
+from semcal_ros.core.calibration.start import add_shared_unknowns
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
 
@@ -171,7 +171,7 @@ def test_the_step_is_that_of_the_whole_system(system, dense):
     scale = 1.0 / np.sqrt(np.diag(matrix))
     step = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
     reduced = schur_complement(problem, state, normal_equations(problem, state), 0.0)
-    from semcal_ros.core.calibration.normal_equations import reduced_normal_equations
+    from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 
     own, pull = reduced_normal_equations(
         problem, state.theta, reduced.information, reduced.gradient

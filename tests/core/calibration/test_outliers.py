@@ -21,11 +21,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, BundleStatus
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.normal_equations import Problem, State
-from semcal_ros.core.calibration.outliers import find_change_point, find_outliers
-from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, BundleStatus
+from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.judgement.outliers import find_change_point, find_outliers
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.camera.scan_distortion import Raster
 from tests.helpers.calibrations import CALIBRATED, calibrated, seen_views

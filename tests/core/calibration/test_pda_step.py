@@ -19,11 +19,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, MethodOptions
-from semcal_ros.core.calibration.discrete import DiscreteFit
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.pda import equation_error
-from semcal_ros.core.calibration.pda_step import (
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
+from semcal_ros.core.calibration.paper.discrete import DiscreteFit
+from semcal_ros.core.calibration.paper.pda import equation_error
+from semcal_ros.core.calibration.paper.pda_step import (
     StepTrial,
     choose_step,
     select_magnifications,

@@ -20,10 +20,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.plan import ViewPlan, plan_views
-from semcal_ros.core.calibration.update import update_calibration
-from semcal_ros.core.calibration.verdict import judge_calibration
+from semcal_ros.core.calibration.judgement.plan import ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.update import update_calibration
+from semcal_ros.core.calibration.judgement.verdict import judge_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import InvalidValueError

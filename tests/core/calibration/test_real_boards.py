@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
-from semcal_ros.core.calibration.evaluate import fit_poses
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import views_from_detections
 from tests.helpers.corner_boards import seen_photograph
 

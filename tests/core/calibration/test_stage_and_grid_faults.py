@@ -26,7 +26,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationOptions, calibrate_views
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views

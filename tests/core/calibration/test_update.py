@@ -17,12 +17,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
-from semcal_ros.core.calibration.update import CalibrationUpdate, update_calibration
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.update import CalibrationUpdate, update_calibration
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from tests.core.calibration.test_check import (

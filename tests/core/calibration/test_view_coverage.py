@@ -21,8 +21,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration.judgement.view_coverage import (
+    estimate_tilt_deg,
+    measure_view_coverage,
+)
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.calibration.view_coverage import estimate_tilt_deg, measure_view_coverage
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import LatticeDetection
 

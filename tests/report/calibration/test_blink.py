@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.report.calibration.blink import choose_blink
 from tests.helpers.report_samples import SIZE, found_of

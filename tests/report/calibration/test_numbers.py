@@ -24,15 +24,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.coverage import (
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.coverage import (
     compute_empty_share,
     compute_reached_shares,
     compute_tilts_deg,
 )
-from semcal_ros.core.calibration.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.core.calibration.finding import Finding, rank_findings
-from semcal_ros.core.calibration.findings import find_all
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
+from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
 from semcal_ros.core.camera.predicted_error import (
     make_field_lattice,

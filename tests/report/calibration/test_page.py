@@ -27,13 +27,11 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.calibrate import (
-    CalibrationOptions,
-    CalibrationResult,
-    calibrate_views,
-)
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.finding import Finding
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError

@@ -21,7 +21,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.report.calibration.numbers import collect_warnings
 from semcal_ros.report.calibration.worst_views import choose_worst_views, describe_pattern
 from semcal_ros.report.html.text import format_length

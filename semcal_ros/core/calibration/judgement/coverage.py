@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices
-from semcal_ros.core.calibration.calibrate import CalibrationResult
+from semcal_ros.core.calibration.judge import CalibrationResult
 
 __all__ = [
     "Cells",

@@ -29,8 +29,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import (
     Problem,
     State,
     pose_priors,
@@ -39,8 +39,8 @@ from semcal_ros.core.calibration.normal_equations import (
     whiten,
     whitened_rows,
 )
-from semcal_ros.core.calibration.priors import Setup
-from semcal_ros.core.calibration.problem import variance_factor
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import variance_factor
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
 

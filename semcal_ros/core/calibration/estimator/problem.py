@@ -22,20 +22,17 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.initial_values import pose_from_camera
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import (
     Effects,
     Problem,
     State,
     make_problem,
-    pick_views,
-    pose_priors,
     whitened_norm,
 )
-from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.variance_components import VarianceComponents
 from semcal_ros.core.calibration.stage import attitudes
-from semcal_ros.core.calibration.variance_components import VarianceComponents
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
@@ -44,39 +41,23 @@ from semcal_ros.core.camera.calibration_model import (
     names_of,
 )
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.plane_geometry import mirrored_tilt
 from semcal_ros.core.camera.projection import ALL_NAMES
-from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = [
-    "LEAST_DECREASE",
     "Functions",
-    "adjust",
     "build_problem",
     "constant_functions",
-    "mirror",
     "prior_vectors",
-    "resolve_mirrored_tilts",
-    "restart_poses",
     "stack_coefficients",
+    "stack_theta",
     "variance_factor",
+    "weighted_squares",
     "with_coefficients",
     "with_shared",
     "with_shared_values",
 ]
 
 Functions = Mapping[str, ContinuousFunction]
-
-# Shared unknowns that change their sign when everything is mirrored in the reference plane.
-_ODD = ("grid_curvature_m", "axis_z_m")
-# Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
-# no view turns.
-_MAX_TURNS = 5
-LEAST_DECREASE = 0.1
-"""Least decrease of a sum of squares, in sigmas, that makes another pose of a view: what few steps leave is less."""
-# Steps from either sign of a tilt, enough to say which fits better; the adjustment does the rest.
-_POSE_ITERATIONS = 12
 
 
 def build_problem(
@@ -203,114 +184,12 @@ def stack_coefficients(functions: Functions) -> Array:
     return np.concatenate([functions[name].coefficients for name in names_of(functions)])
 
 
-def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> BundleResult:
-    """Refine, and turn views to their mirrored tilt as long as that fits better."""
-    result = refine(problem, state, tolerance=tolerance)
-    for _ in range(_MAX_TURNS):
-        turned, changed = resolve_mirrored_tilts(problem, result.state)
-        if not changed:
-            break
-        result = refine(problem, turned, tolerance=tolerance)
-    return result
+def stack_theta(setup: Setup, functions: Functions, state: State) -> Array:
+    """Return the coefficients of the functions, followed by the shared unknowns of a state."""
+    return with_shared_values(functions, state.theta, len(setup.shared))
 
 
-def mirror(functions: Functions, problem: Problem, state: State) -> State:
-    """Return the state mirrored in the reference plane: tilts, heights and the sign of rho.
-
-    Every point stays where it is seen, so that views and poses alone do not tell the two states apart; priors do, and
-    what a stage says. Exact where rho is a constant and the stage has no offsets.
-    """
-    names = list(names_of(functions))
-    first = sum(functions[name].size for name in names[: names.index("rho")])
-    theta = state.theta.copy()
-    theta[first : first + functions["rho"].size] *= -1.0
-    for k, name in enumerate(problem.shared):
-        if name in _ODD:
-            theta[len(theta) - len(problem.shared) + k] *= -1.0
-    flip = np.array([1.0, 1.0, -1.0])
-    visits = state.visits * [1.0, -1.0] if len(state.visits) else state.visits
-    return replace(
-        state,
-        theta=theta,
-        rotations=mirrored_tilt(state.rotations),
-        translations_m=state.translations_m * flip,
-        visits=visits,
-    )
-
-
-def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
-    """Fit the poses from both signs of the tilt; return the better ones and how many changed."""
-    pairs = zip(problem.starts[:-1], problem.starts[1:], strict=True)
-    middle = np.stack([problem.board_m[a:b].mean(axis=0) for a, b in pairs])
-    rotations = mirrored_tilt(state.rotations)
-    # Turning about the middle of the visible points keeps the view in place.
-    moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)
-    mirrored = replace(state, rotations=rotations, translations_m=state.translations_m + moved)
-    own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    other = refine(problem, mirrored, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    better = _view_costs(problem, other) < _view_costs(problem, own) - LEAST_DECREASE
-    return pick_views(better, other.state, own.state), int(better.sum())
-
-
-def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, int]:
-    """Fit every pose anew from the affine part of its view under the camera of ``state``; return the better ones and
-    how many changed.
-
-    A pose that has got into an optimum of its own while the camera was still wrong comes out of it.
-    """
-    table = problem.cameras(state.theta)
-    count = 0
-    own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    best = own.state
-    costs = _view_costs(problem, own)
-    starts = [
-        _affine_poses(setup, view, table[k])
-        for view, k in zip(setup.views, problem.group, strict=True)
-    ]
-    for k in (0, 1):
-        rotations, translations = state.rotations.copy(), state.translations_m.copy()
-        for v, start in enumerate(starts):
-            if start is not None:
-                rotations[v], translations[v] = start[0][k], start[1][k]
-        fresh = replace(
-            state,
-            rotations=rotations,
-            translations_m=translations,
-            drift_px=np.zeros_like(state.drift_px),
-            lattices=np.zeros_like(state.lattices),
-        )
-        other = refine(problem, fresh, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-        other_costs = _view_costs(problem, other)
-        better = other_costs < costs - LEAST_DECREASE
-        best, costs = pick_views(better, other.state, best), np.where(better, other_costs, costs)
-        count += int(better.sum())
-    return best, count
-
-
-def _affine_poses(setup: Setup, view: GridView, parameters: Array) -> tuple[Array, Array] | None:
-    """Both poses of a view by :func:`pose_from_camera`, or None where the camera is none."""
-    width, height = setup.image_size
-    try:
-        camera = ScanCamera(
-            magnification=view.magnification,
-            **dict(zip(ALL_NAMES, parameters.tolist(), strict=False)),
-            norm_px=setup.norm_px,
-            raster_ratio=setup.raster_ratio,
-            width=width,
-            height=height,
-        )
-        return pose_from_camera(view, camera)
-    except (InvalidValueError, CalibrationError, np.linalg.LinAlgError):
-        return None
-
-
-def _view_costs(problem: Problem, result: BundleResult) -> Array:
-    square = _weighted_squares(problem, result)
-    own = pose_priors(problem, result.state)[:, :, -1]
-    return np.bincount(problem.view_of_point, weights=square) + np.sum(own**2, axis=1)
-
-
-def _weighted_squares(problem: Problem, result: BundleResult) -> Array:
+def weighted_squares(problem: Problem, result: BundleResult) -> Array:
     """(N,) squares of the whitened residuals with their weights; 0 for a point without a projection."""
     square = whitened_norm(problem, result.residuals_px) ** 2
     return np.where(result.huber_weight > 0.0, square, 0.0) * result.huber_weight
@@ -318,7 +197,7 @@ def _weighted_squares(problem: Problem, result: BundleResult) -> Array:
 
 def variance_factor(problem: Problem, result: BundleResult) -> float:
     """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
-    norm2 = _weighted_squares(problem, result)
+    norm2 = weighted_squares(problem, result)
     unknowns = problem.pose_columns * len(problem.group) + len(result.state.theta)
     freedom = 2.0 * result.huber_weight.sum() - unknowns - result.state.visits.size
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))

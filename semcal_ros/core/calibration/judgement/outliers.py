@@ -29,15 +29,15 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.estimator.normal_equations import (
     Problem,
     reduced_normal_equations,
     visit_sigmas,
     whitened_norm,
 )
-from semcal_ros.core.calibration.priors import Setup
-from semcal_ros.core.calibration.problem import variance_factor
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import variance_factor
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 

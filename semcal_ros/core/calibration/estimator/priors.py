@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices
-from semcal_ros.core.calibration.normal_equations import MISS_NAMES
+from semcal_ros.core.calibration.estimator.normal_equations import MISS_NAMES
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
@@ -57,7 +57,7 @@ class Priors:
         1-sigma of the jump at a breakpoint.
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, xi_s_change, scan_change, centre_change_fraction
         1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times
-        k squared. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
+        k squared, over a decade and more. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
         what vendors promise of a magnification. A change that the data do not determine is
         uncertain by this much, and not assumed to be zero.
     height_sigma_m
@@ -126,7 +126,7 @@ class Priors:
 class Setup:
     """Everything common to all problems over one set of views, in order of their magnifications.
 
-    With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.normal_equations.Problem`),
+    With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.estimator.normal_equations.Problem`),
     the problems also have the effects of visits and of drift within the images.
     ``stage_rotation_rad`` is where the constant error of the stage's rotation starts. ``tempering`` is by how much less
     than stated the readings of the stage are believed, as long as the corners are: else a wrong reading would win.
@@ -244,9 +244,18 @@ class Setup:
         p, order, jumps = self.priors, np.arange(1, size), len(self.breaks_of(name))
         jump = {"scale": p.scale_jump, "aspect": p.aspect_jump, "skew": p.skew_jump}.get(name, 0.0)
         # The coefficients of a smooth function fall quickly.
-        change = self.change_prior_of(name) / order**2
+        change = self.change_prior_of(name) * self._bend**order / order**2
         sigmas = [np.array([sigma]), change, np.full(jumps, jump)]
         return np.concatenate([[mean], np.zeros(size - 1 + jumps)]), np.concatenate(sigmas)
+
+    @property
+    def _bend(self) -> float:
+        """By how much less a function changes over these magnifications than over a decade; at most 1.
+
+        The coefficients of a smooth function fall with the power of the length of its interval that is their order.
+        """
+        low, high = self.magnifications[[0, -1]]
+        return float(np.clip(np.log10(high / low), 0.05, 1.0))
 
     def prior_of(self, name: str) -> tuple[float, float]:
         """Return (mean, sigma) of a camera parameter."""

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.discrete import DiscreteFit
+from semcal_ros.core.calibration.paper.discrete import DiscreteFit
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError

@@ -24,9 +24,9 @@ import numpy as np
 from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.finding import Finding
-from semcal_ros.core.calibration.joint import JointFit
-from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = [

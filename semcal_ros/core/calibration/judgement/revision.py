@@ -27,27 +27,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.evaluate import fit_poses
-from semcal_ros.core.calibration.grid_orientation import align_lattices
-from semcal_ros.core.calibration.joint import add_shared_unknowns
-from semcal_ros.core.calibration.line_jitter import estimate_jitter, jitter_covariance
-from semcal_ros.core.calibration.normal_equations import Problem, State
-from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors, Setup
-from semcal_ros.core.calibration.problem import (
-    adjust,
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.estimator.line_jitter import estimate_jitter, jitter_covariance
+from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
+from semcal_ros.core.calibration.estimator.poses import adjust
+from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     variance_factor,
     with_shared,
 )
-from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.untilted import mark_untilted
-from semcal_ros.core.calibration.variance_components import (
+from semcal_ros.core.calibration.estimator.variance_components import (
     Spread,
     VarianceComponents,
     initial_components,
     update_components,
 )
+from semcal_ros.core.calibration.grid_orientation import align_lattices
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.start import add_shared_unknowns
+from semcal_ros.core.calibration.untilted import mark_untilted
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,

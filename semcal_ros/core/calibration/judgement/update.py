@@ -15,8 +15,8 @@
 """Renew a calibration with a few views of the grid.
 
 The covariance of the calibration is the prior, and the changes that a check proves are free
-(:mod:`~semcal_ros.core.calibration.check`). What has not changed by that test may have aged a little: its change has
-a prior of the ageing that the user states. The result is the posterior of a linear Gaussian model
+(:mod:`~semcal_ros.core.calibration.judgement.check`). What has not changed by that test may have aged a little: its
+change has a prior of the ageing that the user states. The result is the posterior of a linear Gaussian model
 (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2), so that a second update with
 other views continues from it.
 """
@@ -29,13 +29,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.check import (
+from semcal_ros.core.calibration.judgement.check import (
     CHANGES,
     CalibrationCheck,
     Verdict,
     check_calibration,
 )
-from semcal_ros.core.calibration.revision import (
+from semcal_ros.core.calibration.judgement.revision import (
     CHANGING,
     Revision,
     free_sigmas,
@@ -162,7 +162,7 @@ def update_calibration(
 
 
 def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:
-    """Return the prior 1-sigma of each of :data:`~semcal_ros.core.calibration.revision.CHANGING`.
+    """Return the prior 1-sigma of each of :data:`~semcal_ros.core.calibration.judgement.revision.CHANGING`.
 
     Parameters
     ----------

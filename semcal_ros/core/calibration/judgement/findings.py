@@ -21,14 +21,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from semcal_ros.core.calibration.calibrate import CalibrationResult
-from semcal_ros.core.calibration.coverage import (
+from semcal_ros.core.calibration.judge import CalibrationResult
+from semcal_ros.core.calibration.judgement.coverage import (
     compute_empty_share,
     compute_reached_shares,
     compute_tilts_deg,
 )
-from semcal_ros.core.calibration.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.finding import Finding, rank_findings
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
 from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px

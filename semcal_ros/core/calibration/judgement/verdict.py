@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.calibration.plan import PLANNED_TILTS_RAD, PlannedVisit, plan_views
+from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, PlannedVisit, plan_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
 from semcal_ros.core.errors import SemcalError

@@ -31,8 +31,8 @@ from scipy.linalg import toeplitz
 from scipy.optimize import nnls
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import (
     Problem,
     normal_equations,
     reduced_normal_equations,

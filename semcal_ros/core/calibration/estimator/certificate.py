@@ -19,9 +19,9 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import equilibrate, solve_scaled
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import Problem, reduced_normal_equations
-from semcal_ros.core.calibration.problem import Functions
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import Problem, reduced_normal_equations
+from semcal_ros.core.calibration.estimator.problem import Functions
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.fit_record import Certificate
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -54,7 +54,9 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
     names = [name for name in names_of(functions) for _ in range(functions[name].size)]
     names += list(problem.shared)
     if not (values[0] > 0.0 and np.all(np.isfinite(sigmas)) and np.all(sigmas > 0.0)):
-        weak = [name for name, s in zip(names, sigmas, strict=True) if not (np.isfinite(s) and s > 0)]
+        weak = [
+            name for name, s in zip(names, sigmas, strict=True) if not (np.isfinite(s) and s > 0)
+        ]
         raise UnusableCalibrationError(
             "a fit whose equations have no solution",
             expected=f"views that determine {', '.join(dict.fromkeys(weak)) or 'the camera'}",

@@ -23,10 +23,12 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.evaluate import ViewPose, rms_by_magnification
-from semcal_ros.core.calibration.finding import Finding
-from semcal_ros.core.calibration.joint import CovarianceParts, FittedField, JointFit
-from semcal_ros.core.calibration.priors import Setup
+from semcal_ros.core.calibration.estimator.adjustment import FittedField
+from semcal_ros.core.calibration.estimator.posterior import CovarianceParts
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.judgement.evaluate import ViewPose, rms_by_magnification
+from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.camera.calibration_model import CalibrationModel, pixel_size_gradient
 from semcal_ros.core.camera.fit_record import ScaleShares
 

@@ -30,8 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.calibration.discrete import DiscreteFit
-from semcal_ros.core.calibration.pda import equation_error, pda_functions
+from semcal_ros.core.calibration.paper.discrete import DiscreteFit
+from semcal_ros.core.calibration.paper.pda import equation_error, pda_functions
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
@@ -55,7 +55,7 @@ class StepTrial:
         How many of the recorded magnifications it selects.
     equation_error
         Relative least-squares error of (19), see
-        :func:`~semcal_ros.core.calibration.pda.equation_error`; None for Legendre polynomials.
+        :func:`~semcal_ros.core.calibration.paper.pda.equation_error`; None for Legendre polynomials.
     rms_px
         RMS reprojection error of all views, poses fitted; infinite where the fit failed.
     """
@@ -127,7 +127,7 @@ def try_steps(
         Reprojection error of all views under functions with their covariance; it may raise
         CalibrationError or InvalidValueError.
     order, legendre_degree
-        As for :func:`~semcal_ros.core.calibration.pda.pda_functions`.
+        As for :func:`~semcal_ros.core.calibration.paper.pda.pda_functions`.
 
     Raises
     ------

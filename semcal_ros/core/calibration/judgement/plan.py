@@ -29,11 +29,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
-from semcal_ros.core.calibration.bundle_adjustment import refine
-from semcal_ros.core.calibration.normal_equations import Effects, State, make_problem
-from semcal_ros.core.calibration.priors import HELD_SIGMA, Priors
-from semcal_ros.core.calibration.revision import CHANGING, record_of
-from semcal_ros.core.calibration.update import ageing_sigmas, change_directions
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.normal_equations import Effects, State, make_problem
+from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Priors
+from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
+from semcal_ros.core.calibration.judgement.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
@@ -131,7 +131,7 @@ def plan_views(
         (:attr:`ViewPlan.floor`); otherwise those of the calibration itself, which views can make as small as wanted.
     ageing
         1-sigma of a relative change of the scale until the views are recorded, as that of
-        :func:`~semcal_ros.core.calibration.update.update_calibration`; 0 for views of the same session.
+        :func:`~semcal_ros.core.calibration.judgement.update.update_calibration`; 0 for views of the same session.
 
     Raises
     ------

@@ -26,7 +26,7 @@ from enum import Enum
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask, invert_scaled, solve_scaled
-from semcal_ros.core.calibration.normal_equations import (
+from semcal_ros.core.calibration.estimator.normal_equations import (
     Eliminated,
     NormalEquations,
     Problem,

@@ -14,7 +14,7 @@
 
 """Whether a calibration still describes the microscope, from a few views of the grid.
 
-The calibration is adjusted to the views (:mod:`~semcal_ros.core.calibration.revision`), with changes that all
+The calibration is adjusted to the views (:mod:`~semcal_ros.core.calibration.judgement.revision`), with changes that all
 magnifications share, and the changes are tested: with all others zero, a group of changes
 lowers chi-square by ``b' L^-1 b``, where ``L`` is their information and ``b`` the score. The most significant
 group is taken, and then the next one given that, as long as one is significant (forward selection; Lehmann and
@@ -32,10 +32,10 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import Problem
-from semcal_ros.core.calibration.priors import Setup
-from semcal_ros.core.calibration.revision import (
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import Problem
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.judgement.revision import (
     CHANGING,
     Revision,
     free_sigmas,

@@ -30,9 +30,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.normal_equations import Problem
-from semcal_ros.core.calibration.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import Problem
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 
 __all__ = [
     "Spread",

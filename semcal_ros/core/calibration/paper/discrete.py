@@ -28,18 +28,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.calibration.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.distortion_centre import DistortionCentre, find_distortion_centre
-from semcal_ros.core.calibration.initial_values import initial_values
-from semcal_ros.core.calibration.normal_equations import Problem, State
-from semcal_ros.core.calibration.priors import HELD_SIGMA, Setup
-from semcal_ros.core.calibration.problem import (
-    adjust,
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
+from semcal_ros.core.calibration.estimator.poses import adjust, resolve_mirrored_tilts
+from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Setup
+from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     constant_functions,
-    resolve_mirrored_tilts,
     stack_coefficients,
     variance_factor,
+)
+from semcal_ros.core.calibration.initial_values import initial_values
+from semcal_ros.core.calibration.paper.distortion_centre import (
+    DistortionCentre,
+    find_distortion_centre,
 )
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction

@@ -1,0 +1,226 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From a fit to a calibration: its model, its held-out errors, and what is to be said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import Functions, variance_factor
+from semcal_ros.core.calibration.judgement.evaluate import ViewPose, fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
+from semcal_ros.core.calibration.judgement.outliers import find_change_point
+from semcal_ros.core.calibration.judgement.scale_checks import (
+    estimate_repeatability,
+    find_scale_weaknesses,
+    measure_excess,
+)
+from semcal_ros.core.calibration.judgement.summary import (
+    collect_statistics,
+    describe_field,
+    describe_shares,
+    describe_stage,
+    list_undetermined,
+)
+from semcal_ros.core.calibration.method_fit import MethodFit, make_model
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.solve import JointFit, without_magnification
+from semcal_ros.core.calibration.views import GridView, RejectedView
+from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
+from semcal_ros.core.camera.fit_record import FitRecord
+from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+
+__all__ = ["CalibrationResult", "describe_fit", "judge"]
+
+# Ratio of residuals to the sigmas of the corners beyond which the misfit is due to the model or the
+# grid: the sigmas of the corners themselves are right to a tenth (benchmarks, "Corner finding").
+_MISFIT = 1.3
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """A calibration with the views from which it was computed.
+
+    Attributes
+    ----------
+    model
+        The continuous calibration.
+    views
+        The views that were used.
+    fit
+        Poses and residuals of these views under the model.
+    held_out_rms_px
+        RMS reprojection error of each magnification's views under a calibration from all others;
+        the two outermost ones are extrapolated.
+    findings
+        What the data could not determine, or do not agree on.
+    outliers
+        Views that were left out because they disagree with the others (``"joint"``).
+    """
+
+    model: CalibrationModel
+    views: tuple[GridView, ...]
+    fit: ViewPose
+    held_out_rms_px: Mapping[float, float]
+    findings: tuple[Finding, ...]
+    outliers: tuple[RejectedView, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as plain sentences, the most costly in nm first."""
+        return tuple(own.tell(self.model) for own in rank_findings(self.findings, self.model))
+
+
+def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
+    """Return the joint fit as that of any method, with what is to be said of it."""
+    adjustment, result = fit.adjustment, fit.adjustment.result
+    factor = variance_factor(adjustment.problem, result)
+    findings = []
+    own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
+    misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
+    if misfit > _MISFIT:
+        excess_px, excess_at = measure_excess(setup, fit)
+        findings.append(
+            Finding(
+                f"scale: residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "
+                "do not follow the microscope everywhere, or the grid is not regular"
+                + ("; record more magnifications" if len(setup.magnifications) > 1 else ""),
+                excess_px,
+                magnification=excess_at,
+            )
+        )
+    change = find_change_point(setup, adjustment.problem, result)
+    if change is not None:
+        findings.append(
+            Finding(
+                f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
+                f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range "
+                "there, calibrate with this breakpoint",
+                # A smooth curve through a jump is off by half of it on either side.
+                cost_relative=0.5 * change.relative,
+                magnification=change.below,
+            )
+        )
+    if not adjustment.converged:
+        findings.append(Finding("the choice of the number of coefficients did not converge"))
+    details = {
+        "iterations": result.iterations,
+        "converged": result.converged,
+        "reason": result.status.value,
+        "selection_rounds": adjustment.rounds,
+        "variance_factor": factor,
+        "excess_sigma_px": fit.excess_px,
+        "coefficients": {name: [f.kind, f.smooth_size] for name, f in adjustment.functions.items()},
+        "breakpoints": list(setup.breakpoints),
+        "residual_field": describe_field(fit.field),
+        **describe_stage(setup, fit),
+    }
+    return MethodFit(
+        fit.padded,
+        fit.covariance,
+        lambda index: without_magnification(fit, index),
+        adjustment.problem.height_sigma_m,
+        (result.state.rotations, result.state.translations_m),
+        details,
+        tuple(findings),
+        None if fit.field is None else fit.field.field,
+        estimate_repeatability(setup, fit),
+        "" if result.converged else result.status.value,
+    )
+
+
+def _predict_held_out(setup: Setup, fit: MethodFit, method: str) -> dict[float, float]:
+    """Return the error at each magnification under a calibration from all others.
+
+    The result is empty for a single magnification.
+    """
+    out: dict[float, float] = {}
+    count = len(setup.magnifications)
+    if count < 2:
+        return out
+    for index, g in enumerate(setup.magnifications):
+        mine = [i for i, v in enumerate(setup.views) if v.magnification == g]
+        own = [setup.views[i] for i in mine]
+        starts = None if fit.poses is None else (fit.poses[0][mine], fit.poses[1][mine])
+        try:
+            camera_at = _make_predictor(setup, *fit.without(index), index, method)
+            height = fit.height_sigma_m[mine]
+            poses = fit_poses(own, camera_at, height_sigma_m=height, starts=starts)
+        except (CalibrationError, InvalidValueError):
+            # The method has no answer there: the error is infinite, not missing.
+            out[float(g)] = float("inf")
+            continue
+        out.update(rms_by_magnification(poses))
+    return out
+
+
+def _make_predictor(
+    setup: Setup, functions: Functions, residual: ResidualField | None, index: int, method: str
+) -> Callable[[float], ScanCamera]:
+    size = sum(f.size for f in functions.values()) + (0 if residual is None else residual.size)
+    rest = replace(setup, magnifications=np.delete(setup.magnifications, index))
+    return make_model(rest, functions, np.zeros((size, size)), method, residual).at
+
+
+def judge(
+    setup: Setup,
+    fit: MethodFit,
+    options: CalibrationOptions,
+    joint: JointFit | None,
+    outliers: tuple[RejectedView, ...],
+) -> CalibrationResult:
+    """Make the calibration of a fit, predict every magnification from the others, and list what is weak.
+
+    Parameters
+    ----------
+    setup
+        The views that were used.
+    fit
+        Their fit by any method.
+    options
+        The choices of the user.
+    joint
+        The same fit where the method is ``"joint"``, or None.
+    outliers
+        Views that were left out because they disagree with the others.
+    """
+    scale = ScaleSigma(fit.repeatability, options.squares_sigma, options.height_sigma_m)
+    model = make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
+    poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
+    held_out = _predict_held_out(setup, fit, options.method)
+    findings = (*fit.findings, *list_undetermined(setup, model))
+    record = FitRecord(float(np.max(fit.height_sigma_m)), is_wide=setup.priors.is_wide)
+    if joint is not None:
+        findings = (*findings, *find_scale_weaknesses(setup, joint, model))
+        record = replace(
+            record,
+            visit_height_sigma_m=joint.adjustment.spread.visit_height.sigma
+            if setup.shared
+            else None,
+            scale_shares=describe_shares(model, joint.parts),
+            certificate=joint.certificate,
+        )
+    model = replace(model, record=record)
+    result = CalibrationResult(model, setup.views, poses, held_out, findings, outliers)
+    statistics = collect_statistics(
+        setup, fit.details, fit.height_sigma_m, poses, held_out, result.warnings
+    )
+    return replace(result, model=replace(model, statistics=statistics))

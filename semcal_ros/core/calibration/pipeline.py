@@ -1,0 +1,307 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How a calibration runs: detect, assign, start, select, solve, judge.
+
+Each stage is a function from what the one before it returns, which is frozen.
+
+- *detect* (:func:`~semcal_ros.core.corners.find_lattice`): an image -> the corners of the grid in it, with their
+  covariances, or why there are none.
+- *assign* (:func:`~semcal_ros.core.calibration.views.views_from_detections`): corners -> views, with the size of the
+  squares that each shows.
+- *start* (:func:`~semcal_ros.core.calibration.start.start`): views -> poses and a camera that hardly depends on the
+  magnification.
+- *select* (:func:`~semcal_ros.core.calibration.select.select`): which terms and how many coefficients the views ask
+  for, as the corners come to be believed; the residual field.
+- *solve* (:func:`~semcal_ros.core.calibration.solve.solve`): the exact adjustment, its certificate and covariance.
+- *judge* (:func:`~semcal_ros.core.calibration.judge.judge`): the calibration, its held-out errors, and its weaknesses.
+
+Around select and solve goes the search for views that disagree with the others. The first two stages see images, and
+:func:`calibrate_views` does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
+from semcal_ros.core.calibration.grid_orientation import align_lattices
+from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
+from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.judgement.outliers import (
+    find_outliers,
+    find_wrong_tilts,
+    measure_deviations,
+)
+from semcal_ros.core.calibration.method_fit import MethodFit
+from semcal_ros.core.calibration.nominal_scale import (
+    advise_scale,
+    check_nominal_scale,
+    observed_scale_factor,
+)
+from semcal_ros.core.calibration.options import CalibrationOptions
+from semcal_ros.core.calibration.paper.methods import fit_separately
+from semcal_ros.core.calibration.select import select
+from semcal_ros.core.calibration.solve import JointFit, solve
+from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start
+from semcal_ros.core.calibration.untilted import mark_untilted
+from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
+from semcal_ros.core.errors import (
+    CalibrationError,
+    InvalidValueError,
+    Rejection,
+    UnusableCalibrationError,
+)
+from semcal_ros.core.wording import counted
+
+__all__ = ["calibrate_views", "fit_joint"]
+
+# Twice as many as determine a homography, so that there are residuals to judge a view by. Less than
+# the corner finder accepts (MINIMUM_CORNERS), since views may also come from other corner finders.
+_MIN_CORNERS = 8
+# A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
+_MIN_VIEWS = 3
+# Display widths and squares that are stated are right to some per cent, and tilts shorten lengths by as much.
+_TELLING_FACTOR = 1.2
+# A grid that seems to be so many times less regular than lithography makes it: perhaps one view is wrong.
+_IRREGULAR = 4.0
+# Views that are left out to see.
+_SUSPECTS = 3
+
+
+def calibrate_views(
+    views: Sequence[GridView],
+    *,
+    image_size: tuple[int, int],
+    display_width_m: float,
+    options: CalibrationOptions | None = None,
+    priors: Priors | None = None,
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
+) -> CalibrationResult:
+    """Calibrate the microscope from views of a planar grid.
+
+    Parameters
+    ----------
+    views
+        Views at one or more magnifications; three per magnification with different tilts are
+        enough.
+    image_size
+        (width, height) of the images, px.
+    display_width_m
+        Display width to which the magnifications refer, m.
+    options
+        Method, breakpoints and residual field; None for the defaults.
+    priors
+        Weak prior knowledge; the defaults suit any SEM, and follow the views where their
+        perspective is that of a photograph.
+    on_stage
+        Called with the name of the stage that begins and the fraction of the work that is done, 0
+        to 1 (``"joint"`` starts again after leaving out views).
+
+    Raises
+    ------
+    CalibrationError
+        If the views do not allow a calibration.
+    UnusableCalibrationError
+        If their scale is off by more than a factor of 3 from the nominal one, or the adjustment
+        did not converge.
+    InvalidValueError
+        For breakpoints outside the magnifications of the views.
+    """
+    options = options or CalibrationOptions()
+    ordered = _check_views(views)
+    magnifications = np.unique([v.magnification for v in ordered])
+    breaks = _check_breakpoints(options.breakpoints, magnifications)
+    setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in ordered]))
+    factor = observed_scale_factor(ordered, nominal)
+    _check_scale(setup, factor)
+    if priors is None:
+        setup = adapt_priors(setup)
+    if options.method == "joint":
+        setup = replace(setup, axis=options.axis)
+        setup = add_shared_unknowns(align_lattices(mark_untilted(setup, options.untilted)))
+    if options.method != "joint":
+        on_stage("one magnification after the other", 0.0)
+        fit = fit_separately(setup, options.method, options.method_options)
+        _check_converged(setup, fit, factor)
+        return judge(setup, fit, options, None, ())
+    joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+    fit = describe_fit(setup, joint)
+    fit = replace(fit, findings=(*notes, *fit.findings))
+    _check_converged(setup, fit, factor)
+    on_stage("held-out magnifications", 0.95)
+    return judge(setup, fit, options, joint, outliers)
+
+
+def fit_joint(
+    setup: Setup,
+    residual: str = "off",
+    on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
+) -> JointFit:
+    """Calibrate from views and nominal values alone: start, select, solve; ``on_stage`` as for ``calibrate_views``."""
+    on_stage("start values", 0.0)
+    started = start(setup)
+    on_stage("terms and coefficients", 0.3)
+    return solve(select(started, residual), on_stage)
+
+
+def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
+    """Return the views in the order of their magnifications, or raise if they are too few."""
+    if not views:
+        raise CalibrationError(
+            "no usable view",
+            expected="images of a chess grid",
+            do="check focus and contrast, and that the grid fills the image",
+        )
+    if len(views) < _MIN_VIEWS:
+        raise CalibrationError(
+            f"a calibration from {counted(len(views), 'view')}",
+            expected=f"at least {_MIN_VIEWS} views of the grid in different directions",
+            do="add tilted views",
+        )
+    for view in views:
+        if (count := len(view.board_xy_m)) < _MIN_CORNERS:
+            raise CalibrationError(
+                f"view {view.name} with {counted(count, 'corner')}",
+                expected=f"at least {_MIN_CORNERS} in every view",
+                do="leave this view out",
+            )
+    return tuple(sorted(views, key=lambda v: v.magnification))
+
+
+def _units(setup: Setup) -> dict[str, Any]:
+    """Return what the nominal scale of the views is made of."""
+    known = tuple(side for side in setup.squares_m if side > 0.0)
+    pixel_size_m = None
+    if len(setup.magnifications) == 1:
+        pixel_size_m = 1.0 / float(setup.nominal_px_per_m(setup.magnifications)[0])
+    return {
+        "display_width_m": setup.display_width_m,
+        "squares_m": known,
+        "pixel_size_m": pixel_size_m,
+    }
+
+
+def _check_scale(setup: Setup, factor: float) -> None:
+    check_nominal_scale(factor, **_units(setup))
+
+
+def _check_converged(setup: Setup, fit: MethodFit, factor: float) -> None:
+    """Refuse a fit that is not at a minimum, or that ended far from the nominal scale."""
+    if fit.failure:
+        advice = "leave out what are not such views"
+        if not 1.0 / _TELLING_FACTOR < factor < _TELLING_FACTOR:
+            advice += "; " + advise_scale(factor, **_units(setup))
+        raise UnusableCalibrationError(
+            f"an adjustment that did not converge ({fit.failure}), where the images show {factor:.3g} "
+            "times the scale that magnification, display width and squares predict",
+            expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+            do=advice,
+        )
+    _check_scale(setup, float(np.median([fit.functions["scale"](g) for g in setup.magnifications])))
+
+
+def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> tuple[float, ...]:
+    low, high = magnifications[0], magnifications[-1]
+    breaks = tuple(sorted({float(b) for b in breakpoints}))
+    if not all(low < b <= high for b in breaks):
+        raise InvalidValueError(
+            f"breakpoints {', '.join(f'{b:g}' for b in breaks)}",
+            expected=f"magnifications above {low:g} and up to {high:g}",
+        )
+    return breaks
+
+
+def _fit_without_outliers(
+    setup: Setup, residual: str, on_stage: Callable[[str, float], None]
+) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[Finding]]:
+    """Fit without the views, and the readings of tilts, that disagree with the others.
+
+    Also returns those views, and a finding for each reading.
+    """
+    outliers: list[RejectedView] = []
+    notes: list[Finding] = []
+    while True:
+        fit = fit_joint(setup, residual, on_stage)
+        wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
+        if wrong:
+            setup, own = _without_tilts(setup, wrong)
+            notes += own
+            continue
+        found = _find_masked_outlier(setup, fit) or find_outliers(
+            fit.adjustment.problem, fit.adjustment.result
+        )
+        if not found:
+            return fit, setup, tuple(outliers), notes
+        outliers += [
+            RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
+            for v, rejection in found.items()
+        ]
+        # At least two views of every magnification stay, so this loop ends.
+        views = tuple(v for i, v in enumerate(setup.views) if i not in found)
+        setup = replace(setup, views=views)
+
+
+def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[ViewStatus]]:
+    """Find the one view without which the grid is regular.
+
+    Where the projection is parallel, one view at a wrong scale is imitated by a tilt of a stretched grid, so
+    all views are given stretched grids, and that view stands out little. Leaving it out makes the stretch of the
+    others collapse, which leaving out another does not.
+    """
+    usual = setup.priors.grid_stretch_sigma
+    lattice = fit.adjustment.spread.lattice_sigma
+    if lattice is None or float(np.max(lattice)) < _IRREGULAR * usual:
+        return {}
+    deviations = measure_deviations(fit.adjustment.problem, fit.adjustment.result)
+    count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
+    suspects = [
+        int(v)
+        for v in np.argsort(-deviations.sigmas)[:_SUSPECTS]
+        if count[setup.views[int(v)].magnification] > 2
+    ]
+    left = {}
+    # The field is that of all views: one of them hardly changes it.
+    plain = setup if fit.field is None else undo_field(setup, fit.field.field)
+    for suspect in suspects:
+        views = tuple(view for i, view in enumerate(plain.views) if i != suspect)
+        other = fit_joint(replace(setup, views=views), "off").adjustment.spread.lattice_sigma
+        left[suspect] = np.inf if other is None else float(np.max(other))
+    best = min(left, key=lambda v: left[v], default=None)
+    if best is None or left[best] > float(np.max(lattice)) / _IRREGULAR:
+        return {}
+    return {best: deviations.reject(best)}
+
+
+def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[Finding]]:
+    """Return the setup without the tilts of some views, and a finding for each of them."""
+    views, notes = list(setup.views), []
+    for index, sigmas in wrong.items():
+        view = views[index]
+        told = "the tilt of the stage" if view.stage is not None else "untilted"
+        notes.append(
+            Finding(
+                f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
+                f"{sigmas:.0f} sigma; its tilt is not used"
+            )
+        )
+        views[index] = replace(view, stage=None, untilted=False)
+    return add_shared_unknowns(replace(setup, views=tuple(views))), notes

@@ -1,0 +1,223 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The exact adjustment of what was selected, its certificate, and what is known after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, solve_scaled
+from semcal_ros.core.calibration.estimator.adjustment import Adjustment, FittedField, GridPattern
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.certificate import certify
+from semcal_ros.core.calibration.estimator.line_jitter import LineJitter, estimate_jitter
+from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
+from semcal_ros.core.calibration.estimator.poses import (
+    refine_coarsely,
+    right_way_up,
+    try_other_poses,
+)
+from semcal_ros.core.calibration.estimator.posterior import (
+    CovarianceParts,
+    pad_covariance,
+    pad_functions,
+    pattern_covariance,
+    split_covariance,
+)
+from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import (
+    Functions,
+    build_problem,
+    with_coefficients,
+)
+from semcal_ros.core.calibration.estimator.residual_field_fit import (
+    field_system,
+    solve_field,
+    undo_field,
+)
+from semcal_ros.core.calibration.estimator.variance_components import (
+    VarianceComponents,
+    limit_components,
+    update_components,
+)
+from semcal_ros.core.calibration.select import Selection, select_and_adjust
+from semcal_ros.core.calibration.start import with_excess
+from semcal_ros.core.camera.fit_record import Certificate
+from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.errors import UnusableCalibrationError
+
+__all__ = ["JointFit", "solve", "without_magnification"]
+
+# Updates of the variance components at most, until they change by less than the last number.
+_LAST_UPDATES, _SMALL_CHANGE = 12, 0.02
+# Views that a message names.
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Result of :func:`fit_joint`.
+
+    Attributes
+    ----------
+    adjustment
+        The adjustment with the chosen number of coefficients.
+    padded, covariance
+        The same functions with a few more coefficients, which are zero, and the covariance of all
+        of them, followed by that of the coefficients of the field.
+    jitter
+        Errors that corners on neighbouring lines share.
+    field
+        The residual field, or None.
+    pattern
+        What is irregular about the grid, or None.
+    excess_px
+        1-sigma per axis, px, by which all corners scatter beyond their own.
+    parts
+        What the covariance of the functions consists of.
+    certificate
+        That the adjustment ended at a minimum.
+    """
+
+    adjustment: Adjustment
+    padded: Functions
+    covariance: Array
+    jitter: LineJitter
+    field: FittedField | None
+    pattern: GridPattern | None
+    excess_px: float
+    parts: CovarianceParts
+    certificate: Certificate
+
+
+def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
+    """Refuse an adjustment whose camera does not show some corners at all, and name their views."""
+    lost = adjustment.result.lost
+    if not np.any(lost):
+        return
+    views = sorted({int(v) for v in adjustment.problem.view_of_point[lost]})
+    more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
+    raise UnusableCalibrationError(
+        "an adjustment whose camera cannot show corners of "
+        f"{', '.join(setup.views[v].name for v in views[:_NAMED])}{more}",
+        expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+        do="leave these views out, or check magnifications, --display-width and --squares",
+    )
+
+
+def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
+    """Adjust exactly with the chosen functions, after trying both signs of every tilt.
+
+    The variance components are updated until they no longer change.
+    """
+    functions = adjustment.functions
+    # From what is usual: spreads that were wide while the model was wrong would hold it there.
+    spread = update_components(setup, adjustment.problem, adjustment.result)
+    spread = limit_components(setup, spread)
+    state, _ = try_other_poses(setup, functions, spread, adjustment.result.state)
+    for _ in range(_LAST_UPDATES):
+        problem = build_problem(setup, functions, setup.views, spread)
+        result = right_way_up(setup, functions, problem, refine_coarsely(problem, state))
+        before, state = spread, result.state
+        spread = update_components(setup, problem, result)
+        if _largest_change(before, spread) < _SMALL_CHANGE:
+            break
+    problem = build_problem(setup, functions, setup.views, spread)
+    result = refine(problem, state)
+    functions = with_coefficients(functions, result.state.theta)
+    return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
+
+
+def _largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
+    """Return the largest relative change of the variance components."""
+    a, b = (
+        np.concatenate(
+            [
+                [c.scale.sigma, c.visit_height.sigma],
+                c.height_sigma_m,
+                c.drift_sigma_px,
+                () if c.lattice_sigma is None else c.lattice_sigma,
+            ]
+        )
+        for c in (before, after)
+    )
+    return float(np.max(np.abs(np.log(b / a))))
+
+
+def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
+    """Return the solution without one magnification, by one Gauss-Newton step on reduced equations.
+
+    At the optimum the poses of the other views follow linearly, so one step is as good as a new
+    adjustment.
+    """
+    if fit.field is not None:
+        fitted = fit.field
+        keep = fitted.system.group != index
+        theta, field = solve_field(fitted.system, fitted.choice.prior, fitted.field, keep)
+        return with_coefficients(fit.adjustment.functions, theta), field
+    functions, result = fit.adjustment.functions, fit.adjustment.result
+    information, gradient = result.information.copy(), result.gradient.copy()
+    information[index] = 0.0
+    gradient[index] = 0.0
+    theta = result.state.theta
+    matrix, right = reduced_normal_equations(fit.adjustment.problem, theta, information, gradient)
+    return with_coefficients(functions, theta + solve_scaled(matrix, right)), None
+
+
+def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> JointFit:
+    """Adjust exactly, certify the result, and compute its covariance; ``on_stage`` as for ``calibrate_views``.
+
+    Raises
+    ------
+    UnusableCalibrationError
+        If the adjustment loses corners, or is not at a minimum.
+    """
+    adjustment, field = selection.adjustment, selection.field
+    on_stage("final adjustment", 0.75)
+    final = setup = with_excess(selection.setup, selection.excess_px)
+    if field is not None:
+        final = undo_field(setup, field.field)
+    # The corners are believed to their own noise now.
+    spread = update_components(setup, adjustment.problem, adjustment.result)
+    adjustment = select_and_adjust(
+        final, adjustment.functions, adjustment.result.state, spread, choose_terms=field is None
+    )
+    adjustment = _adjust_exactly(final, adjustment)
+    _refuse_lost_corners(final, adjustment)
+    certificate = certify(adjustment.functions, adjustment.problem, adjustment.result)
+    if field is not None:
+        system = field_system(setup, adjustment.problem, adjustment.result, field.field)
+        field = replace(field, system=system)
+    on_stage("uncertainty", 0.9)
+    padded = pad_functions(adjustment.functions)
+    jitter = estimate_jitter(adjustment.problem, adjustment.result)
+    covariance = pad_covariance(setup, padded, adjustment, field, jitter)
+    if selection.pattern is not None:
+        covariance = covariance + pattern_covariance(setup, padded, adjustment, selection.pattern)
+    parts = split_covariance(setup, padded, adjustment, final.views, jitter)
+    return JointFit(
+        adjustment,
+        padded,
+        covariance,
+        jitter,
+        field,
+        selection.pattern,
+        selection.excess_px,
+        parts,
+        certificate,
+    )
