@@ -254,18 +254,20 @@ def _write_record(record: FitRecord) -> dict[str, Any]:
 
 def _read_record(data: Mapping[str, Any]) -> FitRecord | None:
     if "fit_record" not in data:
-        return _record_of_notes(data.get("statistics", {}))
+        return _record_of_notes(data.get("statistics", {}), tuple(data["magnifications"]))
     values = dict(data["fit_record"])
     values["squares_m"] = tuple(values.get("squares_m", ()))
     if shares := values.get("scale_shares"):
-        values["scale_shares"] = ScaleShares(tuple(shares["corners"]), tuple(shares["visits"]))
+        values["scale_shares"] = ScaleShares(**{name: tuple(own) for name, own in shares.items()})
     if certificate := values.get("certificate"):
         held = tuple(certificate.get("held", ()))
         values["certificate"] = Certificate(**{**certificate, "held": held})
     return FitRecord(**values)
 
 
-def _record_of_notes(notes: Mapping[str, Any]) -> FitRecord | None:
+def _record_of_notes(
+    notes: Mapping[str, Any], magnifications: tuple[float, ...]
+) -> FitRecord | None:
     """Return the record of a file of version 1 or 2, which kept it among its notes; None where they do not say it."""
     try:
         fit, priors = notes["fit"], notes["priors"]
@@ -276,7 +278,9 @@ def _record_of_notes(notes: Mapping[str, Any]) -> FitRecord | None:
             None if visits is None else float(visits),
             tuple(float(side) for side in notes.get("squares_m", ())),
             bool(priors.get("is_wide", False)),
-            ScaleShares(tuple(shares["corners"]), tuple(shares["visits"])) if shares else None,
+            ScaleShares(magnifications, tuple(shares["corners"]), tuple(shares["visits"]))
+            if shares
+            else None,
         )
     except (KeyError, TypeError, ValueError, AttributeError, InvalidValueError):
         # Notes may have been edited.

@@ -48,9 +48,9 @@ _MAX_SIZE = 8
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
 # Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
 _GAIN_PER_COEFFICIENT = 1.0
-# That of a term that is not there yet: by chance in one of 70 terms that are not needed, as the chance of a chi-square
-# of one degree of freedom above 6.
-_GAIN_OF_TERM = 3.0
+# That of a term that is not there yet: by chance in one of 600 terms that are not needed, as the chance of a chi-square
+# of one degree of freedom above 10.
+_GAIN_OF_TERM = 5.0
 # Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
 _MAX_SCAN_SIZE = 3
 # Gain in half chi-squares by which a choice must be better to replace the previous one.

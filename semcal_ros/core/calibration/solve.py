@@ -64,7 +64,9 @@ from semcal_ros.core.errors import UnusableCalibrationError
 __all__ = ["JointFit", "solve", "without_magnification"]
 
 # Updates of the variance components at most, until they change by less than the last number.
-_LAST_UPDATES, _SMALL_CHANGE = 12, 0.02
+_LAST_UPDATES, _SMALL_CHANGE = 30, 0.005
+# Of the last adjustment: what is left of a step is some hundredths of a sigma then, however many corners there are.
+_EXACT, _MOST_ITERATIONS = 1e-10, 300
 # Views that a message names.
 _NAMED = 5
 
@@ -138,7 +140,7 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
         if _largest_change(before, spread) < _SMALL_CHANGE:
             break
     problem = build_problem(setup, functions, setup.views, spread)
-    result = refine(problem, state)
+    result = refine(problem, state, tolerance=_EXACT, max_iterations=_MOST_ITERATIONS)
     functions = with_coefficients(functions, result.state.theta)
     return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
 

@@ -190,12 +190,6 @@ class CalibrationModel:
             raise InvalidValueError(
                 f"covariance of shape {self.covariance.shape}", expected=f"({size}, {size})"
             )
-        shares = None if self.record is None else self.record.scale_shares
-        if shares is not None and len(shares.corners) != len(self.magnifications):
-            raise InvalidValueError(
-                f"shares of the variance at {len(shares.corners)} magnifications",
-                expected=f"{len(self.magnifications)}",
-            )
         if not self.magnifications or list(self.magnifications) != sorted(self.magnifications):
             raise InvalidValueError(
                 f"magnifications {self.magnifications}", expected="an ascending, non-empty list"

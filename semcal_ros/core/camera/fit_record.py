@@ -65,24 +65,30 @@ class ScaleShares:
 
     Attributes
     ----------
+    magnifications
+        Ascending.
     corners
         What the errors of the corners add.
     visits
         What visits, poses, heights, grid and stage add; the rest is the form of the functions.
     """
 
+    magnifications: tuple[float, ...]
     corners: tuple[float, ...]
     visits: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        whole = np.add(self.corners, self.visits) if self.corners else np.zeros(0)
+        count = len(self.magnifications)
+        as_many = count > 0 and len(self.corners) == len(self.visits) == count
         parts = np.array([*self.corners, *self.visits])
-        if len(self.corners) != len(self.visits) or not (
-            np.all(parts >= 0.0) and np.all(whole <= 1.0 + 1e-9)
+        if not (
+            as_many
+            and np.all(parts >= 0.0)
+            and np.all(np.add(self.corners, self.visits) < 1.0 + 1e-9)
         ):
             raise InvalidValueError(
                 f"shares {self.corners} and {self.visits} of a variance",
-                expected="as many of each, at least 0, and at most 1 together",
+                expected="one of each for every magnification, at least 0, and at most 1 together",
             )
 
 

@@ -100,7 +100,7 @@ class ScanCamera:
         Centre of the distortion, px.
     xi_s, xi_u
         Spiral distortion, and the tangential one along the other diagonal, in normalised coordinates.
-    coil_x2 to coil_x5, settling_1 to settling_4, coil_y2 to coil_y5
+    coil_x2 to coil_x5, settling_1 to settling_5, coil_y2 to coil_y5
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
     raster_ratio
@@ -153,6 +153,7 @@ class ScanCamera:
     settling_2: float = 0.0
     settling_3: float = 0.0
     settling_4: float = 0.0
+    settling_5: float = 0.0
     coil_y2: float = 0.0
     coil_y3: float = 0.0
     coil_y4: float = 0.0
@@ -206,7 +207,7 @@ class ScanCamera:
 
     @property
     def all_parameters(self) -> Array:
-        """(24,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
+        """(25,) parameter vector in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
         return np.array([getattr(self, name) for name in ALL_NAMES], dtype=np.float64)
 
     @property
@@ -351,7 +352,9 @@ class ScanCamera:
     @cached_property
     def without_settling(self) -> ScanCamera:
         """The camera without the settling of the beam at the start of the lines."""
-        return replace(self, settling_1=0.0, settling_2=0.0, settling_3=0.0, settling_4=0.0)
+        return replace(
+            self, settling_1=0.0, settling_2=0.0, settling_3=0.0, settling_4=0.0, settling_5=0.0
+        )
 
     def deflect_columns(self, x: Array) -> Array:
         """Return the deflections along the lines, px, at raw columns, without the residual field; shapes are kept."""

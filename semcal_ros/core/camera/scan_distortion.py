@@ -57,8 +57,8 @@ __all__ = [
     "scan_functions",
 ]
 
-SETTLING_TIMES: tuple[float, ...] = (0.0234, 0.0469, 0.0938, 0.1875)
-"""Time constants of the settling, in half lines: 6, 12, 24 and 48 columns of 512."""
+SETTLING_TIMES: tuple[float, ...] = (0.0117, 0.0234, 0.0469, 0.0938, 0.1875)
+"""Time constants of the settling, in half lines: 3, 6, 12, 24 and 48 columns of 512."""
 SCAN_NAMES: tuple[str, ...] = (
     "coil_x2",
     "coil_x3",
@@ -68,15 +68,16 @@ SCAN_NAMES: tuple[str, ...] = (
     "settling_2",
     "settling_3",
     "settling_4",
+    "settling_5",
     "coil_y2",
     "coil_y3",
     "coil_y4",
     "coil_y5",
 )
 """Amplitudes in half image widths: of the functions along the lines, then of those across them."""
-SETTLING = slice(4, 8)
+SETTLING = slice(4, 9)
 """Which of these are the settling."""
-ALONG_COUNT = 8
+ALONG_COUNT = 9
 """How many of them are along the lines."""
 # Beyond the picture the functions go on as straight lines.
 _END = 1.0
@@ -119,7 +120,7 @@ class ScanDerivatives:
     stretch
         (2, n) derivative of the deflection by the raw pixel along each axis.
     basis
-        (12, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
+        (13, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
     """
 
     stretch: Array
@@ -170,7 +171,7 @@ def _functions(u: Array, axis: int) -> tuple[Array, Array]:
 
 
 def scan_functions(u: Array, axis: int) -> Array:
-    """Return the functions along the lines (``axis`` 0) or across them at ``u`` in half pictures, (8 or 4, n)."""
+    """Return the functions along the lines (``axis`` 0) or across them at ``u`` in half pictures, (9 or 4, n)."""
     return _functions(u, axis)[0]
 
 
@@ -185,7 +186,7 @@ def _amplitudes(amplitudes: Array, axis: int) -> Array:
 
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (12,) or (n, 12)."""
+    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (13,) or (n, 13)."""
     out = np.empty_like(xy)
     for axis in (0, 1):
         values, _ = _functions((xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis), axis)
@@ -194,7 +195,7 @@ def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
 
 
 def deflect_along(x: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (12,)."""
+    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (13,)."""
     flat = x.ravel()
     own = amplitudes[:ALONG_COUNT]
     if not np.any(own):
@@ -219,7 +220,7 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
     """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
 
     Newton's method along each axis on its own. A point without a raw pixel, where the beam would stand still or go
-    back, is NaN. ``amplitudes`` are (12,) or (n, 12).
+    back, is NaN. ``amplitudes`` are (13,) or (n, 13).
     """
     raw = deflection.copy()
     for axis in (0, 1):

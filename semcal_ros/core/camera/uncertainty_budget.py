@@ -147,7 +147,7 @@ def _split_views(
     shares = None if model.record is None else model.record.scale_shares
     if shares is None:
         return {"views of the calibration": math.sqrt(variance)}
-    at, calibrated = np.log(magnification), np.log(model.magnifications)
+    at, calibrated = np.log(magnification), np.log(shares.magnifications)
     corners, visits = (
         float(np.interp(at, calibrated, part)) for part in (shares.corners, shares.visits)
     )

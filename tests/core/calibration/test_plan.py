@@ -123,7 +123,7 @@ def test_what_cannot_be_planned_is_refused(poor: CalibrationModel) -> None:
 
 
 def test_the_verdict_names_the_weakest_place_and_the_next_visit(poor: CalibrationModel) -> None:
-    known = replace(poor, statistics={**poor.statistics, "squares_m": list(SQUARES_M)})
+    known = replace(poor, record=replace(poor.record, squares_m=SQUARES_M))
     verdict = judge_calibration(known)
     assert verdict.largest == pytest.approx(worst(poor), rel=1e-6)
     at = known.at(verdict.at)
@@ -151,7 +151,7 @@ def test_no_visit_is_proposed_where_none_would_help(poor: CalibrationModel) -> N
     """Squares that are known to 3 % only set the scale's sigma, whatever is recorded."""
     rough = replace(
         poor,
-        statistics={**poor.statistics, "squares_m": list(SQUARES_M)},
+        record=replace(poor.record, squares_m=SQUARES_M),
         scale_sigma=replace(poor.scale_sigma, grid=0.03),
     )
     verdict = judge_calibration(rough)
@@ -159,4 +159,4 @@ def test_no_visit_is_proposed_where_none_would_help(poor: CalibrationModel) -> N
     assert "hardly improve" in verdict.advise()
     assert verdict.floor == pytest.approx(0.03, rel=0.05)
     # Nothing is known of the grid.
-    assert judge_calibration(replace(poor, statistics={})).advise() == ""
+    assert judge_calibration(replace(poor, record=None)).advise() == ""

@@ -28,24 +28,10 @@ from semcal_ros.core.camera.scan_distortion import Raster
 
 RASTER = Raster.of(512, 448)
 BASIC = np.array([4.3e5, 1.01, 0.003, 245.0, 262.0, 50.0, 0.06, -0.012, 231.0, 274.0])
-TERMS = np.array(
-    [
-        -0.008,
-        0.003,
-        0.004,
-        -0.006,
-        0.001,
-        0.002,
-        0.002,
-        0.01,
-        -0.003,
-        0.002,
-        0.003,
-        0.005,
-        -0.001,
-        0.002,
-    ]
-)
+LENS = [-0.008, 0.003]
+ALONG = [0.004, -0.006, 0.001, 0.002, 0.001, 0.002, 0.01, -0.003, 0.002]
+ACROSS = [0.003, 0.005, -0.001, 0.002]
+TERMS = np.array([*LENS, *ALONG, *ACROSS])
 PARAMETERS = np.concatenate([BASIC, TERMS])
 POINTS = np.random.default_rng(3).uniform(-5e-4, 5e-4, (60, 3))
 
@@ -54,13 +40,13 @@ def _central(function, x, step):
     return (function(x + step) - function(x - step)) / 2.0
 
 
-@pytest.mark.parametrize("index", range(24), ids=ALL_NAMES)
+@pytest.mark.parametrize("index", range(25), ids=ALL_NAMES)
 @pytest.mark.parametrize("rho", [50.0, 0.0])
 def test_parameter_derivatives(index, rho):
     parameters = PARAMETERS.copy()
     parameters[5] = rho
     step = max(abs(parameters[index]) * 1e-5, 1e-6)
-    delta = np.zeros(24)
+    delta = np.zeros(25)
     delta[index] = step
     numeric = _central(lambda p: project_points(p, POINTS, RASTER), parameters, delta) / step
     analytic = project_points_with_jacobians(parameters, POINTS, RASTER).d_parameters[:, :, index]
@@ -86,7 +72,7 @@ def test_one_camera_per_point_equals_one_camera():
 
 
 def test_a_camera_without_terms_is_that_with_terms_of_zero():
-    whole = np.concatenate([BASIC, np.zeros(14)])
+    whole = np.concatenate([BASIC, np.zeros(15)])
     np.testing.assert_array_equal(
         project_points(BASIC, POINTS, RASTER), project_points(whole, POINTS, RASTER)
     )

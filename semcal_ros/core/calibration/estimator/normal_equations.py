@@ -218,7 +218,7 @@ class Problem:
         return (*self.parameters, *self.shared).index(name)
 
     def cameras(self, theta: Array) -> Array:
-        """Return the parameters of the cameras, (M, 10), or (M, 24) with others than those of every camera."""
+        """Return the parameters of the cameras, (M, 10), or (M, 25) with others than those of every camera."""
         own = self.designs[:, : len(self.parameters)] @ theta
         if self.parameters == PARAMETER_NAMES:
             return own

@@ -87,13 +87,17 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
     # Photographs have no effects of visits.
     if len(order) < 2 or number.min() < 0 or not setup.shared:
         return None
-    effects = fit.adjustment.result.state.visits[:, 0]
+    own = fit.adjustment
+    rho = own.problem.cameras(own.result.state.theta)[groups, 5]
+    # A height of a visit is told from its scale by the priors alone: together they are what its images show.
+    scale, height_m = own.result.state.visits.T
+    effects = scale - rho * height_m
     upward: dict[int, list[float]] = {}
     downward: dict[int, list[float]] = {}
-    for before, own in pairwise(order):
-        if groups[before] != groups[own]:
-            kind = upward if groups[own] > groups[before] else downward
-            kind.setdefault(int(groups[own]), []).append(float(effects[own]))
+    for before, now in pairwise(order):
+        if groups[before] != groups[now]:
+            kind = upward if groups[now] > groups[before] else downward
+            kind.setdefault(int(groups[now]), []).append(float(effects[now]))
     both = sorted(set(upward) & set(downward))
     if len(both) < 2:
         return None

@@ -97,7 +97,7 @@ def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> ScaleSha
         most = max(variance, sum(own), np.finfo(np.float64).tiny)
         corners.append(own[0] / most)
         visits.append(own[1] / most)
-    return ScaleShares(tuple(corners), tuple(visits))
+    return ScaleShares(model.magnifications, tuple(corners), tuple(visits))
 
 
 def _finite_or_none(value: float) -> float | None:
