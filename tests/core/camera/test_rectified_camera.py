@@ -24,7 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from semcal_ros.core.camera.projection import PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.corners import find_lattice
@@ -38,6 +38,9 @@ from semcal_ros.synthetic.specimens.grid import ChessGrid
 SIZE = (512, 384)
 MIDDLE = np.array([255.5, 191.5])
 SIGMAS = np.array([2e4, 0.003, 0.002, 4.0, 5.0, 2.0, 2e-3, 1e-3, 3.0, 4.0])
+# Spiral, decentring along the other diagonal, coils, settling.
+TERMS = {name: (-1.0) ** k * 0.003 for k, name in enumerate(ALL_NAMES[len(PARAMETER_NAMES) :])}
+TERM_SIGMAS = np.full(len(TERMS), 1e-3)
 
 
 def make_camera(**changes: float) -> ScanCamera:
@@ -50,8 +53,15 @@ def make_camera(**changes: float) -> ScanCamera:
 
 def with_covariance(camera: ScanCamera, seed: int = 0) -> ScanCamera:
     """Everything correlates."""
-    root = np.random.default_rng(seed).normal(size=(10, 10)) + 2.0 * np.eye(10)
-    return replace(camera, covariance=(SIGMAS[:, None] * root) @ (SIGMAS[:, None] * root).T / 10.0)
+    sigmas = sigmas_of(camera)
+    size = len(sigmas)
+    root = np.random.default_rng(seed).normal(size=(size, size)) + 2.0 * np.eye(size)
+    root *= sigmas[:, None]
+    return replace(camera, covariance=root @ root.T / size)
+
+
+def sigmas_of(camera: ScanCamera) -> np.ndarray:
+    return np.append(SIGMAS, TERM_SIGMAS)[: len(camera.names)]
 
 
 def make_field(seed: int = 0) -> ResidualField:
@@ -99,9 +109,10 @@ def test_the_middle_of_the_undistorted_picture_stays():
     np.testing.assert_allclose(CAMERA.rectified.project(seen), [MIDDLE], atol=1e-9)
 
 
-def test_it_projects_to_where_the_rectified_image_shows_a_point():
-    square = CAMERA.rectified
-    shown = CAMERA.rect_from_raw(CAMERA.project(POINTS))
+@pytest.mark.parametrize("camera", [CAMERA, make_camera(**TERMS)], ids=["plain", "terms"])
+def test_it_projects_to_where_the_rectified_image_shows_a_point(camera):
+    square = camera.rectified
+    shown = camera.rect_from_raw(camera.project(POINTS))
     for seen in (square.project(POINTS), square.project_ideal(POINTS)):
         np.testing.assert_allclose(seen, shown, atol=1e-9)
     homogeneous = np.column_stack([POINTS, np.ones(len(POINTS))])
@@ -144,8 +155,9 @@ def test_there_and_back(aspect, skew, xi_r, xi_t, pixel):
 
 
 @pytest.mark.parametrize("size", [(1024, 768), (256, 192), (512, 512), (300, 211)])
-def test_resizing_and_rectifying_commute(size):
-    camera = with_covariance(CAMERA)
+@pytest.mark.parametrize("camera", [CAMERA, make_camera(**TERMS)], ids=["plain", "terms"])
+def test_resizing_and_rectifying_commute(camera, size):
+    camera = with_covariance(camera)
     one, other = camera.resized(*size).rectified, camera.rectified.resized(*size)
     np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-13)
     # The same field, about the middle.
@@ -188,14 +200,17 @@ def test_the_parameters_of_a_picture_that_another_camera_rectifies():
     np.testing.assert_array_equal(camera.rectified.covariance[6:, 6:], camera.covariance[6:, 6:])
 
 
+@pytest.mark.parametrize("terms", [False, True])
 @pytest.mark.parametrize("field", [False, True])
-def test_the_jacobian_is_that_of_what_another_camera_rectifies(field):
+def test_the_jacobian_is_that_of_what_another_camera_rectifies(field, terms):
     """Numerically: the true parameters move the raw pixel, the map stays as estimated."""
-    camera = with_covariance(CAMERA)
+    camera = with_covariance(make_camera(**TERMS) if terms else CAMERA)
+    sigmas = sigmas_of(camera)
+    own_count = len(sigmas)
     if field:
         slice_ = make_field().at(1000.0)
         size = slice_.coefficients.size
-        covariance, cross = 1e-6 * np.eye(size), np.zeros((10, size))
+        covariance, cross = 1e-6 * np.eye(size), np.zeros((own_count, size))
         camera = replace(
             camera,
             residual=replace(
@@ -206,8 +221,8 @@ def test_the_jacobian_is_that_of_what_another_camera_rectifies(field):
             ),
         )
     columns = []
-    for k, name in enumerate(PARAMETER_NAMES):
-        step = 1e-4 * SIGMAS[k]
+    for k, name in enumerate(camera.names):
+        step = 1e-4 * sigmas[k]
         up, down = (replace(camera, **{name: getattr(camera, name) + s}) for s in (step, -step))
         moved = [camera.rect_from_raw(c.project(POINTS)) for c in (up, down)]
         columns.append((moved[0] - moved[1]) / (2.0 * step))
@@ -229,8 +244,8 @@ def test_the_jacobian_is_that_of_what_another_camera_rectifies(field):
     own = square.project_jacobian(POINTS)
     # Its own parameters are linear in the raw camera's: undo that to compare.
     linear = np.eye(own.shape[2])
-    linear[:10, :10] = camera._rectified_from_own
-    units = np.concatenate([SIGMAS, np.full(own.shape[2] - 10, 1e-3)])
+    linear[:own_count, :own_count] = camera._rectified_from_own
+    units = np.concatenate([sigmas, np.full(own.shape[2] - own_count, 1e-3)])
     np.testing.assert_allclose(own @ linear * units, by_source * units, atol=2e-6)
     spread = np.einsum("nip,pq,niq->ni", by_source, camera.joint_covariance, by_source)
     np.testing.assert_allclose(square.project_sigma(POINTS), np.sqrt(spread), rtol=1e-5)
