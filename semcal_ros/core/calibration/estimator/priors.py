@@ -33,6 +33,8 @@ HELD_SIGMA = 1e-9
 """Prior 1-sigma that holds an unknown at its mean."""
 
 
+# Width of an image for which lengths in px among the priors are meant.
+_REFERENCE_WIDTH_PX = 512
 # The amplifiers of the scan change these at a breakpoint.
 _JUMPING = ("scale", "aspect", "skew")
 
@@ -55,7 +57,8 @@ class Priors:
         About 1, 0 and the nominal scale.
     scale_jump, aspect_jump, skew_jump
         1-sigma of the jump at a breakpoint.
-    scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, xi_s_change, scan_change, centre_change_fraction
+    scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, xi_s_change, scan_change
+    centre_change_fraction
         1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times
         k squared, over a decade and more. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
         what vendors promise of a magnification. A change that the data do not determine is
@@ -149,6 +152,11 @@ class Setup:
         """Where the raster lies in the pictures; ``raster_ratio`` is that of an older calibration."""
         whole = Raster.of(*self.image_size)
         return whole if self.raster_ratio is None else replace(whole, ratio=self.raster_ratio)
+
+    @property
+    def drift_sigma_px(self) -> float:
+        """Usual drift within an image, 1-sigma per axis in px: the same part of the field in all sizes of images."""
+        return self.priors.drift_sigma_px * self.image_size[0] / _REFERENCE_WIDTH_PX
 
     @property
     def norm_px(self) -> float:

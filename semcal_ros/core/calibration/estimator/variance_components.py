@@ -112,7 +112,7 @@ def initial_components(setup: Setup) -> VarianceComponents:
         Spread(priors.visit_scale_sigma, 0.0),
         Spread(priors.visit_height_sigma_m, 0.0),
         np.full(count, priors.height_sigma_m),
-        np.full(count, priors.drift_sigma_px),
+        np.full(count, setup.drift_sigma_px),
         None if setup.is_rotation_known else _usual_lattice(priors),
     )
 
@@ -198,7 +198,7 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
         visits[0],
         visits[1],
         height,
-        _drift_sigma(problem, result, priors),
+        _drift_sigma(problem, result, setup.drift_sigma_px),
         _lattice_sigma(effects.lattice_sigma, result, priors),
     )
 
@@ -215,14 +215,13 @@ def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) ->
     )
 
 
-def _drift_sigma(problem: Problem, result: BundleResult, priors: Priors) -> Array:
+def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     """Fit the squares of the drifts by a constant and a part that grows with the scale.
 
     A drift of the specimen is one in metres, that of the beam one in pixels. An effect that the
     data determine to ``1 - variance`` has so much of its variance as expected square.
     """
     assert problem.effects is not None
-    usual = priors.drift_sigma_px
     sigma = problem.effects.drift_sigma_px
     scale = np.min(problem.unit_m) / problem.unit_m
     design = np.stack([np.ones_like(scale), scale**2], axis=1)

@@ -254,7 +254,7 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         np.zeros(1, dtype=np.intp),
         max(model.scale_sigma.repeatability, 1e-6),
         heights.visit_height_sigma_m or usual.visit_height_sigma_m,
-        np.full(len(views), usual.drift_sigma_px),
+        np.full(len(views), usual.drift_sigma_px * camera.width / 512),
         y / camera.height - 0.5,
     )
     state = State(np.ones(1), np.stack(rotations), np.zeros((len(views), 3)))
