@@ -59,10 +59,10 @@ class Priors:
         1-sigma of the jump at a breakpoint.
     scale_change, aspect_change, skew_change, xi_r_change, xi_t_change, xi_s_change, scan_change
     centre_change_fraction
-        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times
-        k squared, over a decade and more. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale
-        what vendors promise of a magnification. A change that the data do not determine is
-        uncertain by this much, and not assumed to be zero.
+        1-sigma of the change with the magnification: of the k-th coefficient of a polynomial, times k squared, over a
+        decade and more. A few times what tables 2-4 of the paper show for a JSM-820, and for the scale what vendors
+        promise of a magnification. A change that the data do not determine is uncertain by this much, and not assumed
+        to be zero.
     height_sigma_m
         Height of a view: a tenth of a millimetre is what a stage that is not quite eucentric adds.
     visit_scale_sigma, visit_height_sigma_m, drift_sigma_px
