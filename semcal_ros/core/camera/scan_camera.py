@@ -39,9 +39,7 @@ from semcal_ros.core.camera.projection import (
 from semcal_ros.core.camera.residual_field import FieldSlice
 from semcal_ros.core.camera.scan_distortion import (
     SCAN_NAMES,
-    SETTLING,
     Raster,
-    deflect_along,
     deflection_shift,
     deflection_stretch,
     raw_from_deflection,
@@ -345,20 +343,9 @@ class ScanCamera:
         return self if self.residual is None else replace(self, residual=None)
 
     @property
-    def settles(self) -> bool:
-        """Whether the beam settles at the start of the lines."""
-        return bool(np.any(self._scan_amplitudes[SETTLING]))
-
-    @cached_property
-    def without_settling(self) -> ScanCamera:
-        """The camera without the settling of the beam at the start of the lines."""
-        return replace(
-            self, settling_1=0.0, settling_2=0.0, settling_3=0.0, settling_4=0.0, settling_5=0.0
-        )
-
-    def deflect_columns(self, x: Array) -> Array:
-        """Return the deflections along the lines, px, at raw columns, without the residual field; shapes are kept."""
-        return deflect_along(x, self._scan_amplitudes, self.raster)
+    def distorts_scan(self) -> bool:
+        """Whether coils or settling distort the scan."""
+        return bool(np.any(self._scan_amplitudes))
 
     def without_residual(self, xy: ArrayLike) -> Array:
         """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
@@ -367,8 +354,11 @@ class ScanCamera:
             return points
         return points + self.norm_px * self.residual.displacement(self._normalised(points))
 
-    def _deflection(self, xy: Array) -> Array:
-        """Return the deflections (n, 2) of raw pixels (n, 2): without residual field and distortion of the scan."""
+    def deflect(self, xy: ArrayLike) -> Array:
+        """Return where the beam should be, px, at raw pixels (n, 2): without residual field and distortion of the scan.
+
+        What is left is the distortion of the lens.
+        """
         straight, amplitudes = self.without_residual(xy), self._scan_amplitudes
         if not np.any(amplitudes):
             return straight
@@ -403,7 +393,7 @@ class ScanCamera:
 
     def undistort_report(self, xy: ArrayLike) -> Undistortion:
         """Undistort to normalised coordinates, with convergence flags and residuals."""
-        q_d = (self._deflection(as_points(xy, 2)) - self._centre) / self.norm_px
+        q_d = (self.deflect(xy) - self._centre) / self.norm_px
         return undistort_normalised(q_d, *self._lens)
 
     # -- rectified pixels -------------------------------------------------------------------------

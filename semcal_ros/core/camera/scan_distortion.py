@@ -49,7 +49,6 @@ __all__ = [
     "SETTLING_TIMES",
     "Raster",
     "ScanDerivatives",
-    "deflect_along",
     "deflection_shift",
     "deflection_stretch",
     "linearise_scan",
@@ -192,21 +191,6 @@ def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
         values, _ = _functions((xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis), axis)
         out[:, axis] = raster.norm_px * np.sum(_amplitudes(amplitudes, axis) * values, axis=0)
     return out
-
-
-def deflect_along(x: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return the deflections along the lines, px, at raw columns ``x`` of any shape; ``amplitudes`` are (13,)."""
-    flat = x.ravel()
-    own = amplitudes[:ALONG_COUNT]
-    if not np.any(own):
-        return x
-    # Without settling there is no need of the decays, which cost the most.
-    u = (flat - raster.middle_px[0]) / raster.norm_px
-    if np.any(own[SETTLING]):
-        values, _ = _functions(u, 0)
-        return (flat + raster.norm_px * (own @ values)).reshape(x.shape)
-    values, _ = _functions(u, 1)
-    return (flat + raster.norm_px * (own[: SETTLING.start] @ values)).reshape(x.shape)
 
 
 def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:

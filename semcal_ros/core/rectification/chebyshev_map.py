@@ -16,8 +16,8 @@
 
 A map is evaluated exactly at Chebyshev nodes only and interpolated by polynomials in x and y
 (Trefethen 2019, doi:10.1137/1.9781611975949), in bands of rows: a small matrix product per band, of
-which only the values at the nodes depend on the frame. The residual field of a camera is less smooth and is added
-from a table (:mod:`semcal_ros.core.rectification.field_table`).
+which only the values at the nodes depend on the frame. What is less smooth is added from tables: the distortion of
+the scan along each axis, and the residual field of a camera (:mod:`semcal_ros.core.rectification.field_table`).
 """
 
 from __future__ import annotations
@@ -70,13 +70,19 @@ _COMPARED_ROWS = 49
 _COMPARED_IN_ONE_COLUMN = 2.0
 # Degrees down the image of what the field adds; across it, every column has its own values.
 _FIELD_DEGREES = (12, 24, 48)
-# Degrees down the image of what the settling of the beam adds; across it, every column has its own values.
-_SETTLING_DEGREES = (6, 12, 24, 48)
-# Step of the table of settled columns, px, and part of the width by which it goes on beyond the image: the error is an
-# eighth of the square of the step times the curvature of the decay, 3 px over the square of 8 columns.
-_SETTLING_STEP_PX, _SETTLING_BEYOND = 0.125, 0.125
-# Columns at which the settling is tested, over this part of the width: the slowest decay is a seventh after it.
-_SETTLING_TESTS, _SETTLED_AFTER = 33, 0.2
+# Degrees down the image of what the distortion of the scan adds; across it, every column has its own values.
+_SCAN_DEGREES = (6, 12, 24, 48, 96, 192)
+# Half of that of a map: where the beam settles, an error of its deflection is one of twice as many columns.
+_MAX_DEFLECTION_ERROR_PX = 0.0005
+# Step of the table of deflections at a width of 512 px. The error is an eighth of its square times the curvature of the
+# fastest decay: 0.0002 px for each px of it.
+_SCAN_STEP_PX = 0.125
+# Pictures by which the table goes on beyond this one, in straight lines as the deflections do.
+_SCAN_BEYOND = 10.0
+# Columns at which such a map is tested: where lines begin in some of the rows, over this part of the width from there,
+# after which the slowest decay is a seventh, and over the whole width. Rows between two nodes.
+_SCAN_TESTS, _SETTLED_AFTER = (65, 33, 33), 0.2
+_TESTS_BETWEEN_NODES = np.array([0.25, 0.5, 0.75])
 # Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
 _BEYOND_STEP = 0.125
 # Whole tables of residual fields that are kept: two magnifications may take turns.
@@ -274,10 +280,10 @@ class SmoothMaps:
     """
 
     def __init__(self) -> None:
-        self._degrees: LruCache[tuple[int, int, bool], int] = LruCache(_MAX_KEPT)
+        self._degrees: LruCache[tuple[int, int, bool, bool], int] = LruCache(_MAX_KEPT)
         self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._seen: tuple[object, float] | None = None
-        self._settling_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
+        self._scan_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._tested: deque[_TestedMap] = deque(maxlen=_MAX_TESTED)
         # Of the frame before: where to begin.
@@ -306,62 +312,59 @@ class SmoothMaps:
         drift: RasterDrift | None,
         timing: ScanTiming | None,
     ) -> RawMap:
-        """The map by polynomials, with the settling of the beam from a table where there is any.
+        """The map by polynomials, with the distortion of the scan from tables where there is any.
 
-        The beam is displaced by some columns while it settles, which is too short a time for a drift to be seen.
+        With a residual field, it is by polynomials alone.
         """
-        if camera is not None and camera.settles:
-            found = self._map_with_settling(size, camera, drift, timing)
+        if camera is not None and camera.distorts_scan and camera.residual is None:
+            found = self._map_with_scan(size, camera, drift, timing)
             if found is not None:
                 return found
         return self._map_by_polynomials(size, camera, drift, timing)
 
-    def _map_with_settling(
+    def _map_with_scan(
         self,
         size: tuple[int, int],
         camera: ScanCamera,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
     ) -> RawMap | None:
+        """The map of where the beam should be, and from there to where it is by tables; None where there are none.
+
+        At the nodes the drift is that of the time at which the raw pixel is scanned.
+        """
         width, height = size
-        plain = camera.without_settling
-        smooth = self._map_by_polynomials(size, plain, drift, timing)
-        if smooth._columns is None:
+        smooth = self._map_by_polynomials(size, camera, drift, timing, deflected=True)
+        tables = _tabulate_scan(size, camera)
+        if smooth._columns is None or tables is None:
             return None
-        beyond = _SETTLING_BEYOND * width
-        # A decay is as much longer as a picture is wider.
-        step = _SETTLING_STEP_PX * max(width / 512.0, 1.0)
-        raw = np.arange(-beyond, width + beyond, step)
-        deflected = camera.deflect_columns(raw)
-        if not np.all(np.diff(deflected) > 0.0):
-            return None
-        departure = raw - deflected
-
-        def settle(column: Array) -> Array:
-            """By how much columns without settling are displaced by it."""
-            target = plain.deflect_columns(column)
-            return np.asarray(target + np.interp(target, deflected, departure) - column)
-
+        begin_px = float(camera.deflect([[-0.5, -0.5]])[0, 0])
         smooth_degree = len(smooth._columns) - 3
-        for degree in [d for d in _SETTLING_DEGREES if d >= self._settling_degrees.get(size, 0)]:
+        for degree in [d for d in _SCAN_DEGREES if d >= self._scan_degrees.get(size, 0)]:
             rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
             columns = np.empty((len(rows.places) + 2, 2 * width), dtype=np.float32)
             columns[-2:] = smooth._columns[-2:]
             np.matmul(rows.at_nodes, smooth._columns[:-2], out=columns[:-2])
-            plain_at = columns[:-2, :width].astype(np.float64) + np.arange(width)
-            added = settle(plain_at)
-            # Halfway between the nodes, where interpolation is worst, and where the beam settles.
-            halfway = 0.5 * (rows.places[1:, 0] + rows.places[:-1, 0])
-            matrix = rows.at_pixels[np.unique(halfway.astype(np.intp)), :-2].astype(np.float64)
-            tested = _settling_columns(plain_at)
-            truth = matrix @ plain_at[:, tested]
-            error = matrix @ added[:, tested] - settle(truth)
-            # What lies outside of the raw frame comes out black anyway.
-            if not np.max(np.abs(error[truth > -1.0]), initial=0.0) <= _MAX_MAP_ERROR_PX:
-                continue
-            self._settling_degrees.put(size, degree)
-            columns[:-2, :width] += added
-            return RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
+            start, apart = rows.places[:-1], np.diff(rows.places, axis=0)
+            between = np.unique((start + apart * _TESTS_BETWEEN_NODES).astype(np.intp))
+            matrix = rows.at_pixels[between, :-2].astype(np.float64)
+            identity = np.arange(width, dtype=np.float64), rows.places.astype(np.float64)
+            tested = _tested_columns(columns[:-2, :width] + identity[0] - begin_px)
+            errors_px = []
+            for axis, table in tables.items():
+                part = columns[:-2, axis * width : (axis + 1) * width]
+                target = part + identity[axis]
+                added = np.interp(target, *table)
+                goal = matrix @ target[:, tested]
+                truth = np.interp(goal, *table)
+                # What lies outside of the raw frame comes out black anyway.
+                scanned = (goal + truth > -1.0) & (goal + truth < size[axis])
+                missed = np.abs(matrix @ added[:, tested] - truth)
+                errors_px.append(np.max(missed[scanned], initial=0.0))
+                part += added
+            if max(errors_px) <= _MAX_MAP_ERROR_PX:
+                self._scan_degrees.put(size, degree)
+                return RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
         return None
 
     def _map_with_field(
@@ -440,10 +443,15 @@ class SmoothMaps:
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
+        *,
+        deflected: bool = False,
     ) -> RawMap:
-        """The map by polynomials alone, or the exact one where they do not follow it."""
+        """The map by polynomials alone, or the exact one where they do not follow it.
+
+        It is to where the beam should be if ``deflected``, without the distortion of the scan.
+        """
         exact = camera, drift, timing
-        interpolated = self._sample_departure(size, *exact)
+        interpolated = self._sample_departure(size, *exact, deflected=deflected)
         if interpolated is None:
             return RawMap(size, None, None, exact)
         interpolant, departure = interpolated
@@ -463,23 +471,29 @@ class SmoothMaps:
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
+        *,
+        deflected: bool,
     ) -> tuple[_Interpolant, Array] | None:
         """The map minus the identity, (2, nodes, nodes) of x and y, at the nodes of the lowest
         degree that is accurate, or None where none is.
         """
         # Neighbouring magnifications need the same degree.
-        key = (*size, camera is not None and camera.residual is not None)
+        key = (*size, camera is not None and camera.residual is not None, deflected)
+        limit_px = _MAX_DEFLECTION_ERROR_PX if deflected else _MAX_MAP_ERROR_PX
         for degree in [d for d in _DEGREES if d >= self._degrees.get(key, 0)]:
             interpolant = _make_interpolant(size, degree)
             points, nodes = interpolant.points_xy, interpolant.nodes
-            departure = (raw_from_output(points, size, camera, drift, timing) - points).T
+            reached = raw_from_output(points, size, camera, drift, timing)
+            if deflected and camera is not None:
+                reached = camera.deflect(reached)
+            departure = (reached - points).T
             at_nodes = departure[:, : nodes * nodes].reshape(2, nodes, nodes)
             truth = departure[:, nodes * nodes :].reshape(2, _TESTS, _TESTS)
             error = interpolant.test_rows @ at_nodes @ interpolant.test_cols - truth
             largest = float(np.max(np.abs(error)))
             if not np.isfinite(largest):
                 return None
-            if largest <= _MAX_MAP_ERROR_PX:
+            if largest <= limit_px:
                 self._degrees.put(key, degree)
                 return interpolant, at_nodes
         return None
@@ -516,14 +530,37 @@ def _response(
     return (np.eye(2) + responses[0]).astype(np.float32), float(np.max(spread))
 
 
-def _settling_columns(raw: Array) -> Indices:
-    """Columns of an image at which its settling is tested, whose raw columns without it are (nodes, w)."""
-    width = raw.shape[1]
-    first, last = (int(np.argmin(np.abs(part))) for part in (raw.max(axis=0), raw.min(axis=0)))
-    start, end = min(first, last), max(first, last)
-    # From where a line begins in the first of the rows to where the slowest decay has become small.
-    inside = np.linspace(start, min(end + _SETTLED_AFTER * width, width - 1.0), _SETTLING_TESTS)
-    return np.unique(np.append(inside, width - 1.0).astype(np.intp))
+def _tabulate_scan(
+    size: tuple[int, int], camera: ScanCamera
+) -> dict[int, tuple[Array, Array]] | None:
+    """Return, for each axis with distortion of the scan, deflections in rising order and raw minus deflected pixels;
+    None where the beam stands still or goes back.
+    """
+    count = int(np.ceil(max(size) / (_SCAN_STEP_PX * np.sqrt(size[0] / 512.0)))) + 1
+    places = np.concatenate([[-_SCAN_BEYOND], np.linspace(0.0, 1.0, count), [1.0 + _SCAN_BEYOND]])
+    raw = places[:, None] * size - 0.5
+    deflected = camera.deflect(raw)
+    if not np.all(np.diff(deflected, axis=0) > 0.0):
+        return None
+    departure = raw - deflected
+    return {
+        axis: (deflected[:, axis].copy(), departure[:, axis].copy())
+        for axis in (0, 1)
+        if np.any(departure[:, axis])
+    }
+
+
+def _tested_columns(since: Array) -> Indices:
+    """Columns of an image at which the distortion of the scan is tested, whose deflections are ``since`` (nodes, w) px
+    from that at the beginning of a line.
+    """
+    width = since.shape[1]
+    begins = [int(np.argmin(np.abs(part))) for part in (since.max(axis=0), since.min(axis=0))]
+    first, last = max(min(begins) - 1, 0), min(max(begins) + 1, width - 1)
+    settled = min(last + _SETTLED_AFTER * width, width - 1.0)
+    parts = (first, last), (last, settled), (0, width - 1)
+    picked = [np.linspace(a, b, n) for (a, b), n in zip(parts, _SCAN_TESTS, strict=True)]
+    return np.unique(np.concatenate(picked).astype(np.intp))
 
 
 def _largest(values: Array | Array32) -> float:

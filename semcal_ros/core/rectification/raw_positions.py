@@ -236,7 +236,8 @@ def camera_key(size: tuple[int, int], camera: ScanCamera | None) -> tuple[object
     if camera is None:
         return size
     field = b"" if camera.residual is None else camera.residual.coefficients.tobytes()
-    return (*size, camera.norm_px, *camera.parameters.tolist(), field)
+    raster = camera.norm_px, camera.raster.ratio
+    return (*size, *raster, *camera.parameters.tolist(), field)
 
 
 def drift_key(drift: RasterDrift | None, timing: ScanTiming | None) -> tuple[object, ...]:

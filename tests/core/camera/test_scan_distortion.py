@@ -32,7 +32,6 @@ from semcal_ros.core.camera.scan_distortion import (
     SETTLING,
     SETTLING_TIMES,
     Raster,
-    deflect_along,
     deflection_shift,
     deflection_stretch,
     linearise_scan,
@@ -115,8 +114,7 @@ def test_settling_known_answer(number):
     # A positive amplitude: the first columns show what lies farther to the right.
     assert shift[0, 0] > 1.0 > abs(shift[2, 0])
     camera = replace(PLAIN, **{f"settling_{number}": 0.01})
-    assert camera.settles
-    assert not camera.without_settling.settles
+    assert camera.distorts_scan
     assert camera.distort([[1.0, 77.0]])[0, 0] < 0.5
 
 
@@ -191,19 +189,6 @@ def test_each_point_may_have_its_own_amplitudes():
     np.testing.assert_allclose(raw_from_deflection(xy, table, RASTER), raw, atol=1e-9)
 
 
-@given(pixels, scan)
-def test_columns_are_deflected_as_the_first_coordinate_of_pixels(raw, own):
-    expected = raw[:, 0] + deflection_shift(raw, own, RASTER)[:, 0]
-    np.testing.assert_allclose(deflect_along(raw[:, 0], own, RASTER), expected, atol=1e-10)
-    own = own.copy()
-    own[SETTLING] = 0.0
-    expected = raw[:, 0] + deflection_shift(raw, own, RASTER)[:, 0]
-    shaped = raw[:, 0].reshape(1, -1, 1)
-    np.testing.assert_allclose(
-        deflect_along(shaped, own, RASTER), expected.reshape(1, -1, 1), atol=1e-10
-    )
-
-
 def test_derivatives_agree_with_differences():
     own = np.array([TERMS[name] for name in SCAN_NAMES])
     # Away from the borders, where the second derivative has a step.
@@ -268,12 +253,15 @@ def test_undistorting_reverts_distorting_with_all_terms(points, own):
 
 def test_the_scan_distorts_what_the_lens_shows():
     """First the lens, then the raster: undistorting takes them off in the reverse order."""
+    assert WHOLE.distorts_scan
+    assert not BENT.distorts_scan
     own = np.array([TERMS[name] for name in SCAN_NAMES])
     lens = replace(WHOLE, **dict.fromkeys(SCAN_NAMES, 0.0))
     xy = np.random.default_rng(1).uniform((0.0, 0.0), (511.0, 383.0), (30, 2))
     expected = raw_from_deflection(lens.distort(xy), own, RASTER)
     np.testing.assert_allclose(WHOLE.distort(xy), expected, atol=1e-10)
     deflection = xy + deflection_shift(xy, own, RASTER)
+    np.testing.assert_allclose(WHOLE.deflect(xy), deflection, atol=1e-10)
     np.testing.assert_allclose(WHOLE.undistort(xy), lens.undistort(deflection), atol=1e-9)
 
 
@@ -289,11 +277,10 @@ def test_another_image_size_shows_the_same_field(size):
     np.testing.assert_allclose(resized.project_sigma(POINTS), s * camera.project_sigma(POINTS))
     back = resized.resized(*SIZE)
     np.testing.assert_allclose(back.project(POINTS), camera.project(POINTS), atol=1e-8)
-    # The live maps deflect columns on their own.
-    columns = np.array([0.0, 3.5, 200.0])
+    raw = np.random.default_rng(0).uniform((0.0, 0.0), (511.0, 383.0), (20, 2))
     np.testing.assert_allclose(
-        resized.deflect_columns((columns + 0.5) * s - 0.5),
-        (camera.deflect_columns(columns) + 0.5) * s - 0.5,
+        resized.deflect((raw + 0.5) * s - 0.5 + shift),
+        (camera.deflect(raw) + 0.5) * s - 0.5 + shift,
         atol=1e-9,
     )
 
