@@ -26,7 +26,11 @@ from semcal_ros import Calibration, SemcalError
 from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, TERM_NAMES
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
@@ -103,6 +107,101 @@ def test_a_file_of_version_1_is_read_without_provenance(calibration):
 def test_wrong_provenance_is_refused(calibration, wrong):
     with pytest.raises(CalibrationFileError):
         Calibration.loads(_broken(calibration, lambda d: d.update(provenance=wrong)))
+
+
+def _with_terms(names, residual=None):
+    """Constants, and some functions that change with the magnification; everything correlates."""
+    rng, limits = np.random.default_rng(0), (500.0, 4000.0)
+    values = dict(
+        zip(FUNCTION_NAMES, [1.02, 1.01, 0.002, 249, 262, 50, 0.02, 1e-3, 227, 267], strict=True)
+    )
+    functions = {
+        name: ContinuousFunction("chebyshev_log", np.array([value, 1e-3 * value]), limits)
+        for name, value in values.items()
+    }
+    functions |= {
+        name: ContinuousFunction("chebyshev_log", rng.normal(0.0, 0.003, 1 + k % 2), limits)
+        for k, name in enumerate(names)
+    }
+    size = sum(function.size for function in functions.values())
+    size += 0 if residual is None else residual.size
+    root = 1e-5 * rng.normal(size=(size, size + 5))
+    return Calibration(
+        functions=functions,
+        covariance=root @ root.T,
+        image_width=512,
+        image_height=384,
+        display_width_m=0.12,
+        magnifications=(500.0, 1000.0, 4000.0),
+        method="joint",
+        residual=residual,
+    )
+
+
+def _assert_same(loaded, calibration):
+    for g in (300.0, 500.0, 777.7, 4000.0, 9000.0):
+        one, other = loaded.at(g), calibration.at(g)
+        assert one.names == other.names
+        np.testing.assert_array_equal(one.parameters, other.parameters)
+        # One triangle is stored; the two differ by rounding at most.
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-25)
+        xyz = one.sem_from_ideal([[3.0, 5.0], [200.0, 300.0], [500.0, 12.0]])
+        np.testing.assert_array_equal(one.project(xyz), other.project(xyz))
+    assert loaded.dumps() == calibration.dumps()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [TERM_NAMES, ("xi_s",), ("settling_2", "coil_y3"), ()],
+    ids=["all", "spiral", "two of the scan", "none"],
+)
+@pytest.mark.parametrize("with_field", [False, True])
+def test_terms_come_back_bit_for_bit_and_are_there_only_where_chosen(names, with_field, tmp_path):
+    field = None
+    if with_field:
+        zero = zero_field((512, 384), (500.0, 4000.0), 1)
+        values = np.random.default_rng(1).normal(0.0, 1e-3, zero.coefficients.shape)
+        field = replace(zero, coefficients=values)
+    calibration = _with_terms(names, field)
+    written = yaml.safe_load(calibration.dumps())
+    assert written["version"] == 3
+    assert set(written["functions"]) == {*FUNCTION_NAMES, *names}
+    calibration.save(tmp_path / "cal.yaml")
+    loaded = Calibration.load(tmp_path / "cal.yaml")
+    assert loaded.at(777.7).names == (ALL_NAMES if names else PARAMETER_NAMES)
+    _assert_same(loaded, calibration)
+
+
+def test_functions_may_stand_in_any_order():
+    """The covariance is in the order of the model, whatever the order in the file."""
+    calibration = _with_terms(TERM_NAMES)
+
+    def turn(data):
+        data["functions"] = dict(reversed(data["functions"].items()))
+
+    text = _broken(calibration, turn)
+    _assert_same(Calibration.loads(text), calibration)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_older_files_without_terms_give_the_same_cameras(version):
+    calibration = _with_terms(())
+    old = calibration.dumps().replace("\nversion: 3\n", f"\nversion: {version}\n")
+    assert f"version: {version}" in old
+    loaded = Calibration.loads(old)
+    assert loaded.at(777.7).names == PARAMETER_NAMES
+    _assert_same(loaded, calibration)
+
+
+@pytest.mark.parametrize("name", ["coil_x1", "coil_z2", "settling_0", "xi_q", "settling_11"])
+def test_terms_that_are_not_known_are_refused(name):
+    calibration = _with_terms(("settling_1",))
+
+    def rename(data):
+        data["functions"][name] = data["functions"].pop("settling_1")
+
+    with pytest.raises(CalibrationFileError, match=name):
+        Calibration.loads(_broken(calibration, rename))
 
 
 def _broken(calibration, edit):
