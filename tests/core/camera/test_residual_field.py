@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING_TIMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
@@ -109,27 +110,54 @@ def test_beyond_the_range_the_field_of_the_nearer_end_holds():
         np.testing.assert_array_equal(field.at(outside).coefficients, field.at(edge).coefficients)
 
 
-@pytest.mark.slow
 def test_overlaps_are_the_integrals_that_they_say():
     field = _field(3)
-    rows = field.overlaps() @ field.at(1000.0).coefficients.ravel()
-    # A fine midpoint rule over the domain; its error goes with the square of the step.
-    high_x, high_y = field.knots_x[-1], field.knots_y[-1]
-    x = high_x * (2.0 * (np.arange(1200) + 0.5) / 1200 - 1.0)
-    y = high_y * (2.0 * (np.arange(900) + 0.5) / 900 - 1.0)
+    overlaps = field.overlaps()
+    assert overlaps.shape == (10 + len(SCAN_NAMES), field.slice_size)
+    rows = overlaps @ field.at(1000.0).coefficients.ravel()
+    # Gauss nodes, thirty between knots and the borders of the picture: there, fields and patterns are smooth.
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    axes = []
+    for knots in (field.knots_x, field.knots_y):
+        ends = np.union1d(knots, [-1.0, 1.0] if knots is field.knots_x else [])
+        half = 0.5 * np.diff(ends)[:, None]
+        at = 0.5 * (ends[1:] + ends[:-1])[:, None] + half * nodes
+        axes.append((at.ravel(), (half * weights / (ends[-1] - ends[0])).ravel()))
+    (x, along), (y, down) = axes
     q = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1)
+    weight = np.outer(down, along).ravel()
     shift = field.at(1000.0).displacement(q)
     r2 = np.sum(q * q, axis=1)
     radial, tangential = r2[:, None] * q, r2[:, None] + 2.0 * q * q
+    spiral = r2[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
     one, zero = np.ones(len(q)), np.zeros(len(q))
-    for row, pattern in zip(
-        (0, 3, 6, 7),
-        (np.stack([one, zero], 1), np.stack([q[:, 1], zero], 1), radial, tangential),
-        strict=True,
+    # Beyond the picture, functions of the scan go on as straight lines.
+    inside, beyond = np.clip(q[:, 0], -1.0, 1.0), q[:, 0] - np.clip(q[:, 0], -1.0, 1.0)
+    coil = 0.5 * (5.0 * inside**3 - 3.0 * inside) + 6.0 * beyond
+    time = SETTLING_TIMES[2]
+    decay = np.exp(-(1.0 + inside) / time)
+    decay -= np.where(beyond < 0.0, beyond, 0.0) / time
+    line = np.polynomial.Polynomial.fit(*_sampled_decay(time), 1)(q[:, 0])
+    for row, pattern, tolerance in (
+        (0, np.stack([one, zero], 1), 1e-12),
+        (3, np.stack([q[:, 1], zero], 1), 1e-12),
+        (6, radial, 1e-12),
+        (7, tangential, 1e-12),
+        (8, spiral, 1e-12),
+        (9, tangential * [1.0, -1.0], 1e-12),
+        (10 + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
+        # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
+        (10 + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),
     ):
-        expected = np.mean(np.sum(shift * pattern, axis=1))
-        expected /= np.sqrt(np.mean(np.sum(pattern**2, axis=1)))
-        assert rows[row] == pytest.approx(expected, abs=2e-7)
+        expected = weight @ np.sum(shift * pattern, axis=1)
+        expected /= np.sqrt(weight @ np.sum(pattern**2, axis=1))
+        assert rows[row] == pytest.approx(expected, abs=tolerance)
+        assert abs(expected) > 1e-5
+
+
+def _sampled_decay(time):
+    u = (np.arange(200_000) + 0.5) / 1e5 - 1.0
+    return u, np.exp(-(1.0 + u) / time)
 
 
 def test_slopes_agree_with_differences():
