@@ -128,6 +128,7 @@ def format_calibration(model: CalibrationModel) -> str:
             name: _write_function(model.functions[name]) for name in names_of(model.functions)
         },
         "statistics": _to_plain(model.statistics),
+        **({} if model.record is None else {"fit_record": _write_record(model.record)}),
         "covariance": {
             "size": size,
             "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
@@ -135,8 +136,6 @@ def format_calibration(model: CalibrationModel) -> str:
     }
     if model.scale_sigma != ScaleSigma():
         data["scale_sigma"] = asdict(model.scale_sigma)
-    if model.record is not None:
-        data["fit_record"] = _write_record(model.record)
     if model.provenance != Provenance():
         known = asdict(model.provenance).items()
         data["provenance"] = {name: _to_plain(value) for name, value in known if value}

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from semcal_ros.core.calibration.estimator.certificate import certify
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import Functions, variance_factor
 from semcal_ros.core.calibration.judgement.evaluate import ViewPose, fit_poses, rms_by_magnification
@@ -201,6 +202,11 @@ def judge(
         The same fit where the method is ``"joint"``, or None.
     outliers
         Views that were left out because they disagree with the others.
+
+    Raises
+    ------
+    UnusableCalibrationError
+        If the joint fit is not at a minimum, so that it gets no certificate.
     """
     scale = ScaleSigma(fit.repeatability, options.squares_sigma, options.height_sigma_m)
     model = make_model(setup, fit.functions, fit.covariance, options.method, fit.residual, scale)
@@ -209,14 +215,13 @@ def judge(
     findings = (*fit.findings, *list_undetermined(setup, model))
     record = FitRecord(float(np.max(fit.height_sigma_m)), is_wide=setup.priors.is_wide)
     if joint is not None:
+        own = joint.adjustment
         findings = (*findings, *find_scale_weaknesses(setup, joint, model))
         record = replace(
             record,
-            visit_height_sigma_m=joint.adjustment.spread.visit_height.sigma
-            if setup.shared
-            else None,
+            visit_height_sigma_m=own.spread.visit_height.sigma if setup.shared else None,
             scale_shares=describe_shares(model, joint.parts),
-            certificate=joint.certificate,
+            certificate=certify(own.functions, own.problem, own.result),
         )
     model = replace(model, record=record)
     result = CalibrationResult(model, setup.views, poses, held_out, findings, outliers)

@@ -215,7 +215,7 @@ def select_functions(
             trial = candidates.score({**sizes, name: option})
             gain = score - trial - _price(option[1]) + _price(sizes[name][1])
             if name in free:
-                gain = score - trial - _GAIN_PER_COEFFICIENT * (option[1] - sizes[name][1])
+                gain = score - trial - _cost(option) + _cost(sizes[name])
             if gain > 1e-6 and (best is None or gain > best[0]):
                 best = (gain, name, option)
         if best is None:
@@ -233,6 +233,12 @@ def select_functions(
 def _most_of(name: str) -> int:
     """Return the most coefficients that a function may have."""
     return _MAX_SCAN_SIZE if name in SCAN_NAMES else _MAX_SIZE
+
+
+def _cost(option: tuple[str, int]) -> float:
+    """Return what a function that is always there must gain: that in g itself somewhat more, as it is less natural."""
+    kind, size = option
+    return _GAIN_PER_COEFFICIENT * (size + (kind != "chebyshev_log"))
 
 
 def _price(size: int) -> float:

@@ -24,8 +24,9 @@ Each stage is a function from what the one before it returns, which is frozen.
   magnification.
 - *select* (:func:`~semcal_ros.core.calibration.select.select`): which terms and how many coefficients the views ask
   for, as the corners come to be believed; the residual field.
-- *solve* (:func:`~semcal_ros.core.calibration.solve.solve`): the exact adjustment, its certificate and covariance.
-- *judge* (:func:`~semcal_ros.core.calibration.judge.judge`): the calibration, its held-out errors, and its weaknesses.
+- *solve* (:func:`~semcal_ros.core.calibration.solve.solve`): the exact adjustment and its covariance.
+- *judge* (:func:`~semcal_ros.core.calibration.judge.judge`): the calibration, its certificate, its held-out errors,
+  and its weaknesses.
 
 Around select and solve goes the search for views that disagree with the others. The first two stages see images, and
 :func:`calibrate_views` does the rest.

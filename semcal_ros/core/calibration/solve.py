@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The exact adjustment of what was selected, its certificate, and what is known after it."""
+"""The exact adjustment of what was selected, and what is known after it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.estimator.adjustment import Adjustment, FittedField, GridPattern
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.certificate import certify
 from semcal_ros.core.calibration.estimator.line_jitter import LineJitter, estimate_jitter
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import (
@@ -57,7 +56,6 @@ from semcal_ros.core.calibration.estimator.variance_components import (
 )
 from semcal_ros.core.calibration.select import Selection, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
-from semcal_ros.core.camera.fit_record import Certificate
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -92,8 +90,6 @@ class JointFit:
         1-sigma per axis, px, by which all corners scatter beyond their own.
     parts
         What the covariance of the functions consists of.
-    certificate
-        That the adjustment ended at a minimum.
     """
 
     adjustment: Adjustment
@@ -104,7 +100,6 @@ class JointFit:
     pattern: GridPattern | None
     excess_px: float
     parts: CovarianceParts
-    certificate: Certificate
 
 
 def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
@@ -182,12 +177,12 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
 
 
 def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> JointFit:
-    """Adjust exactly, certify the result, and compute its covariance; ``on_stage`` as for ``calibrate_views``.
+    """Adjust exactly, and compute the covariance; ``on_stage`` as for ``calibrate_views``.
 
     Raises
     ------
     UnusableCalibrationError
-        If the adjustment loses corners, or is not at a minimum.
+        If the adjustment loses corners.
     """
     adjustment, field = selection.adjustment, selection.field
     on_stage("final adjustment", 0.75)
@@ -201,7 +196,6 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     )
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)
-    certificate = certify(adjustment.functions, adjustment.problem, adjustment.result)
     if field is not None:
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
@@ -221,5 +215,4 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         selection.pattern,
         selection.excess_px,
         parts,
-        certificate,
     )
