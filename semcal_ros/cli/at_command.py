@@ -26,6 +26,8 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import HEIGHT, LENGTH, PATH, json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table
 from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.term_sizes import has_terms, measure_along_axes
 from semcal_ros.core.camera.uncertainty_budget import (
     UncertaintyBudget,
     budget_of_length,
@@ -105,7 +107,7 @@ def command(
     if as_json:
         echo_json(described)
     else:
-        _echo_camera(described)
+        _echo_camera(described, model.at(magnification))
         origin = model.provenance
         click.echo(f"calibrated   {origin.describe_origin()}")
         click.echo(
@@ -158,7 +160,31 @@ def _format_matrix(name: str, values: Any) -> str:
     return "\n".join(f"{name if i == 0 else '':9}[{row}]" for i, row in enumerate(rows))
 
 
-def _echo_camera(camera: dict[str, Any]) -> None:
+def _echo_terms(described: dict[str, Any], camera: ScanCamera) -> None:
+    """Print a line for each kind of distortion beside the radial one and that along one diagonal."""
+    if not has_terms(camera):
+        return
+    value, sigma, sizes = (described[k] for k in ("parameters", "parameter_sigma", "terms_px"))
+    if value["xi_u"]:
+        click.echo(
+            f"xi_u         {value['xi_u']:.6g} +- {sigma['xi_u']:.2g} "
+            f"(with xi_t {sizes['decentring']:.2f} px at most)"
+        )
+    if value["xi_s"]:
+        click.echo(
+            f"spiral       {value['xi_s']:.6g} +- {sigma['xi_s']:.2g} "
+            f"({sizes['spiral']:.2f} px at most)"
+        )
+    if sizes["coils"]:
+        x, y = measure_along_axes(camera, "coils")
+        click.echo(f"coils        {x:.2f} px at most along x, {y:.2f} px along y")
+    if sizes["settling"]:
+        click.echo(f"settling     {sizes['settling']:.2f} px at most along x")
+    if sizes["residual field"]:
+        click.echo(f"field        {sizes['residual field']:.2f} px at most, of the residual field")
+
+
+def _echo_camera(camera: dict[str, Any], model: ScanCamera) -> None:
     value, sigma = camera["parameters"], camera["parameter_sigma"]
     (x, y), (sx, sy) = camera["pixel_size_m"], camera["pixel_size_sigma_m"]
     click.echo(
@@ -182,6 +208,7 @@ def _echo_camera(camera: dict[str, Any]) -> None:
     )
     click.echo(f"xi_r         {value['xi_r']:.6g} +- {sigma['xi_r']:.2g}")
     click.echo(f"xi_t         {value['xi_t']:.6g} +- {sigma['xi_t']:.2g}")
+    _echo_terms(camera, model)
     click.echo(
         f"centre px    ({value['ex']:.2f} +- {sigma['ex']:.2f}, "
         f"{value['ey']:.2f} +- {sigma['ey']:.2f})"

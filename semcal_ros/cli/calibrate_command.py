@@ -25,7 +25,14 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.grid_options import grid_options
 from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_option
-from semcal_ros.cli.output import echo_notes, echo_rejected, echo_table, echo_verdict, show_progress
+from semcal_ros.cli.output import (
+    echo_notes,
+    echo_rejected,
+    echo_table,
+    echo_term_sizes,
+    echo_verdict,
+    show_progress,
+)
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.options import (
@@ -206,6 +213,7 @@ def _echo_result(done: RecordingCalibration) -> None:
     )
     _echo_steps(statistics["fit"])
     _echo_equations(done.calibration)
+    echo_term_sizes(done.calibration)
     if done.calibration.residual is not None:
         click.echo("with a residual field for what the distortion parameters do not describe")
     told = sum(view.stage is not None for view in done.result.views)

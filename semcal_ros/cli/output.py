@@ -43,6 +43,7 @@ __all__ = [
     "echo_rejected",
     "echo_states",
     "echo_table",
+    "echo_term_sizes",
     "echo_verdict",
     "list_rejections",
     "show_progress",
@@ -164,6 +165,20 @@ def echo_verdict(calibration: CalibrationModel) -> None:
     for line in (verdict.describe(), verdict.advise()):
         if line:
             click.echo(line)
+
+
+def echo_term_sizes(calibration: CalibrationModel) -> None:
+    """Print how large each kind of distortion is; nothing for a calibration without further terms."""
+    from semcal_ros.core.camera.term_sizes import (
+        describe_term_sizes,
+        has_terms,
+        largest_term_sizes,
+    )
+
+    cameras = [calibration.at(g) for g in calibration.magnifications]
+    if any(has_terms(camera) for camera in cameras):
+        sizes = describe_term_sizes(largest_term_sizes(cameras))
+        click.echo(f"distortion: {sizes} (largest, at any calibrated magnification)")
 
 
 def echo_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.scan_camera import RectifiedCamera, ScanCamera
+from semcal_ros.core.camera.term_sizes import measure_terms
 
 __all__ = ["describe_camera", "parameter_sigma"]
 
@@ -37,6 +38,9 @@ def parameter_sigma(camera: ScanCamera) -> dict[str, float]:
 
 def describe_camera(calibration: Calibration, magnification: float) -> dict[str, Any]:
     """Return K, P, distortion, pixel size and their uncertainty in SI units, as ``semcal at --json`` prints them.
+
+    ``terms_px`` is the largest displacement by each kind of distortion
+    (:func:`~semcal_ros.core.camera.term_sizes.measure_terms`).
 
     Raises
     ------
@@ -60,6 +64,7 @@ def describe_camera(calibration: Calibration, magnification: float) -> dict[str,
         "rectified": _describe_rectified(camera.rectified),
         "distortion": {"xi_r": camera.xi_r, "xi_t": camera.xi_t, "norm_px": camera.norm_px},
         "distortion_centre_px": [camera.ex, camera.ey],
+        "terms_px": measure_terms(camera),
         "parameters": dict(zip(camera.names, camera.parameters.tolist(), strict=True)),
         "parameter_sigma": parameter_sigma(camera),
         "projection_sigma_px": continuous_value("sigma", camera),

@@ -18,9 +18,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from semcal_ros import Calibration
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.residual_field import zero_field
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
 
@@ -99,3 +103,65 @@ def test_what_is_not_known_is_said_to_be_not_recorded_and_nothing_else(
     assert told.err == ""
     path.write_text("format: other\n")
     assert "cal.yaml" in refused(capsys, "info", path)
+
+
+def _with_terms(values: dict[str, float], *, field_px: float = 0.0) -> Calibration:
+    """The calibration with constant further terms, for 96 x 96 images."""
+    plain = make_calibration()
+    functions = dict(plain.functions) | {
+        name: ContinuousFunction("chebyshev_log", np.array([value]), (500.0, 8000.0))
+        for name, value in values.items()
+    }
+    field = None
+    if field_px:
+        zero = zero_field((96, 96), (500.0, 8000.0), 1)
+        field = replace(zero, coefficients=zero.coefficients + [field_px / 48.0, 0.0])
+    size = sum(function.size for function in functions.values())
+    size += 0 if field is None else field.size
+    return replace(plain, functions=functions, residual=field, covariance=1e-8 * np.eye(size))
+
+
+def _lines_of_distortion(told: str) -> list[str]:
+    lines = told.splitlines()
+    begin = next(k for k, line in enumerate(lines) if line.startswith("xi_t"))
+    end = next(k for k, line in enumerate(lines) if line.startswith("centre px"))
+    return lines[begin + 1 : end]
+
+
+def test_each_kind_of_distortion_has_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cal.yaml"
+    terms = {"xi_u": 0.004, "xi_s": -0.01, "coil_x2": 0.02, "coil_y3": 0.01, "settling_3": 0.02}
+    _with_terms(terms, field_px=0.25).save(path)
+    assert run("at", path, 2000) == 0
+    told = _lines_of_distortion(capsys.readouterr().out)
+    assert [line.split()[0] for line in told] == ["xi_u", "spiral", "coils", "settling", "field"]
+    assert told[0].startswith("xi_u         0.004 +- 0.0001 (with xi_t ")
+    assert told[1].startswith("spiral       -0.01 +- 0.0001 (")
+    # P2 is 0.97 in the first column of 96, P3 0.94 in the first row.
+    assert told[2] == "coils        0.93 px at most along x, 0.45 px along y"
+    assert told[4] == "field        0.25 px at most, of the residual field"
+    assert run("at", path, 2000, "--json") == 0
+    sizes = json.loads(capsys.readouterr().out)["terms_px"]
+    kinds = ["radial", "decentring", "spiral", "coils", "settling", "residual field"]
+    assert list(sizes) == kinds
+    assert sizes["residual field"] == pytest.approx(0.25)
+    assert f"({sizes['spiral']:.2f} px at most)" in told[1]
+    assert told[3] == f"settling     {sizes['settling']:.2f} px at most along x"
+
+
+def test_kinds_that_are_not_there_have_no_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cal.yaml"
+    for calibration, expected in (
+        (make_calibration(), []),
+        (_with_terms({}, field_px=0.25), []),
+        (_with_terms({"xi_s": 0.01}), ["spiral"]),
+        (_with_terms({"settling_1": 0.01}), ["settling"]),
+    ):
+        calibration.save(path)
+        assert run("at", path, 2000) == 0
+        told = _lines_of_distortion(capsys.readouterr().out)
+        assert [line.split()[0] for line in told] == expected

@@ -18,11 +18,15 @@ from __future__ import annotations
 
 import io
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from semcal_ros.cli import output
-from semcal_ros.cli.output import show_progress
+from semcal_ros.cli.output import echo_term_sizes, show_progress
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from tests.helpers.node_scenes import make_calibration
 
 
 class _Terminal(io.StringIO):
@@ -84,3 +88,26 @@ def test_only_terminals_see_it(monkeypatch: pytest.MonkeyPatch) -> None:
     with show_progress() as on_progress:
         on_progress("drift", 1, 2)
     assert stderr.getvalue() == ""
+
+
+def test_distortion_is_told_by_its_kinds_where_a_calibration_has_further_terms(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plain = make_calibration()
+    echo_term_sizes(plain)
+    assert capsys.readouterr().out == ""
+    # It grows with log g: the largest is that of the highest magnification, 0.02 half widths of 48 px.
+    spiral = ContinuousFunction("chebyshev_log", np.array([0.01, 0.01]), (500.0, 8000.0))
+    size = len(plain.covariance) + 2
+    terms = replace(
+        plain,
+        functions={**plain.functions, "xi_s": spiral},
+        covariance=1e-8 * np.eye(size),
+    )
+    echo_term_sizes(terms)
+    told = capsys.readouterr().out
+    assert told.startswith("distortion: radial ")
+    assert ", decentring " in told
+    assert ", spiral 3" in told
+    assert "coils" not in told
+    assert told.endswith(" px (largest, at any calibrated magnification)\n")

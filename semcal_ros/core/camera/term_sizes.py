@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from semcal_ros.core.camera.scan_distortion import (
 
 __all__ = [
     "TERM_KINDS",
+    "describe_term_sizes",
     "displace_by",
     "has_terms",
     "largest_term_sizes",
@@ -126,3 +127,12 @@ def largest_term_sizes(cameras: Iterable[ScanCamera]) -> dict[str, float]:
         for kind, size in measure_terms(camera).items():
             largest[kind] = max(largest[kind], size)
     return largest
+
+
+def describe_term_sizes(sizes: Mapping[str, float]) -> str:
+    """Return sizes in words, to two digits, such as ``radial 1.8 px, spiral 12 px``, without those that are 0."""
+    return ", ".join(
+        f"{kind} {size:{'.0f' if size >= 10.0 else '.2g'}} px"
+        for kind, size in sizes.items()
+        if size > 0.0
+    )

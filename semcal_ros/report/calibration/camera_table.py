@@ -23,6 +23,7 @@ import numpy as np
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.term_sizes import describe_term_sizes, has_terms, measure_terms
 from semcal_ros.report.calibration.geometry import compute_displacements
 from semcal_ros.report.html.text import format_length, format_magnification
 
@@ -60,6 +61,8 @@ def _row(camera: ScanCamera, *, calibrated: bool) -> dict[str, Any]:
         ("Field", " × ".join(format_length(side) for side in field)),
         ("Largest distortion", _format_both(float(np.nanmax(moved)), mean_m)),
     ]
+    if has_terms(camera):
+        values.append(("Largest of each kind", describe_term_sizes(measure_terms(camera))))
     if camera.covariance is not None:
         lattice = make_field_lattice(camera.width, camera.height, _ACROSS)
         predicted = predict_shape_sigma_px(camera, lattice)

@@ -23,7 +23,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.camera.predicted_error import make_field_lattice
-from semcal_ros.core.camera.projection import ProjectionJacobians, project_points_with_jacobians
+from semcal_ros.core.camera.projection import PARAMETER_NAMES, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = [
@@ -51,10 +51,6 @@ def remove_residual_field(camera: ScanCamera) -> ScanCamera:
     return replace(camera, residual=None)
 
 
-def _compute_jacobians(camera: ScanCamera, points: Array) -> ProjectionJacobians:
-    return project_points_with_jacobians(camera.parameters, points, camera.raster)
-
-
 def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
     """Compute the RMS error in px at each magnification without distortion correction.
 
@@ -65,15 +61,16 @@ def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, flo
     poses = zip(result.fit.rotations, result.fit.translations_m, strict=True)
     for view, (rotation, translation) in zip(result.views, poses, strict=True):
         camera = remove_residual_field(result.model.at(view.magnification))
-        straight = replace(camera, xi_r=0.0, xi_t=0.0)
+        straight = camera.parameters[: len(PARAMETER_NAMES)].copy()
+        straight[[PARAMETER_NAMES.index("xi_r"), PARAMETER_NAMES.index("xi_t")]] = 0.0
         turned = view.board_xy_m @ rotation[:, :2].T
         points = turned + translation
-        jacobian = _compute_jacobians(straight, points).d_xyz
+        jacobian = project_points_with_jacobians(straight, points, camera.raster).d_xyz
         x, y, z = turned.T
         o = np.zeros_like(x)
         turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
         columns = np.concatenate([jacobian @ turns, jacobian], axis=2).reshape(-1, 6)
-        error = (view.image_xy - straight.project_ideal(points)).ravel()
+        error = (view.image_xy - camera.project_ideal(points)).ravel()
         known = np.isfinite(error) & np.all(np.isfinite(columns), axis=1)
         normal = columns[known].T @ columns[known] + pull.T @ pull
         scaled, scale = equilibrate(normal)

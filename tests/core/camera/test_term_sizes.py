@@ -25,6 +25,7 @@ from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import (
     TERM_KINDS,
+    describe_term_sizes,
     displace_by,
     has_terms,
     largest_term_sizes,
@@ -136,3 +137,11 @@ def test_the_largest_over_some_cameras_is_that_of_each_kind_on_its_own():
     assert largest["spiral"] == measure_terms(one)["spiral"]
     assert largest["coils"] == measure_terms(other)["coils"]
     assert largest_term_sizes([]) == dict.fromkeys(TERM_KINDS, 0.0)
+
+
+def test_sizes_in_words():
+    sizes = {"radial": 1.84, "decentring": 0.3, "spiral": 0.0, "coils": 12.4, "settling": 0.0123}
+    assert describe_term_sizes(sizes) == (
+        "radial 1.8 px, decentring 0.3 px, coils 12 px, settling 0.012 px"
+    )
+    assert describe_term_sizes({}) == ""

@@ -34,6 +34,8 @@ from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_mag
 from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
 from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.predicted_error import (
     make_field_lattice,
     predict_aligned_sigma_px,
@@ -41,6 +43,7 @@ from semcal_ros.core.camera.predicted_error import (
 )
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.field_error_figures import plot_residual_field
 from semcal_ros.report.calibration.geometry import (
     compute_displacements,
@@ -194,6 +197,44 @@ def test_error_without_distortion_is_that_of_poses_fitted_to_a_straight_camera(
         assert linear[g] == pytest.approx(value, rel=0.15)
     # Far above the noise of 0.07 px, which is what stays with the distortion corrected.
     assert linear[100.0] > 3.0 * rms_by_magnification(result.fit)[100.0]
+
+
+def _with_spiral(model: CalibrationModel) -> CalibrationModel:
+    """The calibration with a spiral and a settling that it did not find, each constant."""
+    functions = dict(model.functions) | {
+        name: ContinuousFunction("chebyshev_log", np.array([0.01]), model.magnification_range)
+        for name in ("xi_s", "settling_3")
+    }
+    size = sum(function.size for function in functions.values())
+    return replace(model, functions=functions, covariance=1e-12 * np.eye(size), residual=None)
+
+
+def test_further_terms_are_no_part_of_the_error_without_distortion(
+    result: CalibrationResult,
+) -> None:
+    other = replace(result, model=_with_spiral(result.model))
+    assert compute_rms_without_distortion(other) == pytest.approx(
+        compute_rms_without_distortion(result)
+    )
+
+
+def test_the_slider_tells_the_kinds_of_distortion_where_there_are_further_terms(
+    result: CalibrationResult,
+) -> None:
+    name = "Largest of each kind"
+    plain = replace(
+        result.model,
+        functions={k: result.model.functions[k] for k in FUNCTION_NAMES},
+        residual=None,
+    )
+    size = sum(function.size for function in plain.functions.values())
+    plain = replace(plain, covariance=1e-12 * np.eye(size))
+    assert all(name not in dict(row["values"]) for row in tabulate_cameras(plain))
+    for row in tabulate_cameras(_with_spiral(plain)):
+        told = dict(row["values"])[name]
+        assert re.fullmatch(
+            r"radial \S+ px, decentring \S+ px, spiral \S+ px, settling \S+ px", told
+        )
 
 
 def test_rows_beside_the_paper(result: CalibrationResult) -> None:
