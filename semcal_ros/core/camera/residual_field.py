@@ -12,10 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Residual field: the distortion of a scan that two parameters cannot describe.
+"""Residual field: the distortion that the terms of lens and scan cannot describe.
 
-Spiral distortion, non-linear scan coils and the settling of the beam at the start of a line are
-smooth displacements of the image that no small set of parameters covers. They are held by a
+What they leave is a smooth displacement of the image. It is held by a
 tensor-product B-spline over the raw pixel and log g (design section 4): a raw pixel x would lie at
 
     x + n G((x - c) / n, g)
@@ -25,9 +24,8 @@ width. Being defined on the raw pixel, the field corrects observations by a fixe
 coefficients.
 
 The knots are denser at the start of the lines, where the beam settles. The field excludes what the
-rest of the model describes: shifts, linear maps, and the patterns of the radial and of the
-tangential distortion. Otherwise two descriptions of the same displacement would leave the pixel
-size undefined.
+rest of the model describes: shifts, linear maps, and the patterns of all terms of lens and scan.
+Otherwise two descriptions of the same displacement would leave the pixel size undefined.
 """
 
 from __future__ import annotations
@@ -129,7 +127,7 @@ class FieldSlice:
     coefficients
         (ny, nx, 2), in half image widths.
     cross_covariance
-        (10, 2 ny nx) of the parameters of the camera with the coefficients, or None where it is not known.
+        (P, 2 ny nx) of the parameters of the camera with the coefficients, or None where it is not known.
     weights, whole_covariance
         (ng,) weights of the coefficients of the whole field in these, and their covariance
         (2 ng ny nx, 2 ng ny nx), or None.
@@ -293,7 +291,7 @@ class ResidualField:
     ) -> FieldSlice:
         """Return the field at a magnification.
 
-        ``covariance`` (size, size) of all coefficients and ``cross`` (10, size) with the camera at
+        ``covariance`` (size, size) of all coefficients and ``cross`` (P, size) with the camera at
         ``g`` are optional.
         """
         weights = self.weights(g)
