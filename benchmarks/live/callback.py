@@ -57,6 +57,11 @@ COLUMNS = (
     "core, magnification",
     "core, both",
     "core, fast",
+    "settling, still",
+    "settling, drift",
+    "settling, magnification",
+    "settling, both",
+    "settling, fast",
     "field, still",
     "field, drift",
     "field, magnification",
@@ -88,6 +93,7 @@ def core_actions(size: int, image: np.ndarray) -> dict[str, Callable[[], object]
     return {
         "floor": floor,
         **_rectifications("core", calibration(), size, image, out),
+        **_rectifications("settling", calibration(with_terms=True), size, image, out),
         **_rectifications("field", calibration(with_field=True), size, image, out),
     }
 

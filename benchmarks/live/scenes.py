@@ -64,11 +64,16 @@ def settling_field(limits: tuple[float, float]) -> ResidualField:
     return replace(zero, coefficients=coefficients)
 
 
-def calibration(*, with_field: bool = False) -> Calibration:
+# A spiral of 1 px, coils that depart by 1.5 px, and a beam that settles by 2 px over some 14 columns of 512.
+TERMS = {"xi_s": 0.004, "coil_x3": -0.006, "coil_y2": 0.002, "settling_3": 0.006, "settling_4": 0.002}
+
+
+def calibration(*, with_field: bool = False, with_terms: bool = False) -> Calibration:
     """A calibration with a little of every distortion, for 512 x 512."""
     limits = (500.0, 20000.0)
     values = {"scale": 1.01, "aspect": 1.004, "skew": 0.001, "px": 250.0, "py": 262.0, "rho": 50.0}
     values |= {"xi_r": 0.01, "xi_t": 0.001, "ex": 235.0, "ey": 268.0}
+    values |= TERMS if with_terms else {}
     functions = {
         name: ContinuousFunction("chebyshev_log", np.array([value]), limits)
         for name, value in values.items()

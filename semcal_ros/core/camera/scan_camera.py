@@ -354,6 +354,11 @@ class ScanCamera:
             return points
         return points + self.norm_px * self.residual.displacement(self._normalised(points))
 
+    @property
+    def scan_key(self) -> tuple[object, ...]:
+        """What the distortion of the scan depends on, for looking it up."""
+        return (self.raster, *self._scan_amplitudes.tolist())
+
     def deflect(self, xy: ArrayLike) -> Array:
         """Return where the beam should be, px, at raw pixels (n, 2): without residual field and distortion of the scan.
 

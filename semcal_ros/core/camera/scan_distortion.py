@@ -186,10 +186,12 @@ def _amplitudes(amplitudes: Array, axis: int) -> Array:
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (13,) or (n, 13)."""
-    out = np.empty_like(xy)
+    out = np.zeros_like(xy)
     for axis in (0, 1):
-        values, _ = _functions((xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis), axis)
-        out[:, axis] = raster.norm_px * np.sum(_amplitudes(amplitudes, axis) * values, axis=0)
+        own = _amplitudes(amplitudes, axis)
+        if np.any(own):
+            u = (xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis)
+            out[:, axis] = raster.norm_px * _Curve.of(own).value(u)[0]
     return out
 
 

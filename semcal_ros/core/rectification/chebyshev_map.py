@@ -94,6 +94,10 @@ _OUTSIDE_PX = -1e4
 _IDENTITY = np.eye(2, dtype=np.float32)
 
 
+# Deflections in rising order and raw minus deflected pixels, by the axis.
+_ScanTables = dict[int, tuple[Array, Array]]
+
+
 @dataclass(frozen=True)
 class _Interpolant:
     """Polynomial interpolation from a lattice of nodes to the pixels of an image and to a few test
@@ -283,6 +287,8 @@ class SmoothMaps:
         self._degrees: LruCache[tuple[int, int, bool, bool], int] = LruCache(_MAX_KEPT)
         self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
         self._seen: tuple[object, float] | None = None
+        # Coils and settling hardly depend on the magnification.
+        self._scan_tables: LruCache[object, _ScanTables | None] = LruCache(_MAX_KEPT)
         self._scan_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
         self._tested: deque[_TestedMap] = deque(maxlen=_MAX_TESTED)
@@ -335,7 +341,10 @@ class SmoothMaps:
         """
         width, height = size
         smooth = self._map_by_polynomials(size, camera, drift, timing, deflected=True)
-        tables = _tabulate_scan(size, camera)
+        key = camera.scan_key
+        if (tables := self._scan_tables.get((size, key), None)) is None:
+            tables = _tabulate_scan(size, camera)
+            self._scan_tables.put((size, key), tables)
         if smooth._columns is None or tables is None:
             return None
         begin_px = float(camera.deflect([[-0.5, -0.5]])[0, 0])
@@ -530,9 +539,7 @@ def _response(
     return (np.eye(2) + responses[0]).astype(np.float32), float(np.max(spread))
 
 
-def _tabulate_scan(
-    size: tuple[int, int], camera: ScanCamera
-) -> dict[int, tuple[Array, Array]] | None:
+def _tabulate_scan(size: tuple[int, int], camera: ScanCamera) -> _ScanTables | None:
     """Return, for each axis with distortion of the scan, deflections in rising order and raw minus deflected pixels;
     None where the beam stands still or goes back.
     """
