@@ -77,7 +77,7 @@ _MAX_DEFLECTION_ERROR_PX = 0.0005
 # Step of the table of deflections at a width of 512 px. The error is an eighth of its square times the curvature of the
 # fastest decay: 0.0002 px for each px of it.
 _SCAN_STEP_PX = 0.125
-# Pictures by which the table goes on beyond this one, in straight lines as the deflections do.
+# Rasters to which the table goes on from the middle, in straight lines as the deflections do.
 _SCAN_BEYOND = 10.0
 # Columns at which such a map is tested: where lines begin in some of the rows, over this part of the width from there,
 # after which the slowest decay is a seventh, and over the whole width. Rows between two nodes.
@@ -544,8 +544,12 @@ def _tabulate_scan(size: tuple[int, int], camera: ScanCamera) -> _ScanTables | N
     None where the beam stands still or goes back.
     """
     count = int(np.ceil(max(size) / (_SCAN_STEP_PX * np.sqrt(size[0] / 512.0)))) + 1
-    places = np.concatenate([[-_SCAN_BEYOND], np.linspace(0.0, 1.0, count), [1.0 + _SCAN_BEYOND]])
-    raw = places[:, None] * size - 0.5
+    places = np.linspace(-0.5, 0.5, count)
+    places = np.concatenate([[-_SCAN_BEYOND], places, [_SCAN_BEYOND]])
+    # The picture may be a part of the raster.
+    raster = camera.raster
+    extent = np.maximum(size, 2.0 * raster.norm_px * np.array([1.0, raster.ratio]))
+    raw = raster.middle_px + places[:, None] * extent
     deflected = camera.deflect(raw)
     if not np.all(np.diff(deflected, axis=0) > 0.0):
         return None

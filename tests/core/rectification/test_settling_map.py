@@ -84,7 +84,8 @@ def test_a_map_with_settling_is_the_exact_one(drift: RasterDrift | None, size) -
     camera = SETTLING.resized(*size)
     made = SmoothMaps().make_map(size, camera, drift, TIMING)
     assert made.is_interpolated
-    assert np.abs(errors(made, camera, drift)).max() < 0.002
+    # The promise is 0.002 px; a table that did not follow the raster beyond a part of it took 0.0019 px of that.
+    assert np.abs(errors(made, camera, drift)).max() < 0.0015
 
 
 def test_the_settling_is_seen_in_the_first_columns() -> None:
