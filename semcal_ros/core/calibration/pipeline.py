@@ -61,6 +61,12 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.methods import fit_separately
 from semcal_ros.core.calibration.select import select
 from semcal_ros.core.calibration.solve import JointFit, solve
+from semcal_ros.core.calibration.stage import (
+    OFFSET_NAMES,
+    StageAxis,
+    attitudes,
+    stage_rotations,
+)
 from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start
 from semcal_ros.core.calibration.untilted import mark_untilted
 from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
@@ -85,6 +91,8 @@ _TELLING_FACTOR = 1.2
 _IRREGULAR = 4.0
 # Views that are left out to see.
 _SUSPECTS = 3
+# Part of the tilts that are refused, and of the angle to the stage's own, at which it is the axis that is wrong.
+_MOST_REFUSED, _MUCH_NEARER = 0.5, 0.3
 
 
 def calibrate_views(
@@ -240,6 +248,7 @@ def _fit_without_outliers(
     """
     outliers: list[RejectedView] = []
     notes: list[Finding] = []
+    given = {view.name: view for view in setup.views}
     while True:
         fit = fit_joint(setup, residual, on_stage)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
@@ -251,6 +260,7 @@ def _fit_without_outliers(
             fit.adjustment.problem, fit.adjustment.result
         )
         if not found:
+            notes += _find_turned_axis(given, setup, fit)
             return fit, setup, tuple(outliers), notes
         outliers += [
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
@@ -259,6 +269,32 @@ def _fit_without_outliers(
         # At least two views of every magnification stay, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
+
+
+def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:
+    """Return a finding if most tilts of the stage were refused, and would be right about an axis the other way round."""
+    told = sum(v.has_stage_tilt for v in given.values())
+    """Return a finding if most tilts of the stage were refused, and are right about an axis the other way round."""
+        k for k, v in enumerate(setup.views) if v.stage is None and given[v.name].has_stage_tilt
+    ]
+    if len(refused) < max(_MOST_REFUSED * told, 1.0):
+        return []
+    readings = [given[setup.views[k].name].stage for k in refused]
+    seen = fit.adjustment.result.state.rotations[refused, :, 2]
+
+    def median_angle(axis: StageAxis) -> float:
+        known = attitudes(readings, [False] * len(refused), axis, np.inf)
+        expected = stage_rotations(known, np.zeros(len(OFFSET_NAMES)))[0][:, :, 2]
+        return float(np.median(np.linalg.norm(expected - seen, axis=1)))
+
+    turned = replace(setup.axis, tilt_axis_rad=setup.axis.tilt_axis_rad + np.pi)
+    if median_angle(turned) > _MUCH_NEARER * median_angle(setup.axis):
+        return []
+    return [
+        Finding(
+            "scale: the tilts of the stage have the wrong sign, so they are not used: add 180 to stage.tilt_axis_deg"
+        )
+    ]
 
 
 def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[ViewStatus]]:
