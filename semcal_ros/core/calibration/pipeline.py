@@ -272,9 +272,9 @@ def _fit_without_outliers(
 
 
 def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:
-    """Return a finding if most tilts of the stage were refused, and would be right about an axis the other way round."""
-    told = sum(v.has_stage_tilt for v in given.values())
     """Return a finding if most tilts of the stage were refused, and are right about an axis the other way round."""
+    told = sum(v.has_stage_tilt for v in given.values())
+    refused = [
         k for k, v in enumerate(setup.views) if v.stage is None and given[v.name].has_stage_tilt
     ]
     if len(refused) < max(_MOST_REFUSED * told, 1.0):
