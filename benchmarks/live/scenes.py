@@ -65,7 +65,13 @@ def settling_field(limits: tuple[float, float]) -> ResidualField:
 
 
 # A spiral of 1 px, coils that depart by 1.5 px, and a beam that settles by 2 px over some 14 columns of 512.
-TERMS = {"xi_s": 0.004, "coil_x3": -0.006, "coil_y2": 0.002, "settling_3": 0.006, "settling_4": 0.002}
+TERMS = {
+    "xi_s": 0.004,
+    "coil_x3": -0.006,
+    "coil_y2": 0.002,
+    "settling_3": 0.006,
+    "settling_4": 0.002,
+}
 
 
 def calibration(*, with_field: bool = False, with_terms: bool = False) -> Calibration:
