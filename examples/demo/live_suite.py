@@ -50,6 +50,11 @@ class Received:
     camera_infos: dict[int, CameraInfo] = field(default_factory=dict)
     projections: list[Float64MultiArray] = field(default_factory=list)
 
+    def is_complete(self, frames: int) -> bool:
+        """Whether all of so many frames came through on every topic."""
+        counts = self.counts()
+        return all(counts[topic] >= frames for topic in (*IMAGES, "camera_info"))
+
     def counts(self) -> dict[str, int]:
         """Number of messages per topic."""
         return {
@@ -126,16 +131,17 @@ class LiveSuite:
         )
 
     def _spin_while(self, player: subprocess.Popen[bytes], received: Received, frames: int) -> None:
-        topics = (*IMAGES, "camera_info")
         seen, last_s = 0, time.monotonic()
-        while min(received.counts()[topic] for topic in topics) < frames:
+        while not received.is_complete(frames):
             rclpy.spin_once(self._node, timeout_sec=0.1)
             self._nodes.check()
             total = sum(received.counts().values())
             if total > seen or player.poll() is None:
                 seen, last_s = total, time.monotonic()
             elif time.monotonic() - last_s > SILENCE_S:
-                print("  this machine was too busy: some frames were overtaken by newer ones")
+                print(
+                    "  this machine was too busy: some frames were lost; they are replayed slower"
+                )
                 return
 
     def parameter(self, name: str) -> list[float]:
