@@ -16,20 +16,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import Functions
 from semcal_ros.core.calibration.judgement.finding import Finding
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
-from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 
 __all__ = ["MethodFit", "make_model"]
-
-Functions = Mapping[str, ContinuousFunction]
 
 
 @dataclass(frozen=True)

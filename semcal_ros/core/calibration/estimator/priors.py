@@ -27,14 +27,14 @@ from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
-__all__ = ["HELD_SIGMA", "Priors", "Setup"]
+__all__ = ["HELD_SIGMA", "REFERENCE_WIDTH_PX", "Priors", "Setup"]
 
 HELD_SIGMA = 1e-9
 """Prior 1-sigma that holds an unknown at its mean."""
+REFERENCE_WIDTH_PX = 512
+"""Width of an image for which lengths in px among the priors are meant; they grow with the image."""
 
 
-# Width of an image for which lengths in px among the priors are meant.
-_REFERENCE_WIDTH_PX = 512
 # The amplifiers of the scan change these at a breakpoint.
 _JUMPING = ("scale", "aspect", "skew")
 
@@ -156,7 +156,7 @@ class Setup:
     @property
     def drift_sigma_px(self) -> float:
         """Usual drift within an image, 1-sigma per axis in px: the same part of the field in all sizes of images."""
-        return self.priors.drift_sigma_px * self.image_size[0] / _REFERENCE_WIDTH_PX
+        return self.priors.drift_sigma_px * self.image_size[0] / REFERENCE_WIDTH_PX
 
     @property
     def norm_px(self) -> float:

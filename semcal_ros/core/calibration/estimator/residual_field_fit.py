@@ -39,7 +39,7 @@ from semcal_ros.core.calibration.estimator.normal_equations import (
     whiten,
     whitened_rows,
 )
-from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.priors import REFERENCE_WIDTH_PX, Setup
 from semcal_ros.core.calibration.estimator.problem import variance_factor
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -58,7 +58,7 @@ __all__ = [
 
 # Standard deviations of a coefficient that are tried, px in a picture of the reference width: from less than the noise
 # to a camera lens. Distortion grows with the picture.
-_STRENGTHS_PX, _REFERENCE_WIDTH_PX = (0.05, 0.3, 2.0, 12.0), 512
+_STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
 # A prior this narrow holds the field at zero; the same equations then serve without a field.
 _NO_STRENGTH_PX = 1e-7
 # Ratio of the coefficients to their second differences: fields are smooth.
@@ -390,7 +390,7 @@ def choose_field(
         return np.concatenate(costs)
 
     without = held_out(_NO_STRENGTH_PX)
-    relative = setup.image_size[0] / _REFERENCE_WIDTH_PX
+    relative = setup.image_size[0] / REFERENCE_WIDTH_PX
     gains = {s: without - held_out(s) for s in (relative * s for s in _STRENGTHS_PX)}
     best = max(gains, key=lambda s: float(gains[s].sum()))
     gain = float(gains[best].sum())

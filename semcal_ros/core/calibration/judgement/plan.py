@@ -31,7 +31,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
 from semcal_ros.core.calibration.estimator.normal_equations import Effects, State, make_problem
-from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Priors
+from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, REFERENCE_WIDTH_PX, Priors
 from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
 from semcal_ros.core.calibration.judgement.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.views import GridView
@@ -254,7 +254,7 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         np.zeros(1, dtype=np.intp),
         max(model.scale_sigma.repeatability, 1e-6),
         heights.visit_height_sigma_m or usual.visit_height_sigma_m,
-        np.full(len(views), usual.drift_sigma_px * camera.width / 512),
+        np.full(len(views), usual.drift_sigma_px * camera.width / REFERENCE_WIDTH_PX),
         y / camera.height - 0.5,
     )
     state = State(np.ones(1), np.stack(rotations), np.zeros((len(views), 3)))
