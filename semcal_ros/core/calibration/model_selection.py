@@ -30,8 +30,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import Problem
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import variance_factor, with_shared
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS

@@ -34,8 +34,8 @@ from semcal_ros.core.calibration.estimator.adjustment import (
     GridPattern,
     refit_functions,
 )
+from semcal_ros.core.calibration.estimator.blocks import State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.normal_equations import State
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses, refine_coarsely
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import (

@@ -25,7 +25,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2
 from semcal_ros.core.calibration.estimator.adjustment import SMOOTH, refit_functions
-from semcal_ros.core.calibration.estimator.normal_equations import GRID_NAMES, MISS_NAMES, State
+from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
 from semcal_ros.core.calibration.estimator.poses import (
     COARSE,
     adjust,

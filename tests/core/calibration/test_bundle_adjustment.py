@@ -21,8 +21,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration.estimator.blocks import State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.normal_equations import State, make_problem, residuals
+from semcal_ros.core.calibration.estimator.residuals import corner_residuals
 from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
@@ -118,7 +119,7 @@ def test_covariance_equals_that_of_the_full_system(poses):
             rotations_from_vectors(shift[:, :3]) @ state.rotations,
             state.translations_m + shift[:, 3:] * problem.unit_m[:, None],
         )
-        rows = np.einsum("nij,nj->ni", inverse_roots, residuals(problem, moved))
+        rows = np.einsum("nij,nj->ni", inverse_roots, corner_residuals(problem, moved))
         rows *= np.sqrt(result.huber_weight)[:, None]
         height, _, _ = height_of_tilt(
             np.zeros(n_views), moved.rotations, moved.translations_m, np.zeros(3)
@@ -140,7 +141,7 @@ def test_covariance_equals_that_of_the_full_system(poses):
     np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), expected, rtol=2e-3)
     rows = jacobian[2 * len(problem.board_m) :][:n_views]
     np.testing.assert_allclose(
-        result.prior_variance[:, 0], np.diag(rows @ dense @ rows.T), rtol=5e-3
+        result.prior_variance["height"][:, 0], np.diag(rows @ dense @ rows.T), rtol=5e-3
     )
 
 

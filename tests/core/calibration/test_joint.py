@@ -23,10 +23,7 @@ import pytest
 
 from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.normal_equations import (
-    reduced_normal_equations,
-    residuals,
-)
+from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import mirror, restart_poses, right_way_up
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 from semcal_ros.core.calibration.estimator.problem import (
@@ -34,6 +31,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     stack_coefficients,
     variance_factor,
 )
+from semcal_ros.core.calibration.estimator.residuals import corner_residuals
 from semcal_ros.core.calibration.pipeline import fit_joint
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.start import measure_misfit_px
@@ -110,7 +108,7 @@ def test_what_is_mirrored_in_the_reference_plane_is_seen_at_the_same_places_and_
     own = fit.adjustment
     flipped = mirror(own.functions, own.problem, own.result.state)
     np.testing.assert_allclose(
-        residuals(own.problem, flipped), own.result.residuals_px, rtol=0.0, atol=1e-9
+        corner_residuals(own.problem, flipped), own.result.residuals_px, rtol=0.0, atol=1e-9
     )
     wrong = refine(own.problem, flipped)
     right = right_way_up(setup, own.functions, own.problem, wrong)

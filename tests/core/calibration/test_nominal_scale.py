@@ -24,7 +24,7 @@ import pytest
 
 from semcal_ros.core.calibration import pipeline
 from semcal_ros.core.calibration import solve as solve_module
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleStatus
+from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
 from semcal_ros.core.calibration.nominal_scale import check_nominal_scale, check_square_sides
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
@@ -111,7 +111,7 @@ def _lose_the_first_corner(result):
     ("spoil", "told"),
     [
         (
-            lambda result: replace(result, status=BundleStatus.ITERATION_LIMIT),
+            lambda result: replace(result, status=DescentStatus.ITERATION_LIMIT),
             "did not converge .stopped at the iteration limit",
         ),
         (_lose_the_first_corner, "cannot show corners of"),

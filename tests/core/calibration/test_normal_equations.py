@@ -25,22 +25,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration.estimator.blocks import State, empty_effects, retract
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
 from semcal_ros.core.calibration.estimator.normal_equations import (
-    State,
-    empty_effects,
     normal_equations,
-    pose_priors,
-    residuals,
-    retract,
+    reduced_normal_equations,
     schur_complement,
-    visit_sigmas,
 )
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     constant_functions,
     stack_coefficients,
+)
+from semcal_ros.core.calibration.estimator.residuals import (
+    VIEW_RESIDUALS,
+    corner_residuals,
+    corner_rows,
+    stack_rows,
+    view_residuals,
 )
 from semcal_ros.core.calibration.estimator.variance_components import Spread, VarianceComponents
 from semcal_ros.core.calibration.grid_orientation import align_lattices
@@ -124,14 +127,14 @@ def _moved(problem, state, x):
 def _whole(problem, state, x, huber):
     """All whitened residuals, of observations and of priors, as one vector."""
     moved = _moved(problem, state, x)
-    miss = residuals(problem, moved)
+    miss = corner_residuals(problem, moved)
     xx, yx, yy = problem.whitening.T * np.sqrt(huber)
     return np.concatenate(
         [
             xx * miss[:, 0],
             yx * miss[:, 0] + yy * miss[:, 1],
-            pose_priors(problem, moved)[:, :, -1].ravel(),
-            (-moved.visits / visit_sigmas(problem)).ravel(),
+            stack_rows(problem.layout, view_residuals(problem, moved))[:, :, -1].ravel(),
+            (-moved.visits / problem.effects.visit_sigmas).ravel(),
             (problem.prior_mean - moved.theta) / problem.prior_sigma,
         ]
     )
@@ -142,14 +145,14 @@ def dense(system):
     """Numerical normal equations of the whole system."""
     problem, state = system
     huber = normal_equations(problem, state).huber_weight
-    size = len(state.theta) + state.visits.size + problem.pose_columns * len(problem.group)
+    size = len(state.theta) + state.visits.size + problem.layout.of_view.size * len(problem.group)
     # Steps small enough for the curvature and large enough for rounding, in units of the priors.
     own = np.minimum(problem.prior_sigma, 1.0)
-    own_steps = [1e-6] * (problem.pose_columns - 8)
+    own_steps = [1e-6] * (problem.layout.of_view.size - 8)
     steps = np.concatenate(
         [
             1e-4 * own,
-            np.tile(visit_sigmas(problem) * 1e-2, len(state.visits)),
+            np.tile(problem.effects.visit_sigmas * 1e-2, len(state.visits)),
             np.tile([*[1e-5] * 3, *[1e-3] * 3, *[1e-3] * 2, *own_steps], len(problem.group)),
         ]
     )
@@ -171,8 +174,6 @@ def test_the_step_is_that_of_the_whole_system(system, dense):
     scale = 1.0 / np.sqrt(np.diag(matrix))
     step = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
     reduced = schur_complement(problem, state, normal_equations(problem, state), 0.0)
-    from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
-
     own, pull = reduced_normal_equations(
         problem, state.theta, reduced.information, reduced.gradient
     )
@@ -196,17 +197,110 @@ def test_covariances_are_those_of_the_whole_system(system, dense):
     )
     visits = np.diag(inverse)[size : size + state.visits.size].reshape(-1, 2)
     np.testing.assert_allclose(np.sqrt(result.visit_variance), np.sqrt(visits), rtol=2e-3)
-    rows = pose_priors(problem, state)[:, :, :-1]
-    first, outer = problem.shared_columns, problem.shared_columns + problem.visit_columns
+    rows = stack_rows(problem.layout, view_residuals(problem, state))[:, :, :-1]
+    first, outer = problem.layout.visit.start, problem.layout.view.start
+    found = np.concatenate(list(result.prior_variance.values()), axis=1)
     for v in (0, len(problem.group) - 1):
         # The unknowns of a view from those of the whole system.
         take = np.zeros((rows.shape[2], len(inverse)))
         take[:first, :size] = problem.designs[problem.group[v]]
         visit = size + 2 * problem.effects.visit[v]
         take[[first, first + 1], [visit, visit + 1]] = 1.0
-        pose = size + state.visits.size + problem.pose_columns * v
-        own = np.arange(problem.pose_columns)
+        pose = size + state.visits.size + problem.layout.of_view.size * v
+        own = np.arange(problem.layout.of_view.size)
         take[outer + own, pose + own] = 1.0
         spread = take @ inverse @ take.T
         expected = np.diag(rows[v] @ spread @ rows[v].T)
-        np.testing.assert_allclose(result.prior_variance[v], expected, rtol=5e-3, atol=1e-6)
+        np.testing.assert_allclose(found[v], expected, rtol=5e-3, atol=1e-6)
+
+
+# Steps in the units of the blocks, small against their curvature and large against rounding.
+STEPS = {
+    "camera": 1e-5,
+    "grid.shape": 1e-6,
+    "grid.squares": 1e-6,
+    "stage.axis": 1e-8,
+    "stage.offset": 1e-6,
+    "visit.scale": 1e-6,
+    "visit.height": 1e-8,
+    "view.turn": 1e-6,
+    "view.shift": 1e-3,
+    "view.drift": 1e-3,
+    "view.lattice": 1e-6,
+}
+
+
+def _stepped(problem, state, block, k, step):
+    """The state after a step in the k-th unknown of a block of every magnification, visit or view."""
+    layout = problem.layout
+    theta = np.zeros_like(state.theta)
+    visits, views = np.zeros_like(state.visits), np.zeros((len(problem.group), layout.of_view.size))
+    if block in layout.of_view:
+        views[:, layout.of_view[block].start + k] = step
+    elif block in layout.of_visit:
+        visits[:, layout.of_visit[block].start + k] = step
+    else:
+        # The functions of this problem are constants: the camera is theta itself, but for the scale.
+        column = layout[block].start + k
+        theta[column] = step / problem.designs[0, column, column]
+    return retract(problem, state, theta, views, visits)
+
+
+def _central(values, step):
+    return (values(step) - values(-step)) / (2.0 * step)
+
+
+@pytest.mark.parametrize("name", VIEW_RESIDUALS)
+def test_derivatives_of_the_residuals_of_views(system, name):
+    """Of every kind, by every unknown of every block; where a residual names no derivative, there is none."""
+    problem, state = system
+    residual = VIEW_RESIDUALS[name](problem, state)
+    if residual is None:
+        assert name == "lattice"
+        assert "view.lattice" not in problem.layout
+        return
+    rows = stack_rows(problem.layout, {name: residual})
+    assert set(residual.by) <= set(STEPS)
+    for block in problem.layout.blocks:
+        step = STEPS[block.name]
+        for k in range(len(block.unknowns)):
+
+            def values(delta, block=block.name, k=k):
+                moved = _stepped(problem, state, block, k, delta)
+                return VIEW_RESIDUALS[name](problem, moved).values
+
+            found = rows[:, :, problem.layout[block.name].start + k]
+            expected = -_central(values, step)
+            # Rounding of a residual of some sigmas, over the step.
+            largest = np.max(np.abs(residual.values))
+            floor = 1e-9 * (1.0 + largest) / step
+            if name == "attitude":
+                # A rotation that is left is taken for a small one: per rad, this leaves out the residual itself.
+                floor += largest
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=floor, err_msg=block.name)
+
+
+def test_derivatives_of_the_corners(system):
+    """By every unknown of every block, those included on which a corner does not depend."""
+    problem, state = system
+    corners = corner_rows(problem, state)
+    rows = np.zeros((2, problem.layout.size, len(problem.board_m)))
+    rows[:, corners.columns[:-1]] = corners.rows[:, :-1]
+    xx, yx, yy = problem.whitening.T * np.sqrt(corners.huber_weight)
+    # The first magnification alone: its scale has the step in px per m.
+    own = problem.group[problem.view_of_point] == 0
+    for block in problem.layout.blocks:
+        for k, unknown in enumerate(block.unknowns):
+            step = STEPS[block.name] * (problem.designs[0, 0, 0] if unknown == "m" else 1.0)
+
+            def values(delta, block=block.name, k=k):
+                moved = _stepped(problem, state, block, k, delta)
+                x, y = corner_residuals(problem, moved).T
+                return np.stack([xx * x, yx * x + yy * y])
+
+            found = rows[:, problem.layout[block.name].start + k, own]
+            expected = -_central(values, step)[:, own]
+            scale = np.max(np.abs(expected)) + 1e-6 / step
+            np.testing.assert_allclose(
+                found / scale, expected / scale, rtol=1e-4, atol=1e-6, err_msg=block.name
+            )

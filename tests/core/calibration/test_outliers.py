@@ -21,9 +21,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, BundleStatus
-from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
 from semcal_ros.core.calibration.judgement.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
@@ -133,7 +134,7 @@ def _adjusted(group, residual_sigmas, *, heights_m=0.0, pull=0.0, weight=1.0):
         np.ones((count, 1)),
         np.zeros((0, 2)),
         1,
-        BundleStatus.SMALL_DECREASE,
+        DescentStatus.SMALL_DECREASE,
     )
     return problem, result
 

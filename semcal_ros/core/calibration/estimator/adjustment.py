@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import Problem
 from semcal_ros.core.calibration.estimator.problem import Functions
 from semcal_ros.core.calibration.estimator.residual_field_fit import FieldChoice, FieldSystem
 from semcal_ros.core.calibration.estimator.variance_components import VarianceComponents

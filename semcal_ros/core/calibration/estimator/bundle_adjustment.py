@@ -19,42 +19,50 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import dataclass
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask, invert_scaled, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import (
+    Problem,
+    State,
+    empty_effects,
+    pick_views,
+    retract,
+    select_views,
+    states_of,
+    with_states_of,
+)
 from semcal_ros.core.calibration.estimator.normal_equations import (
     Eliminated,
     NormalEquations,
-    Problem,
-    State,
     damped_diagonal,
-    empty_effects,
     normal_equations,
-    pick_views,
-    pose_priors,
-    prior_cost,
     reduced_normal_equations,
-    retract,
     schur_complement,
-    select_views,
-    states_of,
+)
+from semcal_ros.core.calibration.estimator.residuals import (
+    prior_cost,
+    stack_rows,
     view_costs,
-    visit_sigmas,
-    with_states_of,
+    view_residuals,
+)
+from semcal_ros.core.calibration.estimator.trust_region import (
+    FIRST_DAMPING,
+    MIN_DAMPING,
+    DescentStatus,
+    Step,
+    descend,
 )
 
-__all__ = ["BundleResult", "BundleStatus", "refine"]
+__all__ = ["BundleResult", "refine"]
 
 
 # A guard against endless iteration; the result says where it was reached.
 _MAX_ITERATIONS = 60
-# Levenberg-Marquardt damping relative to the diagonal: nearly Gauss-Newton at the start; the limits
-# stand for no damping and for steps of no length.
-_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-12, 1e10
 # Ratio of actual to predicted decrease below which the quadratic model of a view has failed.
 _POOR_GAIN = 0.25
 # Steps by which the pose of such a view follows a new camera. It has to be near only: the next
@@ -68,15 +76,6 @@ _LARGEST_TURN = 0.5
 _ROUNDING = 1e-10
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-7
-
-
-class BundleStatus(Enum):
-    """How an adjustment ended; the values are the sentences of the calibration file."""
-
-    SMALL_DECREASE = "converged: relative decrease below the tolerance"
-    NO_DESCENT = "converged: no step lowers the cost"
-    ITERATION_LIMIT = "stopped at the iteration limit"
-    SINGULAR = "the views and the priors do not determine the unknowns"
 
 
 @dataclass(frozen=True)
@@ -101,9 +100,9 @@ class BundleResult:
     covariance
         (K, K) of theta for unit variance of the whitened residuals.
     prior_residuals, prior_variance
-        (V, r) residuals of the priors of the poses, in sigmas, and their posterior variances: of
-        the height, the drift within the image (x, y) and the orientation (about the tilt axis,
-        across it, about the normal), as far as the problem has them.
+        (V, r) each: what is left of each of
+        :data:`~semcal_ros.core.calibration.estimator.residuals.VIEW_RESIDUALS` that the problem has, in sigmas, and
+        its posterior variance.
     visit_variance
         (J, 2) posterior variance of the scale and of the height in m2 of each visit.
     iterations, status
@@ -119,17 +118,17 @@ class BundleResult:
     information: Array
     gradient: Array
     covariance: Array
-    prior_residuals: Array
-    prior_variance: Array
+    prior_residuals: Mapping[str, Array]
+    prior_variance: Mapping[str, Array]
     visit_variance: Array
     iterations: int
-    status: BundleStatus
+    status: DescentStatus
     last_decrease: float = 0.0
 
     @property
     def converged(self) -> bool:
         """Whether the cost is at a minimum, and every point has a projection there."""
-        ended = self.status in (BundleStatus.SMALL_DECREASE, BundleStatus.NO_DESCENT)
+        ended = self.status in (DescentStatus.SMALL_DECREASE, DescentStatus.NO_DESCENT)
         return ended and not np.any(self.lost)
 
     @property
@@ -143,15 +142,17 @@ class BundleResult:
 
 
 @dataclass(frozen=True)
-class _Step:
-    """A damped Gauss-Newton step, and the decrease of cost that its quadratic model predicts.
+class _Point:
+    """A state, and the cost of each view there."""
 
-    Attributes
-    ----------
-    state
-        State after the step.
-    predicted, predicted_prior
-        (V,) predicted decrease for each view, and that of the prior of theta.
+    state: State
+    costs: Array
+
+
+@dataclass(frozen=True)
+class _Change:
+    """A damped Gauss-Newton step: the state after it, and the (V,) decrease that it predicts for each view, and for
+    the priors of theta and of the visits.
     """
 
     state: State
@@ -159,7 +160,9 @@ class _Step:
     predicted_prior: float
 
 
-def _step(problem: Problem, state: State, normal: NormalEquations, damping: float) -> _Step | None:
+def _change(
+    problem: Problem, state: State, normal: NormalEquations, damping: float
+) -> _Change | None:
     """Return the step, or None where rounding leaves no positive definite equations: a larger damping does."""
     try:
         reduced = schur_complement(problem, state, normal, damping)
@@ -169,14 +172,16 @@ def _step(problem: Problem, state: State, normal: NormalEquations, damping: floa
         change = solve_scaled(matrix, right, damping)
     except np.linalg.LinAlgError:
         return None
-    camera, visits, pose = reduced.back(problem, change)
-    if not (np.all(np.isfinite(change)) and np.all(np.isfinite(pose))):
+    camera, visits, views = reduced.back(problem, change)
+    if not (np.all(np.isfinite(change)) and np.all(np.isfinite(views))):
         return None
-    if np.any(np.abs(pose[:, :3]) > _LARGEST_TURN):
+    if np.any(np.abs(views[:, problem.layout.of_view["view.turn"]]) > _LARGEST_TURN):
         return None
-    new = retract(problem, state, change, pose, visits)
+    new = retract(problem, state, change, views, visits)
     parts = (
-        [camera, pose] if problem.effects is None else [camera, visits[problem.effects.visit], pose]
+        [camera, views]
+        if problem.effects is None
+        else [camera, visits[problem.effects.visit], views]
     )
     whole = np.concatenate(parts, axis=1)
     bent = np.einsum("vpq,vq->vp", normal.matrix, whole)
@@ -184,10 +189,9 @@ def _step(problem: Problem, state: State, normal: NormalEquations, damping: floa
     prior = (problem.prior_mean - state.theta) * precision * change - 0.5 * change**2 * precision
     gain = float(prior.sum())
     if problem.effects is not None:
-        gain += float(
-            np.sum((-state.visits * visits - 0.5 * visits**2) / visit_sigmas(problem) ** 2)
-        )
-    return _Step(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), gain)
+        squares = problem.effects.visit_sigmas**2
+        gain += float(np.sum((-state.visits * visits - 0.5 * visits**2) / squares))
+    return _Change(new, np.sum((normal.right - 0.5 * bent) * whole, axis=1), gain)
 
 
 def refine(
@@ -209,44 +213,45 @@ def refine(
     if (len(state.visits), len(state.drift_px)) != sizes:
         state = empty_effects(problem, state)
     costs = view_costs(problem, state)
-    cost = float(costs.sum()) + prior_cost(problem, state)
     if fixed_theta:
         state, costs, iterations, status = _refine_poses(
             problem, state, costs, max_iterations, tolerance
         )
         cost = float(costs.sum()) + prior_cost(problem, state)
-        return _make_result(problem, state, cost, iterations, status)
-    damping, iterations, status = _FIRST_DAMPING, 0, BundleStatus.ITERATION_LIMIT
-    relative = 0.0
-    while iterations < max_iterations:
-        iterations += 1
-        normal = normal_equations(problem, state)
-        while True:
-            trial_cost, step = np.inf, _step(problem, state, normal, damping)
-            if step is not None:
-                trial, trial_costs = _refine_following_poses(problem, state, costs, step)
-                trial_cost = float(trial_costs.sum()) + prior_cost(problem, trial)
-            if trial_cost <= cost or damping >= _MAX_DAMPING:
-                break
-            damping *= 10.0
-        if step is None or not trial_cost <= cost:
-            status = BundleStatus.NO_DESCENT
-            break
-        decrease, cost, costs, state = cost - trial_cost, trial_cost, trial_costs, trial
-        damping = max(0.1 * damping, _MIN_DAMPING)
-        relative = decrease / max(cost, np.finfo(np.float64).tiny)
-        predicted = float(step.predicted.sum()) + step.predicted_prior
-        if decrease <= tolerance * cost and predicted <= 1e3 * tolerance * (1.0 + cost):
-            status = BundleStatus.SMALL_DECREASE
-            break
-    result = _make_result(problem, state, cost, iterations, status)
-    return replace(result, last_decrease=float(relative))
+        return _make_result(problem, state, cost, iterations, status, 0.0)
+
+    def linearise(point: _Point) -> Callable[[float], Step[_Point] | None]:
+        normal = normal_equations(problem, point.state)
+
+        def solve(damping: float) -> Step[_Point] | None:
+            change = _change(problem, point.state, normal, damping)
+            if change is None:
+                return None
+            trial = _follow_with_poses(problem, point.costs, change)
+            cost = float(trial.costs.sum()) + prior_cost(problem, trial.state)
+            return Step(trial, cost, float(change.predicted.sum()) + change.predicted_prior)
+
+        return solve
+
+    found = descend(
+        _Point(state, costs),
+        float(costs.sum()) + prior_cost(problem, state),
+        linearise,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+    )
+    return _make_result(
+        problem,
+        found.state.state,
+        found.cost,
+        found.iterations,
+        found.status,
+        found.last_decrease,
+    )
 
 
-def _refine_following_poses(
-    problem: Problem, state: State, costs: Array, step: _Step
-) -> tuple[State, Array]:
-    """Return the state after a step, and its costs per view.
+def _follow_with_poses(problem: Problem, costs: Array, step: _Change) -> _Point:
+    """Return the state after a step from one with the given costs.
 
     The tilt of a nearly flat view acts through its square, so the quadratic model holds only for
     very small steps. Where the model failed, the pose is adjusted to the new camera on its own;
@@ -256,33 +261,30 @@ def _refine_following_poses(
     trial_costs = view_costs(problem, trial)
     short = trial_costs > costs - _POOR_GAIN * step.predicted + _NEGLIGIBLE
     if not np.any(short):
-        return trial, trial_costs
+        return _Point(trial, trial_costs)
     part = select_views(problem, short)
     start = states_of(trial, short)
     own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
     trial_costs[short] = own_costs
-    return with_states_of(trial, short, own), trial_costs
+    return _Point(with_states_of(trial, short, own), trial_costs)
 
 
 def _refine_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
-) -> tuple[State, Array, int, BundleStatus]:
+) -> tuple[State, Array, int, DescentStatus]:
     """Adjust the pose of each view on its own by Levenberg-Marquardt, for all views at once.
 
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
-    damping = np.full(len(costs), _FIRST_DAMPING)
-    first, diagonal = (
-        problem.shared_columns + problem.visit_columns,
-        np.arange(problem.pose_columns),
-    )
+    damping = np.full(len(costs), FIRST_DAMPING)
+    own, diagonal = problem.layout.view, np.arange(problem.layout.of_view.size)
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
         normal = normal_equations(problem, state, poses_only=True)
-        pose = normal.matrix[:, first:, first:].copy()
+        pose = normal.matrix[:, own, own].copy()
         pose[:, diagonal, diagonal] = damped_diagonal(pose, damping[:, None])
-        change = solve_scaled(pose, normal.right[:, first:])
+        change = solve_scaled(pose, normal.right[:, own])
         still = np.zeros_like(state.visits)
         trial = retract(problem, state, np.zeros_like(state.theta), change, still)
         trial_costs = view_costs(problem, trial)
@@ -290,16 +292,21 @@ def _refine_poses(
         decrease = np.where(better, costs - trial_costs, 0.0)
         state = pick_views(better, trial, state)
         costs = np.where(better, trial_costs, costs)
-        damping = np.where(better, np.maximum(0.1 * damping, _MIN_DAMPING), 10.0 * damping)
-        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, first:], change)
+        damping = np.where(better, np.maximum(0.1 * damping, MIN_DAMPING), 10.0 * damping)
+        predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, own], change)
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
-            return state, costs, iterations, BundleStatus.SMALL_DECREASE
-    return state, costs, iterations, BundleStatus.ITERATION_LIMIT
+            return state, costs, iterations, DescentStatus.SMALL_DECREASE
+    return state, costs, iterations, DescentStatus.ITERATION_LIMIT
 
 
 def _make_result(
-    problem: Problem, state: State, cost: float, iterations: int, status: BundleStatus
+    problem: Problem,
+    state: State,
+    cost: float,
+    iterations: int,
+    status: DescentStatus,
+    last_decrease: float,
 ) -> BundleResult:
     normal = normal_equations(problem, state)
     for damping in (0.0, _ROUNDING):
@@ -316,8 +323,11 @@ def _make_result(
         return _make_singular_result(problem, state, normal, cost, iterations)
     covariance = 0.5 * (covariance + covariance.T)
     visit_variance, view_covariance = _posterior(problem, reduced, covariance)
-    priors = pose_priors(problem, state)
-    own = priors[:, :, :-1]
+    known = view_residuals(problem, state)
+    variance = {}
+    for name, residual in known.items():
+        rows = stack_rows(problem.layout, {name: residual})[:, :, :-1]
+        variance[name] = np.einsum("vrp,vpq,vrq->vr", rows, view_covariance, rows, optimize=True)
     return BundleResult(
         state=state,
         residuals_px=normal.residuals_px,
@@ -326,11 +336,12 @@ def _make_result(
         information=reduced.information,
         gradient=reduced.gradient,
         covariance=covariance,
-        prior_residuals=priors[:, :, -1],
-        prior_variance=np.einsum("vrp,vpq,vrq->vr", own, view_covariance, own, optimize=True),
+        prior_residuals={name: residual.values for name, residual in known.items()},
+        prior_variance=variance,
         visit_variance=visit_variance,
         iterations=iterations,
         status=status,
+        last_decrease=last_decrease,
     )
 
 
@@ -347,8 +358,8 @@ def _posterior(problem: Problem, reduced: Eliminated, covariance: Array) -> tupl
         by_visit = _with_inner(
             spread[problem.effects.visit_group], reduced.visit_by_rest, reduced.visit_inverse
         )
-        size = problem.shared_columns
-        variance = np.diagonal(by_visit[:, size:, size:], axis1=1, axis2=2)
+        own = problem.layout.visit
+        variance = np.diagonal(by_visit[:, own, own], axis1=1, axis2=2)
         outer = by_visit[problem.effects.visit]
     return variance, _with_inner(outer, reduced.pose_by_rest, reduced.pose_inverse)
 
@@ -365,8 +376,8 @@ def _make_singular_result(
 ) -> BundleResult:
     """Return the result where rounding leaves nothing of the equations: no sigma is known."""
     groups, size = len(problem.designs), len(state.theta)
-    priors = pose_priors(problem, state)
-    own = problem.shared_columns
+    known = view_residuals(problem, state)
+    own = problem.layout.magnification.stop
     return BundleResult(
         state=state,
         residuals_px=normal.residuals_px,
@@ -375,9 +386,9 @@ def _make_singular_result(
         information=np.zeros((groups, own, own)),
         gradient=np.zeros((groups, own)),
         covariance=np.full((size, size), np.inf),
-        prior_residuals=priors[:, :, -1],
-        prior_variance=np.ones(priors.shape[:2]),
-        visit_variance=np.full((len(state.visits), problem.visit_columns), np.inf),
+        prior_residuals={name: residual.values for name, residual in known.items()},
+        prior_variance={name: np.ones(r.values.shape) for name, r in known.items()},
+        visit_variance=np.full(state.visits.shape, np.inf),
         iterations=iterations,
-        status=BundleStatus.SINGULAR,
+        status=DescentStatus.SINGULAR,
     )

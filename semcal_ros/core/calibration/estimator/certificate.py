@@ -19,8 +19,9 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import equilibrate, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import Problem, reduced_normal_equations
+from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.problem import Functions
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.fit_record import Certificate

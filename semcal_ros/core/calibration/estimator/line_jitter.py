@@ -31,14 +31,14 @@ from scipy.linalg import toeplitz
 from scipy.optimize import nnls
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.normal_equations import (
-    Problem,
     normal_equations,
     reduced_normal_equations,
     schur_complement,
-    whitened_rows,
 )
+from semcal_ros.core.calibration.estimator.residuals import corner_rows
 
 __all__ = ["LineJitter", "estimate_jitter", "jitter_covariance"]
 
@@ -143,21 +143,21 @@ def jitter_covariance(problem: Problem, result: BundleResult, jitter: LineJitter
     matrix, _ = reduced_normal_equations(
         problem, state.theta, reduced.information, reduced.gradient
     )
-    whitened = whitened_rows(problem, state)
-    inner = problem.shared_columns + problem.visit_columns
-    columns = whitened.columns[:-1]
+    corners = corner_rows(problem, state)
+    inner = problem.layout.view.start
+    columns = corners.columns[:-1]
     meat = np.zeros((size, size))
     kernel = np.zeros((0, 0))
     for v, part in enumerate(_views(problem)):
-        xx, yx, _ = problem.whitening[part].T * np.sqrt(whitened.huber_weight[part])
-        rows = whitened.rows[:, :-1, part]
-        score = np.zeros((inner + problem.pose_columns, rows.shape[2]))
+        xx, yx, _ = problem.whitening[part].T * np.sqrt(corners.huber_weight[part])
+        rows = corners.rows[:, :-1, part]
+        score = np.zeros((problem.layout.size, rows.shape[2]))
         score[columns] = rows[0] * xx + rows[1] * yx
         # What a shift of each corner along x does to the theta of the optimum.
         outer = score[:inner] - reduced.pose_by_rest[v].T @ score[inner:]
         if problem.effects is not None:
             own = reduced.visit_by_rest[problem.effects.visit[v]]
-            first = problem.shared_columns
+            first = problem.layout.visit.start
             outer = outer[:first] - own.T @ outer[first:]
         pull = problem.designs[problem.group[v]].T @ outer
         line = _lines(problem, part)

@@ -25,13 +25,8 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.blocks import Problem, State, pick_views
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.estimator.normal_equations import (
-    Problem,
-    State,
-    pick_views,
-    pose_priors,
-)
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import (
     Functions,
@@ -39,6 +34,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     weighted_squares,
     with_coefficients,
 )
+from semcal_ros.core.calibration.estimator.residuals import view_residuals
 from semcal_ros.core.calibration.estimator.variance_components import VarianceComponents
 from semcal_ros.core.calibration.initial_values import pose_from_camera
 from semcal_ros.core.calibration.views import GridView
@@ -199,8 +195,9 @@ def _affine_poses(setup: Setup, view: GridView, parameters: Array) -> tuple[Arra
 
 def _view_costs(problem: Problem, result: BundleResult) -> Array:
     square = weighted_squares(problem, result)
-    own = pose_priors(problem, result.state)[:, :, -1]
-    return np.bincount(problem.view_of_point, weights=square) + np.sum(own**2, axis=1)
+    known = view_residuals(problem, result.state).values()
+    own = np.sum([np.sum(residual.values**2, axis=1) for residual in known], axis=0)
+    return np.bincount(problem.view_of_point, weights=square) + own
 
 
 def thin_view(view: GridView) -> GridView:

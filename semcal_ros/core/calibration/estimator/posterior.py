@@ -28,9 +28,10 @@ from semcal_ros.core.calibration.estimator.adjustment import (
     FittedField,
     GridPattern,
 )
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.estimator.line_jitter import LineJitter, jitter_covariance
-from semcal_ros.core.calibration.estimator.normal_equations import Problem, reduced_normal_equations
+from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import (
     Functions,

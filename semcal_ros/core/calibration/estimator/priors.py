@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices
-from semcal_ros.core.calibration.estimator.normal_equations import MISS_NAMES
+from semcal_ros.core.calibration.estimator.blocks import MISS_NAMES
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster

@@ -22,15 +22,10 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.blocks import Effects, Problem, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import (
-    Effects,
-    Problem,
-    State,
-    make_problem,
-    whitened_norm,
-)
 from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.residuals import whitened_norm
 from semcal_ros.core.calibration.estimator.variance_components import VarianceComponents
 from semcal_ros.core.calibration.stage import attitudes
 from semcal_ros.core.calibration.views import GridView
@@ -198,6 +193,6 @@ def weighted_squares(problem: Problem, result: BundleResult) -> Array:
 def variance_factor(problem: Problem, result: BundleResult) -> float:
     """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
     norm2 = weighted_squares(problem, result)
-    unknowns = problem.pose_columns * len(problem.group) + len(result.state.theta)
+    unknowns = problem.layout.of_view.size * len(problem.group) + len(result.state.theta)
     freedom = 2.0 * result.huber_weight.sum() - unknowns - result.state.visits.size
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))

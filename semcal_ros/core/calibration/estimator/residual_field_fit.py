@@ -29,18 +29,17 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import (
-    Problem,
-    State,
-    pose_priors,
-    sum_by,
-    visit_sigmas,
-    whiten,
-    whitened_rows,
-)
+from semcal_ros.core.calibration.estimator.normal_equations import sum_by
 from semcal_ros.core.calibration.estimator.priors import REFERENCE_WIDTH_PX, Setup
 from semcal_ros.core.calibration.estimator.problem import variance_factor
+from semcal_ros.core.calibration.estimator.residuals import (
+    corner_rows,
+    stack_rows,
+    view_residuals,
+    whiten,
+)
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -243,16 +242,16 @@ def field_system(
     variance = variance_factor(problem, result)
     own_variance = np.concatenate([v.own_variance_share for v in setup.views])
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
-    whitened = whitened_rows(scaled, result.state)
+    corners = corner_rows(scaled, result.state)
     size = field.slice_size
-    priors = pose_priors(scaled, result.state)
-    inner = priors.shape[2] - 1
+    priors = stack_rows(problem.layout, view_residuals(scaled, result.state))
+    inner = problem.layout.size
     # The field comes after the unknowns of a view, before the right-hand side.
     width = inner + size + 1
     place = np.r_[0:inner, width - 1]
     augmented = np.zeros((len(setup.views), width, width))
     augmented[:, place[:, None], place] = np.swapaxes(priors, 1, 2) @ priors
-    observed = np.r_[whitened.columns[:-1], inner : inner + size, width - 1]
+    observed = np.r_[corners.columns[:-1], inner : inner + size, width - 1]
     one = field.at(float(setup.magnifications[0]))
     for v, view in enumerate(setup.views):
         part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
@@ -267,8 +266,8 @@ def field_system(
             # The residual is observed plus field minus projected, so the field has the opposite
             # sign of a projection.
             rows[0, 0::2] = rows[1, 1::2] = -setup.norm_px * spline
-        whiten(scaled.whitening[part], rows, whitened.huber_weight[part])
-        own = whitened.rows[:, :, part]
+        whiten(scaled.whitening[part], rows, corners.huber_weight[part])
+        own = corners.rows[:, :, part]
         x, y = np.concatenate([own[:, :-1], rows, own[:, -1:]], axis=1)
         augmented[v][np.ix_(observed, observed)] += x @ x.T + y @ y.T
     few = len(setup.magnifications) < _ENOUGH_MAGNIFICATIONS
@@ -317,25 +316,24 @@ def _without_poses_and_visits(
     The order is camera and shared unknowns, visit, pose, field, right-hand side. Returns matrices
     and right-hand sides of each visit, or of each view where there are no visits.
     """
-    first, visits, poses = problem.shared_columns, problem.visit_columns, problem.pose_columns
-    left = _eliminate(augmented, first + visits, poses)
+    layout = problem.layout
+    left = _eliminate(augmented, layout.view)
     if problem.effects is not None:
         left = sum_by(problem.effects.visit, len(problem.effects.visit_group), left)
-        sigma = visit_sigmas(problem)
-        own = np.arange(first, first + visits)
+        sigma = problem.effects.visit_sigmas
+        own = np.arange(layout.visit.start, layout.visit.stop)
         left[:, own, own] += sigma**-2.0
         left[:, own, -1] -= state.visits / sigma**2
-        left = _eliminate(left, first, visits)
+        left = _eliminate(left, layout.visit)
     return left[:, :-1, :-1], left[:, :-1, -1]
 
 
-def _eliminate(augmented: Array, first: int, count: int) -> Array:
-    """Eliminate ``count`` unknowns from index ``first`` on by the Schur complement."""
-    keep = np.r_[0:first, first + count : augmented.shape[1]]
-    own = augmented[:, first : first + count, first : first + count]
-    cross = augmented[:, first : first + count][:, :, keep]
+def _eliminate(augmented: Array, own: slice) -> Array:
+    """Eliminate the unknowns in some columns by the Schur complement."""
+    keep = np.r_[0 : own.start, own.stop : augmented.shape[1]]
+    cross = augmented[:, own][:, :, keep]
     left = augmented[:, keep[:, None], keep]
-    return left - np.swapaxes(cross, 1, 2) @ invert_scaled(own) @ cross
+    return left - np.swapaxes(cross, 1, 2) @ invert_scaled(augmented[:, own, own]) @ cross
 
 
 def _second_differences(count: int) -> Array:

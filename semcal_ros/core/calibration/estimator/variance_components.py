@@ -30,8 +30,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import Problem
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 
 __all__ = [
@@ -176,8 +176,8 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
         if np.any(own):
             # A view whose tilt passed the limit still has the spread of the others.
             sigma = height[own]
-            residuals = result.prior_residuals[own, 0] * sigma / sigma[0]
-            variance = result.prior_variance[own, 0]
+            residuals = result.prior_residuals["height"][own, 0] * sigma / sigma[0]
+            variance = result.prior_variance["height"][own, 0]
             height[own] = _update(float(sigma[0]), priors.height_sigma_m, residuals, variance).sigma
     effects = problem.effects
     if effects is None:
@@ -206,11 +206,11 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
 def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) -> Array | None:
     if sigma is None:
         return None
-    own = zip(sigma, _usual_lattice(priors), (3, 4), strict=True)
+    residuals, variance = result.prior_residuals["lattice"], result.prior_variance["lattice"]
     return np.array(
         [
-            _update(s, usual, result.prior_residuals[:, k], result.prior_variance[:, k]).sigma
-            for s, usual, k in own
+            _update(s, usual, residuals[:, k], variance[:, k]).sigma
+            for k, (s, usual) in enumerate(zip(sigma, _usual_lattice(priors), strict=True))
         ]
     )
 
@@ -225,8 +225,8 @@ def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     sigma = problem.effects.drift_sigma_px
     scale = np.min(problem.unit_m) / problem.unit_m
     design = np.stack([np.ones_like(scale), scale**2], axis=1)
-    determined = np.sum(np.maximum(1.0 - result.prior_variance[:, 1:3], 0.0), axis=1)
-    square = sigma**2 * np.sum(result.prior_residuals[:, 1:3] ** 2, axis=1)
+    determined = np.sum(np.maximum(1.0 - result.prior_variance["drift"], 0.0), axis=1)
+    square = sigma**2 * np.sum(result.prior_residuals["drift"] ** 2, axis=1)
     # The weights are those of chi-squares of the spread before, with as many degrees of freedom as
     # are determined; the last row is the usual one.
     root, known = np.sqrt(np.maximum(determined, 1e-6)), np.sqrt(_WEIGHT_OF_USUAL)

@@ -29,15 +29,12 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.estimator.normal_equations import (
-    Problem,
-    reduced_normal_equations,
-    visit_sigmas,
-    whitened_norm,
-)
+from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import variance_factor
+from semcal_ros.core.calibration.estimator.residuals import whitened_norm
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 
@@ -91,7 +88,7 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         result = refine(problem, result.state, tolerance=1e-4)
     scatter, determined = 0.0, 0.0
     if problem.effects is not None:
-        squares = visit_sigmas(problem) ** 2
+        squares = problem.effects.visit_sigmas**2
         scatter = float(np.sum(result.state.visits**2 / squares))
         determined = float(np.sum(np.maximum(1.0 - result.visit_variance / squares, 0.0)))
     matrix, right = reduced_normal_equations(
@@ -140,8 +137,8 @@ def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, flo
     """
     if problem.attitudes is None:
         return {}
-    left = result.prior_residuals[:, -3:]
-    free = np.maximum(1.0 - result.prior_variance[:, -3:], _LEAST_DETERMINED)
+    left = result.prior_residuals["attitude"]
+    free = np.maximum(1.0 - result.prior_variance["attitude"], _LEAST_DETERMINED)
     deviation = np.max(np.abs(left) / np.sqrt(free), axis=1)
     limit = max(_TILT_SIGMAS, 0.5 * float(deviation.max()))
     return {int(v): float(deviation[v]) for v in np.flatnonzero(deviation > limit)}

@@ -29,8 +29,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
+from semcal_ros.core.calibration.estimator.blocks import Effects, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.normal_equations import Effects, State, make_problem
 from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, REFERENCE_WIDTH_PX, Priors
 from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
 from semcal_ros.core.calibration.judgement.update import ageing_sigmas, change_directions

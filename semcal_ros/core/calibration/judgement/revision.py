@@ -27,9 +27,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.estimator.line_jitter import estimate_jitter, jitter_covariance
-from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
 from semcal_ros.core.calibration.estimator.poses import adjust
 from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Priors, Setup
 from semcal_ros.core.calibration.estimator.problem import (
@@ -272,7 +272,7 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         problem = _build(model, setup, spread, sigmas)
         result = refine(problem, result.state)
     misfit = float(np.sqrt(variance_factor(problem, result)))
-    freedom = problem.pose_columns * len(setup.views) + len(theta)
+    freedom = problem.layout.of_view.size * len(setup.views) + len(theta)
     excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
     if excess > 0.0:
         setup = replace(setup, views=tuple(add_excess_noise(setup.views, excess)))

@@ -28,8 +28,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.normal_equations import Problem, State
 from semcal_ros.core.calibration.estimator.poses import adjust, resolve_mirrored_tilts
 from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Setup
 from semcal_ros.core.calibration.estimator.problem import (

@@ -1,0 +1,387 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What an adjustment makes small: residuals of unit variance, and their derivatives by named blocks of unknowns.
+
+There are two kinds. Each corner has one of two coordinates, observed minus projected
+(:func:`corner_rows`); it is the only kind with a robust loss. And what is known of a view beside its
+corners is a :class:`Residual`: its height, its drift, the shape of its lattice, and the orientation
+that a stage says or that is untilted. Those of visits and of theta are independent priors of their
+unknowns, and need no derivatives.
+
+To add a residual of a view, write a function like :func:`height_residual` and name it in
+:data:`VIEW_RESIDUALS`: solver, covariance and tests go through that table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.calibration.estimator.blocks import (
+    GRID_NAMES,
+    MISS_NAMES,
+    Layout,
+    Problem,
+    State,
+)
+from semcal_ros.core.calibration.stage import OFFSET_NAMES, attitude_residuals, height_of_tilt
+from semcal_ros.core.camera.projection import (
+    ProjectionJacobians,
+    project_points,
+    project_points_with_jacobians,
+)
+
+__all__ = [
+    "VIEW_RESIDUALS",
+    "CornerRows",
+    "Residual",
+    "corner_residuals",
+    "corner_rows",
+    "prior_cost",
+    "stack_rows",
+    "view_costs",
+    "view_residuals",
+    "whiten",
+    "whitened_norm",
+]
+
+# Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
+_HUBER = 3.0
+# Loss of a corner that the camera does not show at all: that of one that is far outside the image. An adjustment may
+# start in such a state, and leaves it as soon as it can; one that ends in it is refused.
+_LOST = 1e6
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Residuals of one kind, r for each view, of unit variance.
+
+    Attributes
+    ----------
+    values
+        (V, r) observed or presumed minus predicted.
+    by
+        (V, r, size) derivatives of the prediction by blocks of unknowns; of a block that a problem does not have,
+        they are left out.
+    """
+
+    values: Array
+    by: Mapping[str, Array]
+
+
+def height_residual(problem: Problem, state: State) -> Residual:
+    """The specimen's plane crosses the beam at the height of the visit, as far as the stage does not move it."""
+    scan = np.zeros(len(problem.group))
+    if problem.attitudes is not None:
+        scan = problem.attitudes.scan_rotation_rad
+    miss = problem.shared_values(state.theta, MISS_NAMES)
+    height, by_pose, by_miss = height_of_tilt(scan, state.rotations, state.translations_m, miss)
+    if problem.effects is not None:
+        height = height - state.visits[problem.effects.visit, 1]
+    precision = 1.0 / problem.height_sigma_m[:, None, None]
+    by = {
+        "view.turn": by_pose[:, None, :3],
+        "view.shift": by_pose[:, None, 3:] * problem.unit_m[:, None, None],
+        "visit.height": -np.ones((len(height), 1, 1)),
+        "stage.axis": by_miss[:, None, :],
+    }
+    whitened = {name: precision * derivative for name, derivative in by.items()}
+    return Residual(-height[:, None] * precision[:, 0], whitened)
+
+
+def drift_residual(problem: Problem, state: State) -> Residual | None:
+    """A view drifts by as much as usual."""
+    if problem.effects is None:
+        return None
+    precision = 1.0 / problem.effects.drift_sigma_px[:, None]
+    return Residual(-state.drift_px * precision, {"view.drift": precision[:, None] * np.eye(2)})
+
+
+def lattice_residual(problem: Problem, state: State) -> Residual | None:
+    """The lattice of a view is stretched and sheared as little as usual."""
+    if problem.effects is None or problem.effects.lattice_sigma is None:
+        return None
+    precision = 1.0 / problem.effects.lattice_sigma
+    count = len(problem.group)
+    by = {"view.lattice": np.broadcast_to(np.diag(precision), (count, 2, 2))}
+    return Residual(-state.lattices * precision, by)
+
+
+def attitude_residual(problem: Problem, state: State) -> Residual | None:
+    """A view is tilted and turned as the stage says, or not tilted at all."""
+    if problem.attitudes is None:
+        return None
+    offsets = problem.shared_values(state.theta, OFFSET_NAMES)
+    own, by_turn, by_offset = attitude_residuals(problem.attitudes, offsets, state.rotations)
+    return Residual(own, {"view.turn": by_turn, "stage.offset": by_offset})
+
+
+VIEW_RESIDUALS: Mapping[str, Callable[[Problem, State], Residual | None]] = {
+    "height": height_residual,
+    "drift": drift_residual,
+    "lattice": lattice_residual,
+    "attitude": attitude_residual,
+}
+"""What is known of a view beside its corners; a function returns None where a problem does not have it."""
+
+
+def view_residuals(problem: Problem, state: State) -> dict[str, Residual]:
+    """Return those of :data:`VIEW_RESIDUALS` that a problem has, by name."""
+    found = {name: residual(problem, state) for name, residual in VIEW_RESIDUALS.items()}
+    return {name: own for name, own in found.items() if own is not None}
+
+
+def stack_rows(layout: Layout, residuals: Mapping[str, Residual]) -> Array:
+    """Return residuals as rows (V, r, P + 1) over the columns of a layout, the values last."""
+    count = sum(own.values.shape[1] for own in residuals.values())
+    views = len(next(iter(residuals.values())).values)
+    rows = np.zeros((views, count, layout.size + 1))
+    first = 0
+    for own in residuals.values():
+        part = rows[:, first : first + own.values.shape[1]]
+        part[:, :, -1] = own.values
+        for name, derivative in own.by.items():
+            if name in layout:
+                part[:, :, layout[name]] = derivative
+        first += own.values.shape[1]
+    return rows
+
+
+def _shaped_grid(problem: Problem, state: State) -> Array:
+    """Return the (N, 3) grid points with the shape of the grid."""
+    if not problem.shared:
+        return problem.board_m
+    x, y, _ = problem.board_m.T
+    stretch, shear, curvature = problem.shared_values(state.theta, GRID_NAMES)
+    if len(state.lattices):
+        own = state.lattices[problem.view_of_point]
+        stretch, shear = stretch + own[:, 0], shear + own[:, 1]
+    size = np.zeros(len(x))
+    for name, shown in _square_classes(problem).items():
+        size += shown * problem.shared_values(state.theta, [name])
+    grid = np.stack(
+        [
+            x * (1.0 + 0.5 * stretch) + shear * y,
+            y * (1.0 - 0.5 * stretch),
+            0.5 * curvature * (x * x + y * y),
+        ],
+        axis=1,
+    )
+    return grid * (1.0 + size[:, None])
+
+
+def _square_classes(problem: Problem) -> dict[str, Array]:
+    """Return the unknowns of sizes of squares, and for each the (N,) points on squares of that size."""
+    out = {}
+    for name in problem.shared:
+        if name.startswith("square_"):
+            assert problem.square_class is not None
+            own = problem.square_class == int(name.removeprefix("square_"))
+            out[name] = own[problem.view_of_point]
+    return out
+
+
+def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
+    """Return the rotated grid points, the points in the sem frame, and their cameras."""
+    view = problem.view_of_point
+    grid = _shaped_grid(problem, state)
+    rotated = np.empty_like(grid)
+    for rotation, first, last in zip(
+        state.rotations, problem.starts[:-1], problem.starts[1:], strict=True
+    ):
+        np.matmul(grid[first:last], rotation.T, out=rotated[first:last])
+    cameras = problem.cameras(state.theta)[problem.group]
+    if problem.effects is not None:
+        cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
+    return rotated, rotated + state.translations_m[view], cameras[view]
+
+
+def _drift_shift(problem: Problem, state: State) -> Array | float:
+    """Return the (N, 2) shift of every point by the drift within its image."""
+    if problem.effects is None:
+        return 0.0
+    return problem.effects.frame_time[:, None] * state.drift_px[problem.view_of_point]
+
+
+def corner_residuals(problem: Problem, state: State) -> Array:
+    """Return (N, 2) observed minus projected pixels; NaN where a point has no projection."""
+    _, points, cameras = _points_and_cameras(problem, state)
+    projected = project_points(cameras, points, problem.raster)
+    return problem.observed_px - projected - _drift_shift(problem, state)
+
+
+def whitened_norm(problem: Problem, residuals_px: Array) -> Array:
+    """Return the (N,) lengths of residuals (N, 2) in standard deviations."""
+    xx, yx, yy = problem.whitening.T
+    x, y = residuals_px.T
+    return np.hypot(xx * x, yx * x + yy * y)
+
+
+def _huber(norm: Array) -> tuple[Array, Array]:
+    """Return Huber's loss (half the squared norm inside) and weight of whitened residual norms.
+
+    A point without a projection has a large loss and no weight.
+    """
+    seen = np.isfinite(norm)
+    norm = np.where(seen, norm, 0.0)
+    outside = norm > _HUBER
+    loss = np.where(outside, _HUBER * (norm - 0.5 * _HUBER), 0.5 * norm * norm)
+    weight = np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
+    return np.where(seen, loss, _LOST), np.where(seen, weight, 0.0)
+
+
+def view_costs(problem: Problem, state: State) -> Array:
+    """Return (V,) half robust sums of squares of corners, and of what is known of the views besides."""
+    loss, _ = _huber(whitened_norm(problem, corner_residuals(problem, state)))
+    own = [np.sum(r.values**2, axis=1) for r in view_residuals(problem, state).values()]
+    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * np.sum(own, axis=0)
+
+
+def prior_cost(problem: Problem, state: State) -> float:
+    """Return half the sum of squares of theta and of the visits about their priors."""
+    prior = (state.theta - problem.prior_mean) / problem.prior_sigma
+    cost = float(prior @ prior)
+    if problem.effects is not None:
+        cost += float(np.sum((state.visits / problem.effects.visit_sigmas) ** 2))
+    return 0.5 * cost
+
+
+@dataclass(frozen=True)
+class CornerRows:
+    """Linearised observations of corners, of unit variance and with their Huber weights.
+
+    Attributes
+    ----------
+    layout
+        The blocks on which the corners depend directly.
+    columns
+        (A + 1,) where their unknowns stand among those of a view; the right-hand side is the last.
+    rows
+        (2, A + 1, N): derivatives by these unknowns, and the residual.
+    residuals_px
+        (N, 2) without weights.
+    huber_weight
+        (N,).
+    """
+
+    layout: Layout
+    columns: Indices
+    rows: Array
+    residuals_px: Array
+    huber_weight: Array
+
+
+class _CornerDerivatives:
+    """Derivatives (2, size, N) of the projections of all corners by each block of unknowns."""
+
+    def __init__(self, problem: Problem, state: State):
+        self.problem, self.state = problem, state
+        self.rotated, points, cameras = _points_and_cameras(problem, state)
+        self.jacobians: ProjectionJacobians = project_points_with_jacobians(
+            cameras, points, problem.raster
+        )
+        self.by_point = np.moveaxis(self.jacobians.d_xyz, 0, -1)  # (2, 3, N) in the sem frame
+
+    @cached_property
+    def by_grid_point(self) -> Array:
+        """(2, 3, N) by the points of the grid, in its axes."""
+        rotations = self.state.rotations[self.problem.view_of_point]
+        return np.einsum("kin,nij->kjn", self.by_point, rotations)
+
+    def by_camera(self) -> Array:
+        """By the parameters of the camera."""
+        return np.moveaxis(self.jacobians.d_parameters, 0, -1)[:, self.problem.parameter_index]
+
+    def by_grid_shape(self) -> Array:
+        """By stretch, shear and curvature of the grid."""
+        x, y, _ = self.problem.board_m.T
+        bent = 0.5 * (x * x + y * y) * self.by_grid_point[:, 2]
+        return np.concatenate([self.by_lattice(), bent[:, None]], axis=1)
+
+    def by_squares(self) -> Array:
+        """By the relative sizes of the squares."""
+        grid = _shaped_grid(self.problem, self.state)
+        along = np.einsum("kjn,nj->kn", self.by_grid_point, grid)
+        return np.stack([along * shown for shown in _square_classes(self.problem).values()], axis=1)
+
+    def by_visit_scale(self) -> Array:
+        """By the relative scale of the visit: that of the camera, in other units."""
+        m = self.jacobians.d_parameters[:, :, 0].T
+        return np.asarray((m / self.problem.unit_m[self.problem.view_of_point])[:, None])
+
+    def by_turn(self) -> Array:
+        """By a rotation vector in the sem frame."""
+        x, y, z = self.rotated.T
+        dx, dy, dz = np.moveaxis(self.by_point, 1, 0)
+        return np.stack([y * dz - z * dy, z * dx - x * dz, x * dy - y * dx], axis=1)
+
+    def by_shift(self) -> Array:
+        """By the translation, in pixels of the view."""
+        return np.asarray(self.by_point * self.problem.unit_m[self.problem.view_of_point])
+
+    def by_drift(self) -> Array:
+        """By the drift within the frame."""
+        assert self.problem.effects is not None
+        return np.asarray(np.eye(2)[:, :, None] * self.problem.effects.frame_time)
+
+    def by_lattice(self) -> Array:
+        """By stretch and shear of the lattice of the view."""
+        x, y, _ = self.problem.board_m.T
+        dx, dy, _ = np.moveaxis(self.by_grid_point, 1, 0)
+        return np.stack([0.5 * (x * dx - y * dy), y * dx], axis=1)
+
+
+_CORNER_DERIVATIVES: Mapping[str, Callable[[_CornerDerivatives], Array]] = {
+    "camera": _CornerDerivatives.by_camera,
+    "grid.shape": _CornerDerivatives.by_grid_shape,
+    "grid.squares": _CornerDerivatives.by_squares,
+    "visit.scale": _CornerDerivatives.by_visit_scale,
+    "view.turn": _CornerDerivatives.by_turn,
+    "view.shift": _CornerDerivatives.by_shift,
+    "view.drift": _CornerDerivatives.by_drift,
+    "view.lattice": _CornerDerivatives.by_lattice,
+}
+
+
+def corner_rows(problem: Problem, state: State, *, poses_only: bool = False) -> CornerRows:
+    """Compute the whitened residuals and derivatives of all corners.
+
+    With ``poses_only`` the derivatives are those by the unknowns of each view.
+    """
+    derivatives = _CornerDerivatives(problem, state)
+    left = problem.observed_px - derivatives.jacobians.xy - _drift_shift(problem, state)
+    huber = _huber(whitened_norm(problem, left))[1]
+    layout = problem.layout.of_view if poses_only else problem.layout.only(_CORNER_DERIVATIVES)
+    rows = np.empty((2, layout.size + 1, len(left)))
+    for block in layout.blocks:
+        rows[:, layout[block.name]] = _CORNER_DERIVATIVES[block.name](derivatives)
+    rows[:, -1] = left.T
+    rows[:, :, huber == 0.0] = 0.0
+    whiten(problem.whitening, rows, huber)
+    columns = np.append(problem.layout.columns(layout), problem.layout.size)
+    return CornerRows(layout, columns, rows, left, huber)
+
+
+def whiten(whitening: Array, rows: Array, huber: Array) -> None:
+    """Scale rows (2, k, N) to unit variance, in place."""
+    xx, yx, yy = whitening.T * np.sqrt(huber)
+    rows[1] *= yy
+    if np.any(yx):
+        rows[1] += yx * rows[0]
+    rows[0] *= xx

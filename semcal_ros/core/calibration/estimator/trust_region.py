@@ -1,0 +1,118 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Descent to a minimum of a sum of squares: Levenberg-Marquardt, with any kind of state.
+
+Every step that is taken lowers the cost; one that does not is tried again with a larger damping,
+which makes it shorter.
+
+Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
+import numpy as np
+
+__all__ = ["FIRST_DAMPING", "MIN_DAMPING", "Descent", "DescentStatus", "Step", "descend"]
+
+S = TypeVar("S")
+
+FIRST_DAMPING, MIN_DAMPING = 1e-5, 1e-12
+"""Damping relative to the diagonal: nearly Gauss-Newton at the start, and none at the least."""
+# Damping of steps that have no length.
+_MAX_DAMPING = 1e10
+# Ratio of the tolerance for the decrease that the quadratic model still predicts: where it fails, this says little.
+_PREDICTED = 1e3
+
+
+class DescentStatus(Enum):
+    """How a descent ended; the values are the sentences of the calibration file."""
+
+    SMALL_DECREASE = "converged: relative decrease below the tolerance"
+    NO_DESCENT = "converged: no step lowers the cost"
+    ITERATION_LIMIT = "stopped at the iteration limit"
+    SINGULAR = "the views and the priors do not determine the unknowns"
+
+
+@dataclass(frozen=True)
+class Step(Generic[S]):
+    """A state that may be taken: its cost, and by how much the quadratic model predicted that it would fall."""
+
+    state: S
+    cost: float
+    predicted: float
+
+
+@dataclass(frozen=True)
+class Descent(Generic[S]):
+    """Where a descent ended.
+
+    Attributes
+    ----------
+    state, cost
+        The last state, and its cost.
+    iterations, status
+        Number of steps, and why there were no more.
+    last_decrease
+        Relative decrease of the cost in the last step.
+    """
+
+    state: S
+    cost: float
+    iterations: int
+    status: DescentStatus
+    last_decrease: float
+
+
+def descend(
+    state: S,
+    cost: float,
+    linearise: Callable[[S], Callable[[float], Step[S] | None]],
+    *,
+    max_iterations: int,
+    tolerance: float,
+) -> Descent[S]:
+    """Lower the cost step by step.
+
+    Parameters
+    ----------
+    state, cost
+        The start.
+    linearise
+        From a state to a function from the damping to the step, or to None where rounding leaves no equations that
+        can be solved.
+    max_iterations, tolerance
+        The descent ends at this number of steps, or when the cost falls by less than this part of it.
+    """
+    damping, relative = FIRST_DAMPING, 0.0
+    for iteration in range(1, max_iterations + 1):
+        solve = linearise(state)
+        step = solve(damping)
+        while (step is None or not step.cost <= cost) and damping < _MAX_DAMPING:
+            damping *= 10.0
+            step = solve(damping)
+        if step is None or not step.cost <= cost:
+            return Descent(state, cost, iteration, DescentStatus.NO_DESCENT, relative)
+        decrease, cost, state = cost - step.cost, step.cost, step.state
+        damping = max(0.1 * damping, MIN_DAMPING)
+        relative = decrease / max(cost, np.finfo(np.float64).tiny)
+        small = decrease <= tolerance * cost
+        if small and step.predicted <= _PREDICTED * tolerance * (1.0 + cost):
+            return Descent(state, cost, iteration, DescentStatus.SMALL_DECREASE, relative)
+    return Descent(state, cost, max_iterations, DescentStatus.ITERATION_LIMIT, relative)
