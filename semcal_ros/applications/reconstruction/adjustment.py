@@ -23,14 +23,17 @@ the points have a very weak prior around their middle, which keeps them from mov
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from semcal_ros.applications.reconstruction.types import Observations, tabulate_cameras
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled, solve_scaled
+from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, Step, descend
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
+from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 __all__ = ["Adjustment", "adjust"]
@@ -39,10 +42,6 @@ __all__ = ["Adjustment", "adjust"]
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
 _LEAST_SCALE = 1e-6  # least scale of the residuals, for observations without errors
 _POINT_SPREAD = 3.0  # prior 1-sigma of the points' heights, in units of their spread
-# Relative to the diagonal: the usual start of the Levenberg-Marquardt method.
-_FIRST_DAMPING = 1e-3
-# Beyond this damping a step is lost in rounding: no lower cost can be found.
-_LAST_DAMPING = 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +142,7 @@ class _Problem:
         seen = self.observed
         turned = np.einsum("nij,nj->ni", state.rotations[seen.view], state.points[seen.point])
         moved = turned + state.translations[seen.view]
-        m, a, skew, px, py, rho = self.table.T
-        scale = m / (1.0 + rho * moved[:, 2])
-        x = px + scale * (a * moved[:, 0] + skew * moved[:, 1])
-        y = py + scale * moved[:, 1] / a
-        return seen.xy - np.stack([x, y], axis=1), turned, moved
+        return seen.xy - project_ideal_points(self.table, moved), turned, moved
 
     def whiten(self, error: Array) -> Array:
         white = np.einsum("nij,nj->ni", self.observed.root, error)
@@ -214,7 +209,7 @@ def adjust(
     max_iterations: int = 40,
     tolerance: float = 1e-7,
 ) -> Adjustment:
-    """Adjust points and poses to observations (Levenberg-Marquardt with the Schur complement).
+    """Adjust points and poses to observations.
 
     Parameters
     ----------
@@ -245,8 +240,15 @@ def adjust(
     iterations, converged, sigma = 0, False, _estimate_scale(problem, state)
     for _ in range(3):
         # The robust loss depends on the scale of the residuals: estimate both in turn.
-        state, taken, converged = _descend(problem, state, sigma, free, max_iterations, tolerance)
-        iterations += taken
+        found = descend(
+            state,
+            problem.cost(state, sigma),
+            partial(_linearise, problem, sigma, free),
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+        )
+        state, converged = found.state, found.status is not DescentStatus.ITERATION_LIMIT
+        iterations += found.iterations
         better = _estimate_scale(problem, state)
         scale_converged = abs(better - sigma) < 0.02 * sigma
         sigma = better
@@ -255,43 +257,33 @@ def adjust(
     return _finish(problem, state, sigma, free, unit_m, iterations, converged)
 
 
-def _descend(
-    problem: _Problem, state: _State, sigma: float, free: Indices, limit: int, tolerance: float
-) -> tuple[_State, int, bool]:
-    damping, cost = _FIRST_DAMPING, problem.cost(state, sigma)
-    for iteration in range(limit):
-        blocks = problem.normal(state, sigma)
-        while True:
-            trial = _step(state, blocks, damping, free)
-            new = problem.cost(trial, sigma)
-            if new <= cost:
-                break
-            damping *= 8.0
-            if damping > _LAST_DAMPING:
-                return state, iteration + 1, True
-        gain, state, cost = cost - new, trial, new
-        damping = max(damping * 0.2, 1e-12)
-        if gain <= tolerance * cost:
-            return state, iteration + 1, True
-    return state, limit, False
+def _linearise(
+    problem: _Problem, sigma: float, free: Indices, state: _State
+) -> Callable[[float], Step[_State] | None]:
+    """Return the function from the damping to the step from a state."""
+    pose, point, coupling, right_pose, right_point = problem.normal(state, sigma)
 
+    def solve(damping: float) -> Step[_State] | None:
+        inverse = _invert(_damp(point, damping))
+        reduced, moved = _form_schur_complement(_damp(pose, damping), inverse, coupling, free)
+        right = right_pose.ravel()[free] - moved @ right_point.ravel()
+        step = np.zeros(6 * len(pose))
+        try:
+            step[free] = solve_scaled(reduced, right)
+        except np.linalg.LinAlgError:
+            return None
+        left = right_point - (coupling.T @ step).reshape(-1, 3)
+        by_view, by_point = step.reshape(-1, 6), np.einsum("pij,pj->pi", inverse, left)
+        trial = _State(
+            rotations_from_vectors(by_view[:, :3]) @ state.rotations,
+            state.translations + by_view[:, 3:],
+            state.points + by_point,
+        )
+        # A Gauss-Newton step lowers the quadratic model by half of its product with the gradient.
+        predicted = 0.5 * float(np.sum(by_view * right_pose) + np.sum(by_point * right_point))
+        return Step(trial, problem.cost(trial, sigma), predicted)
 
-def _step(
-    state: _State, blocks: tuple[Array, Array, Array, Array, Array], damping: float, free: Indices
-) -> _State:
-    pose, point, coupling, right_pose, right_point = blocks
-    inverse = _invert(_damp(point, damping))
-    reduced, moved = _form_schur_complement(_damp(pose, damping), inverse, coupling, free)
-    right = right_pose.ravel()[free] - moved @ right_point.ravel()
-    step = np.zeros(6 * len(pose))
-    step[free] = solve_scaled(reduced, right)
-    left = right_point - (coupling.T @ step).reshape(-1, 3)
-    by_view = step.reshape(-1, 6)
-    return _State(
-        rotations_from_vectors(by_view[:, :3]) @ state.rotations,
-        state.translations + by_view[:, 3:],
-        state.points + np.einsum("pij,pj->pi", inverse, left),
-    )
+    return solve
 
 
 def _damp(blocks: Array, damping: float) -> Array:
