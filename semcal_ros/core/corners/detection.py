@@ -12,23 +12,33 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The corner finder: saddle candidates, lattice growing, sub-pixel fit, rejection."""
+"""The grid finder: lattices at all scales, the pattern of their cells, sub-pixel fit, rejection.
+
+Smoothed to its spacing, every grid on a square lattice is the chess board that its strongest
+harmonics make: a chess board itself, or dots, crosses and crossed lines, whose saddle points lie
+between them. So one search grows lattices of saddle points at all scales; the unit cell of each, made
+of its bright squares, says which pattern it is; and what is most likely is fitted at sub-pixel
+accuracy.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, Image, Indices
 from semcal_ros.core.corners.dots_and_lines import (
     bright_cells,
-    find_cell_lattices,
+    count_regular_area,
     fit_lattice_shapes,
+    grow_at_scale,
     refine_cells,
 )
-from semcal_ros.core.corners.lattice import Lattice, grow_best_lattice
+from semcal_ros.core.corners.lattice import Lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
 from semcal_ros.core.corners.pattern import (
@@ -39,48 +49,53 @@ from semcal_ros.core.corners.pattern import (
     PatternChoice,
     check_pattern,
 )
-from semcal_ros.core.corners.saddle import LatticeStatus, find_saddles, prepare_image, screen_image
+from semcal_ros.core.corners.saddle import LatticeStatus, prepare_image, screen_image
 from semcal_ros.core.errors import Rejection
 
 __all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice"]
 
 
-# Scales of the search for saddle points, px. A quarter of the spacing is best, so that these suit
-# spacings of about 10, 6, 17 and 28 px, in steps of a factor of 1.7. The first suits the small
-# squares of low magnifications; a convincing lattice ends the search.
-SCALES_PX = (2.5, 1.5, 4.2, 7.0)
+# Scales of the search for saddle points, px, in steps of 1.7. A quarter of the distance between saddle points is
+# best. The first suits the small squares of low magnifications; the largest one is bounded by the picture.
+_SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0, 168.0, 286.0, 486.0)
+_LARGEST_SCALE_PART = 0.075
 # A view with fewer corners is refused. The cubic in the search for the distortion centre has 10
 # terms per coordinate.
 MINIMUM_CORNERS = 12
 # A lattice that covers this part of the image will not be surpassed at another scale.
-FILLED = 0.6
-# Debris and missing squares may spoil the other corners without another scale being better.
-CONVINCING = 0.6
-
+_FILLED = 0.6
+# Part of the expected points that pass beyond which no coarser picture shows more of them.
+_CONVINCING = 0.8
 # If a larger part of the corners does not continue the lattice, that part is a second board rather
 # than cut off by debris.
-FOREIGN_MAX = 0.15
-
-
-# Part of the power of a unit cell that no shape explains, above which it is no grid. Photographs
-# leave 0.006, and bright rims an eighth of the pitch wide up to 0.2.
-MISFIT_MAX = 0.2
+_FOREIGN_MAX = 0.15
+# Part of the power of a unit cell that no shape explains, above which it is no grid: cells of a lattice through noise
+# have 0.6 and more. Photographs leave 0.006, bright rims an eighth of the pitch wide up to 0.2, and a textured cross
+# grating 0.23.
+_MISFIT_MAX = 0.4
 # Of a chess board nothing but growth and blur changes the cell; photographs leave up to 0.004.
-CHESS_MISFIT_MAX = 0.08
+_CHESS_MISFIT_MAX = 0.08
 # A hexagonal lattice of dots has 0.05 or more, and a square one with a blur of a sixth of the pitch, seen
 # at 45 degrees, has 0.001.
-ASYMMETRY_MAX = 0.02
+_ASYMMETRY_MAX = 0.02
 # Below this a grown lattice, whose points are good to a few tenths of a pixel, shows its pattern; with
 # blurred or wrongly grown cells the fitted corners decide.
-CLEAR_MISFIT = 0.02
+_CLEAR_MISFIT = 0.02
+# A lattice that covers less of the image than this must show its pattern clearly: texture repeats itself by chance.
+_SMALL = 0.15
 # Square dots a half of their distance wide also make a lattice of dots and gaps, whose cells differ: what
 # is common to them has two thirds of the power or less. Lattices of different scales through the same
 # dots differ by a tenth.
-POWER_MIN = 0.8
-# Lattices of different scales that are looked at for dots and lines.
-LATTICES_TRIED = 4
+_POWER_MIN = 0.8
+# Lattices of different scales that are looked at closely.
+_LATTICES_TRIED = 4
+# Largest distance between dots that is fitted at full resolution, px: the time grows with its square, and edges that
+# are sharper than a pixel of the reduced picture lose a tenth of their certainty at most.
+_CELL_FULL_PX = 80.0
+# Least distance of points in a reduced picture, px.
+_SPACING_MIN_PX = 10.0
 
-_POINTS = {"chess": "corners", "dots": "dots", "lines": "crossings"}
+_POINTS = {"chess": "corners", "dots": "dots", "crosses": "crosses", "lines": "crossings"}
 
 
 def _no_covariance() -> Array:
@@ -116,7 +131,9 @@ class LatticeDetection:
     rejected_xy
         (k, 2) expected positions of lattice points in the image that were rejected, px.
     pattern
-        What the points are: corners of a chess board, centres of dots, or crossings of lines.
+        What the points are: corners of a chess board, centres of dots or crosses, or crossings of lines.
+    odds
+        How many times as likely this pattern is as the next one; at most a million.
     """
 
     ij: Indices
@@ -128,6 +145,7 @@ class LatticeDetection:
     blur_px: float = float("nan")
     rejected_xy: Array = field(default_factory=_no_positions)
     pattern: Pattern = "chess"
+    odds: float = float("nan")
 
     @property
     def rejected(self) -> int:
@@ -140,11 +158,11 @@ def find_lattice(
 ) -> LatticeDetection | Rejection[LatticeStatus]:
     """Find a grid, in view as a whole or in part, at any rotation and tilt.
 
-    Chess boards: candidates are maxima of minus the determinant of the Hessian at several scales; a
-    lattice is grown from them with local prediction and the alternating sign of the contrast; every
-    corner in view is then fitted by a model of two crossing blurred edges (see
-    :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance. Dots, holes and
-    crossed lines: see :mod:`semcal_ros.core.corners.dots_and_lines`.
+    Candidates are lattices through saddle points of the image at all scales, up to points a quarter of the picture
+    apart. Corners of a chess board are fitted by a model of two crossing blurred edges (see
+    :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance; dots, crosses and crossings of
+    lines by their mean cell (see :mod:`semcal_ros.core.corners.dots_and_lines`). Where edges are rough or blurred
+    over many pixels, that is done in a reduced picture.
 
     Parameters
     ----------
@@ -153,8 +171,8 @@ def find_lattice(
     databar_rows
         Rows at the bottom that do not belong to the image.
     pattern
-        "chess", "dots" (also holes and small squares), "lines" (crossed), or "auto" for whichever of
-        these is seen.
+        "chess", "dots" (also holes and small squares), "crosses", "lines" (crossed), or "auto" for whichever of these
+        is seen.
 
     Returns
     -------
@@ -169,27 +187,225 @@ def find_lattice(
     """
     wanted = check_pattern(pattern)
     grey = prepare_image(image, databar_rows)
-    size = (grey.shape[1], grey.shape[0])
     scaled = screen_image(grey)
     if isinstance(scaled, Rejection):
         return scaled
-    if wanted in ("dots", "lines"):
-        return _find_cells(scaled, size, wanted)
-    chess = _find_chess(scaled, size)
-    if wanted == "chess":
-        return _other_pattern(chess.pattern, wanted) if isinstance(chess, CellShape) else chess
-    if isinstance(chess, CellShape):
-        return _find_cells(scaled, size, wanted)
-    if isinstance(chess, Rejection):
-        cells = _find_cells(scaled, size, wanted)
-        # What is no other pattern either was most likely meant to be a chess board.
-        return chess if isinstance(cells, Rejection) else cells
-    # In a part of another grid there may be something like a small chess board.
-    if _filled_by(chess) < FILLED / 2.0:
-        cells = _find_cells(scaled, size, wanted)
-        if not isinstance(cells, Rejection) and _filled_by(cells) > _filled_by(chess):
-            return cells
-    return chess
+    pyramid = _Pyramid(scaled)
+    answer: Rejection[LatticeStatus] | None = None
+    best: LatticeDetection | None = None
+    for candidate in _rank(list(_search(pyramid))):
+        for shape in _likely_shapes(candidate, wanted):
+            found = shape if isinstance(shape, Rejection) else _measure(pyramid, candidate, shape)
+            if isinstance(found, Rejection):
+                # What is said is said of the candidate that covers most of the image.
+                answer = answer or found
+            elif best is None or _filled_by(found) > _filled_by(best):
+                best = found
+        if best is not None and candidate.filled > 0.5 * _FILLED:
+            break
+    if best is not None:
+        return best
+    what = "points" if wanted == "auto" else _POINTS[wanted]
+    return answer or Rejection(LatticeStatus.NO_LATTICE, f"no grid: no regular pattern of {what}")
+
+
+class _Pyramid:
+    """An image with a contrast of about 1, and the same reduced by powers of two."""
+
+    def __init__(self, image: Image):
+        self._levels = [image]
+
+    @property
+    def image(self) -> Image:
+        """The image itself."""
+        return self._levels[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image, px."""
+        return self.image.shape[1], self.image.shape[0]
+
+    def level(self, octave: int) -> Image:
+        """Return the image reduced by two to the power of ``octave``."""
+        while len(self._levels) <= octave:
+            last = self._levels[-1]
+            width, height = last.shape[1] // 2, last.shape[0] // 2
+            cropped = last[: 2 * height, : 2 * width]
+            small = cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA)
+            self._levels.append(np.asarray(small, dtype=np.float32))
+        return self._levels[octave]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A lattice through saddle points, the cells that its bright squares make, and the patterns these may be.
+
+    Attributes
+    ----------
+    corners, cells, shapes
+        The lattices, and the shapes; None where too little is in view.
+    filled, regular
+        Parts of the image that its squares cover, and that those of them cover which continue their neighbours.
+    """
+
+    corners: Lattice
+    cells: Lattice | None
+    shapes: CellShapes | None
+    filled: float
+    regular: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it shows its pattern."""
+        return self.shapes is not None and self.shapes.best.misfit < _CLEAR_MISFIT
+
+
+def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
+    """Find lattices scale by scale; a clear chess board that fills the image ends the search."""
+    image, size = pyramid.image, pyramid.size
+    for scale in _SCALES_PX:
+        if scale > _LARGEST_SCALE_PART * min(size) and scale > _SCALES_PX[0]:
+            continue
+        octave = max(0, int(np.log2(scale / _SCALES_PX[0])))
+        corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
+        if corners is None or len(corners.ij) < MINIMUM_CORNERS // 2:
+            continue
+        cells = bright_cells(image, corners)
+        shapes = None if cells is None else fit_lattice_shapes(pyramid.level, cells)
+        area = size[0] * size[1]
+        filled = float(np.abs(np.linalg.det(corners.axes)).sum()) / area
+        candidate = _Candidate(corners, cells, shapes, filled, count_regular_area(corners) / area)
+        yield candidate
+        if (
+            filled > _FILLED
+            and candidate.is_clear
+            and shapes is not None
+            and shapes.allows("chess")
+        ):
+            return
+
+
+def _rank(found: list[_Candidate]) -> list[_Candidate]:
+    """Return the most regular candidates first, without those whose cells are mixtures of different ones."""
+    tried = [c for c in found if c.shapes is None or c.shapes.best.misfit < _MISFIT_MAX]
+    largest = max((c.regular for c in tried), default=0.0)
+    near = [c.shapes.power for c in tried if c.shapes is not None and c.regular > 0.5 * largest]
+    strongest = max(near, default=0.0)
+    kept = [
+        c
+        for c in tried
+        if (c.is_clear or c.filled > _SMALL)
+        and (c.shapes is None or c.shapes.power >= _POWER_MIN * strongest)
+    ]
+    return sorted(kept, key=lambda c: c.regular, reverse=True)[:_LATTICES_TRIED]
+
+
+def _likely_shapes(
+    candidate: _Candidate, wanted: PatternChoice
+) -> list[CellShape | Rejection[LatticeStatus]]:
+    """Return the shapes that the cells of a candidate may have, the most likely first, or why there is none."""
+    shapes = candidate.shapes
+    if shapes is None:
+        # Of the few squares of a small board, none may be in view as a whole.
+        return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
+    if shapes.asymmetry > _ASYMMETRY_MAX and not shapes.allows("chess"):
+        return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
+    if wanted == "auto":
+        likely = [s for s in shapes.every if shapes.allows(s.pattern)]
+        likely.sort(key=lambda s: (s.pattern != "chess", s.misfit))
+        return list(likely)
+    # The same points lie at the middle of dots and of crosses: only a chess board has others.
+    if (shapes.best.pattern == "chess") != (wanted == "chess") and not shapes.allows(wanted):
+        seen = shapes.best.pattern
+        return [
+            Rejection(
+                LatticeStatus.OTHER_PATTERN,
+                f"{PATTERN_NAMES[seen]}, not {PATTERN_NAMES[wanted]}, by odds of"
+                f" {_describe_odds(shapes.odds_against(wanted))}: set the pattern to {seen} or auto",
+            )
+        ]
+    return [shapes.get(wanted)]
+
+
+def _describe_odds(odds: float) -> str:
+    return "more than a million to one" if odds >= 1e6 else f"{odds:.0f} to one"
+
+
+def _measure(
+    pyramid: _Pyramid, candidate: _Candidate, shape: CellShape
+) -> LatticeDetection | Rejection[LatticeStatus]:
+    """Fit the points of a pattern, at full resolution or where most of them pass, and judge them."""
+    best: RefinedCorners | None = None
+    spacing = np.linalg.norm(candidate.corners.axes, axis=2)
+    typical = float(np.median(spacing)) * (1.0 if shape.pattern == "chess" else np.sqrt(2.0))
+    first = (
+        0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / _CELL_FULL_PX))))
+    )
+    last = max(first, int(np.log2(typical / _SPACING_MIN_PX)))
+    for octave in range(first, last + 1):
+        points = _refine(pyramid.level(octave), candidate, shape, octave)
+        if points is not None and (best is None or _passed(points) > _passed(best)):
+            best = points
+        if best is not None and best.quality > _CONVINCING:
+            break
+    if best is None:
+        return Rejection(
+            LatticeStatus.NO_LATTICE,
+            f"no grid: a regular pattern, but its {_POINTS[shape.pattern]} are not alike",
+        )
+    if shape.pattern == "chess":
+        return _judge_chess(pyramid, candidate, best)
+    return _judge(best, candidate, pyramid.size, shape)
+
+
+def _passed(points: RefinedCorners) -> float:
+    return len(points.ij) * points.quality
+
+
+def _refine(
+    image: Image, candidate: _Candidate, shape: CellShape, octave: int
+) -> RefinedCorners | None:
+    """Fit the points in a reduced picture; return them in pixels of the whole one."""
+    factor = 2.0**octave
+    if shape.pattern == "chess":
+        points = refine_lattice(image, candidate.corners.reduced(factor))
+    else:
+        assert candidate.cells is not None
+        points = refine_cells(image, candidate.cells.reduced(factor), shape)
+    if points is None or octave == 0:
+        return points
+    # Pixel centres of the reduced picture lie in the middle of the pixels that they replace.
+    return replace(
+        points,
+        xy=factor * (points.xy + 0.5) - 0.5,
+        rejected_xy=factor * (points.rejected_xy + 0.5) - 0.5,
+        covariance=factor**2 * points.covariance,
+        blur_px=factor * points.blur_px,
+    )
+
+
+def _judge_chess(
+    pyramid: _Pyramid, candidate: _Candidate, corners: RefinedCorners
+) -> LatticeDetection | Rejection[LatticeStatus]:
+    """Return the corners if they are good enough and, as fitted, still those of a chess board."""
+    shapes = candidate.shapes
+    chess = CellShape("chess", True, 1.0, 0.0, 0.0) if shapes is None else shapes.chess
+    judged = _judge(corners, candidate, pyramid.size, chess)
+    if isinstance(judged, Rejection) or candidate.is_clear:
+        return judged
+    maps = fit_local_maps(judged.ij, judged.ij, judged.xy, leave_out_self=False)
+    cells = bright_cells(pyramid.image, Lattice(judged.ij, judged.xy, maps.axes))
+    shapes = None if cells is None else fit_lattice_shapes(pyramid.level, cells)
+    if shapes is None:
+        return judged
+    if not shapes.allows("chess"):
+        return Rejection(
+            LatticeStatus.OTHER_PATTERN,
+            f"{PATTERN_NAMES[shapes.best.pattern]}, but not well enough in view",
+        )
+    if shapes.chess.misfit > _CHESS_MISFIT_MAX:
+        return Rejection(LatticeStatus.NO_LATTICE, "no grid: a regular pattern, but not of squares")
+    return replace(judged, odds=shapes.odds_of("chess"))
 
 
 def _filled_by(points: LatticeDetection) -> float:
@@ -197,174 +413,40 @@ def _filled_by(points: LatticeDetection) -> float:
     return len(points.ij) * points.spacing_px**2 / (points.image_size[0] * points.image_size[1])
 
 
-def _find_chess(
-    scaled: Image, size: tuple[int, int]
-) -> LatticeDetection | CellShape | Rejection[LatticeStatus]:
-    """Find the corners of a chess board; return the shape of the cells of another grid."""
-    best = _best_corners(scaled, size)
-    if best is None:
-        return Rejection(
-            LatticeStatus.NO_LATTICE, "no chess lattice: no regular pattern of saddle points"
-        )
-    if isinstance(best, CellShape):
-        return best
-    corners, filled, is_chess = best
-    chess = _judge(corners, filled, size, "chess")
-    if isinstance(chess, Rejection) or is_chess:
-        return chess
-    maps = fit_local_maps(chess.ij, chess.ij, chess.xy, leave_out_self=False)
-    shapes = _shapes_of(scaled, Lattice(chess.ij, chess.xy, maps.axes))
-    if shapes is None:
-        return chess
-    if shapes.allows("chess") and shapes.chess.misfit > CHESS_MISFIT_MAX:
-        return Rejection(
-            LatticeStatus.NO_LATTICE, "no chess lattice: a regular pattern, but not of squares"
-        )
-    return chess if shapes.allows("chess") else shapes.best
-
-
-def _shapes_of(scaled: Image, corners: Lattice) -> CellShapes | None:
-    """Fit the shapes of the unit cell of a chess board, or of what was taken for one."""
-    cells = bright_cells(scaled, corners)
-    return None if cells is None else fit_lattice_shapes(scaled, cells)
-
-
-def _find_cells(
-    scaled: Image, size: tuple[int, int], pattern: PatternChoice
-) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Find dots or crossed lines; with ``pattern`` "auto" either of them."""
-    wanted = "dots or crossed lines" if pattern == "auto" else PATTERN_NAMES[pattern]
-    answer = Rejection(LatticeStatus.NO_LATTICE, f"no {wanted}: no regular pattern")
-    tried = [
-        (lattice, shapes)
-        for lattice in find_cell_lattices(scaled)[:LATTICES_TRIED]
-        if (shapes := fit_lattice_shapes(scaled, lattice)) and shapes.best.misfit < MISFIT_MAX
-    ]
-    largest = max((_covered_share(lattice, size) for lattice, _ in tried), default=0.0)
-    strongest = max(
-        (s.power for lattice, s in tried if _covered_share(lattice, size) > 0.5 * largest),
-        default=0.0,
-    )
-    for lattice, shapes in tried:
-        if shapes.power < POWER_MIN * strongest:
-            continue
-        if shapes.asymmetry > ASYMMETRY_MAX:
-            answer = Rejection(LatticeStatus.NO_LATTICE, f"no {wanted}: the lattice is not square")
-            continue
-        shape = shapes.best if pattern == "auto" else shapes.get(pattern)
-        if shape.pattern == "chess" or not shapes.allows(shape.pattern):
-            return _other_pattern(shapes.best.pattern, pattern)
-        points = refine_cells(scaled, lattice, shape)
-        if points is not None:
-            filled = _covered_share(lattice, size)
-            judged = _judge(points, filled, size, shape.pattern)
-            if not isinstance(judged, Rejection):
-                return judged
-            answer = judged
-    return answer
-
-
-def _other_pattern(seen: str, wanted: str) -> Rejection[LatticeStatus]:
-    if wanted == "auto":
-        return Rejection(
-            LatticeStatus.OTHER_PATTERN, f"{PATTERN_NAMES[seen]}, but not well enough in view"
-        )
-    return Rejection(
-        LatticeStatus.OTHER_PATTERN,
-        f"{PATTERN_NAMES[seen]}, not {PATTERN_NAMES[wanted]}: set the pattern to {seen} or auto",
-    )
-
-
 def _judge(
-    points: RefinedCorners, filled: float, size: tuple[int, int], pattern: Pattern
+    points: RefinedCorners, candidate: _Candidate, size: tuple[int, int], shape: CellShape
 ) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Return the points of a lattice that covers the part ``filled`` of the image, if good enough."""
-    name = "chess lattice" if pattern == "chess" else PATTERN_NAMES[pattern]
-    what = _POINTS[pattern]
+    """Return the points of a candidate, if they are good enough."""
+    what = _POINTS[shape.pattern]
     if points.quality < 0.5:
         return Rejection(
             LatticeStatus.NO_LATTICE,
-            f"no {name}: only {round(100 * points.quality)} % of the expected {what}"
+            f"no grid: only {round(100 * points.quality)} % of the expected {what}"
             f" look like {what}",
         )
-    if points.foreign > max(FOREIGN_MAX * len(points.ij), MINIMUM_CORNERS // 2):
+    if points.foreign > max(_FOREIGN_MAX * len(points.ij), MINIMUM_CORNERS // 2):
         return Rejection(
             LatticeStatus.TWO_BOARDS,
             f"two boards: {points.foreign} {what} do not continue the lattice of the other"
             f" {len(points.ij)}",
         )
-    if len(points.ij) < MINIMUM_CORNERS and filled < FILLED / 2.0:
+    if len(points.ij) < MINIMUM_CORNERS and candidate.filled < 0.5 * _FILLED:
         return Rejection(
             LatticeStatus.NO_LATTICE,
-            f"no {name}: only {len(points.ij)} regular {what}, in"
-            f" {max(1, round(100 * filled))} % of the image",
+            f"no grid: only {len(points.ij)} regular {what}, in"
+            f" {max(1, round(100 * candidate.filled))} % of the image",
         )
     if len(points.ij) < MINIMUM_CORNERS:
         return Rejection(
             LatticeStatus.TOO_FEW_CORNERS,
             f"too few {what}: {len(points.ij)} found, at least {MINIMUM_CORNERS} needed",
         )
-    return _make_detection(points, size, pattern)
-
-
-def _best_corners(
-    image: Image, size: tuple[int, int]
-) -> tuple[RefinedCorners, float, bool] | CellShape | None:
-    """Find the best corners over all scales, the part of the image that they cover, and whether its cells were found
-    to be those of a chess board already.
-
-    If a lattice fills the image and has clearly the cells of another grid, return their shape.
-    """
-    candidates: list[tuple[float, Lattice]] = []
-    best: tuple[RefinedCorners, float, bool] | None = None
-    for scale in SCALES_PX:
-        lattice = grow_best_lattice(find_saddles(image, scale), size)
-        if lattice is None or len(lattice.ij) < MINIMUM_CORNERS // 2:
-            continue
-        filled = _covered_share(lattice, size)
-        if filled <= FILLED:
-            candidates.append((filled, lattice))
-            continue
-        shapes = _shapes_of(image, lattice)
-        clear = shapes is not None and shapes.best.misfit < CLEAR_MISFIT
-        if shapes is not None and clear and not shapes.allows("chess"):
-            return shapes.best
-        # Corners that are refined show the cells more clearly still.
-        is_chess = (
-            shapes is not None
-            and shapes.allows("chess")
-            and shapes.chess.misfit <= CHESS_MISFIT_MAX
-        )
-        best = _better(best, refine_lattice(image, lattice), filled, is_chess)
-        if best is not None and best[0].quality > CONVINCING:
-            return best
-    for filled, lattice in candidates:
-        best = _better(best, refine_lattice(image, lattice), filled, False)
-    return best
-
-
-def _better(
-    best: tuple[RefinedCorners, float, bool] | None,
-    other: RefinedCorners | None,
-    filled: float,
-    is_chess: bool,
-) -> tuple[RefinedCorners, float, bool] | None:
-    """Return the candidate with the larger product of number of corners and quality."""
-    if other is None:
-        return best
-    if best is None or len(other.ij) * other.quality > len(best[0].ij) * best[0].quality:
-        return other, filled, is_chess
-    return best
-
-
-def _covered_share(lattice: Lattice, size: tuple[int, int]) -> float:
-    """Return the part of the image that the cells of a lattice cover."""
-    area = float(np.abs(np.linalg.det(lattice.axes)).sum())
-    return area / (size[0] * size[1])
+    odds = float("nan") if candidate.shapes is None else candidate.shapes.odds_of(shape.pattern)
+    return _make_detection(points, size, shape.pattern, odds)
 
 
 def _make_detection(
-    corners: RefinedCorners, size: tuple[int, int], pattern: Pattern
+    corners: RefinedCorners, size: tuple[int, int], pattern: Pattern, odds: float
 ) -> LatticeDetection:
     centre = np.array([(size[0] - 1) / 2.0, (size[1] - 1) / 2.0])
     nearest = int(np.argmin(np.linalg.norm(corners.xy - centre, axis=1)))
@@ -383,4 +465,5 @@ def _make_detection(
         corners.blur_px,
         corners.rejected_xy,
         pattern,
+        odds,
     )

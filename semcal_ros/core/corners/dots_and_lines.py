@@ -22,9 +22,9 @@ its squares are the cells of the pattern.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
@@ -53,16 +53,17 @@ from semcal_ros.core.corners.unit_cell import (
     gather_cells,
 )
 
-__all__ = ["bright_cells", "find_cell_lattices", "fit_lattice_shapes", "refine_cells"]
+__all__ = [
+    "bright_cells",
+    "count_regular_area",
+    "fit_lattice_shapes",
+    "grow_at_scale",
+    "refine_cells",
+]
 
 
-# Scales of the search for saddle points, px, in steps of 1.7 as for chess boards; a quarter of
-# the distance between the saddle points, 0.7 spacings, is best. Dots far apart have no saddle
-# points at smaller scales, so the search goes on up to dots a third of the image apart.
-SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0)
-LARGEST_SCALE_PART = 0.06
-# The image is reduced for scales beyond twice this, px.
-SCALE_REDUCED_PX = 5.0
+# Distance between cells up to which they are classified at full resolution, px: the coarse mean has 16 bins.
+COARSE_PX = 64.0
 # Cells that are averaged, and the pixels in them: a fifteenth of the noise remains.
 SAMPLE = 60
 SAMPLE_PIXELS = 400_000
@@ -83,42 +84,39 @@ SHOWN_MIN = 0.9
 STEP_MAX_PX = 0.05
 
 
-def find_cell_lattices(image: Image) -> list[Lattice]:
-    """Return the lattices of bright places at all scales, those with most cells first."""
-    found = []
-    for scale in SCALES_PX:
-        if scale > LARGEST_SCALE_PART * min(image.shape) and scale > SCALES_PX[0]:
-            continue
-        lattice = _grow(image, scale)
-        cells = None if lattice is None else bright_cells(image, lattice)
-        if cells is not None and len(cells.ij) >= CORNERS_MIN:
-            found.append(cells)
-    return sorted(found, key=_regular_count, reverse=True)
+def grow_at_scale(
+    small: Image, scale_px: float, octave: int, size: tuple[int, int]
+) -> Lattice | None:
+    """Grow a lattice through the saddle points at one scale.
+
+    Parameters
+    ----------
+    small
+        (h, w) float32, reduced by two to the power of ``octave``.
+    scale_px
+        Standard deviation of the smoothing in pixels of the whole image.
+    octave
+        See ``small``.
+    size
+        (width, height) of the whole image, px.
+    """
+    factor = 2.0**octave
+    saddles = find_saddles(small, scale_px / factor)
+    # Pixel centres of the reduced image lie in the middle of the pixels that they replace.
+    moved = SaddlePoints(
+        factor * saddles.xy + 0.5 * (factor - 1.0), saddles.hessian, saddles.response
+    )
+    return grow_best_lattice(moved, size)
 
 
-def _regular_count(cells: Lattice) -> float:
-    """Return the number of cells that lie where their neighbours predict them."""
+def count_regular_area(cells: Lattice) -> float:
+    """Return the area, px^2, of the cells that lie where their neighbours predict them."""
     maps = fit_local_maps(cells.ij, cells.ij, cells.xy)
     miss = np.linalg.norm(maps.xy - cells.xy, axis=1)
     spacing = np.linalg.norm(cells.axes, axis=2).min(axis=1)
     # In units of area: a lattice through noise has many small cells.
     area = np.abs(np.linalg.det(cells.axes))
     return float(area[(miss < 0.1 * spacing) & maps.usable].sum())
-
-
-def _grow(image: Image, scale_px: float) -> Lattice | None:
-    factor = max(1, int(scale_px / SCALE_REDUCED_PX))
-    small = image
-    if factor > 1:
-        size = (image.shape[1] // factor, image.shape[0] // factor)
-        cropped = image[: size[1] * factor, : size[0] * factor]
-        small = cv2.resize(cropped, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    saddles = find_saddles(small, scale_px / factor)
-    # Pixel centres of the reduced image lie in the middle of the pixels that they replace.
-    moved = SaddlePoints(
-        factor * saddles.xy + 0.5 * (factor - 1), saddles.hessian, saddles.response
-    )
-    return grow_best_lattice(moved, (image.shape[1], image.shape[0]))
 
 
 def bright_cells(image: Image, lattice: Lattice) -> Lattice | None:
@@ -161,8 +159,14 @@ def _median_at(image: Image, xy: Array) -> float:
     return float(np.median(image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]))
 
 
-def fit_lattice_shapes(image: Array32, cells: Lattice) -> CellShapes | None:
-    """Fit the patterns whose bright places are at ``cells``; None if too little of it is in view."""
+def fit_lattice_shapes(level: Callable[[int], Array32], cells: Lattice) -> CellShapes | None:
+    """Fit the patterns whose bright places are at ``cells``; None if too little of it is in view.
+
+    ``level`` returns the image reduced by powers of two: large cells need no more pixels than small ones.
+    """
+    spacing = float(np.median(np.linalg.norm(cells.axes, axis=2)))
+    octave = max(0, int(np.ceil(np.log2(spacing / COARSE_PX))))
+    image, cells = level(octave), cells.reduced(2.0**octave)
     few = np.random.default_rng(0).permutation(len(cells.ij))[:SAMPLE_COARSE]
     count = len(few)
     # Cells may be too few for local maps, and their axes are good enough.
@@ -255,6 +259,8 @@ def _at_feature(cells: Lattice, shape: CellShape) -> Lattice:
 
 def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseModel] | None:
     """Learn the mean cell and the noise from some cells; also return all cells, centred."""
+    if len(cells.ij) < CORNERS_MIN:
+        return None
     maps = fit_local_maps(cells.ij, cells.ij, cells.xy, leave_out_self=False)
     few = _sample(image, maps)
     if few.sum() < CORNERS_MIN:
@@ -272,6 +278,9 @@ def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseMode
         noise = fit_noise(fit.select(good))
         some, windows, fit = some.select(good), windows.select(good), fit.select(good)
         cell = average_cells(windows, some, fit)
+        if not np.any(cell.values):
+            # Noise explains all that they have in common.
+            return None
         if left:
             fit = fit_cells(windows, some, cell, noise, iterations=2)
     u, v = cell.find_centre()

@@ -72,6 +72,10 @@ class Lattice:
         """Return the points where ``keep`` is true."""
         return Lattice(self.ij[keep], self.xy[keep], self.axes[keep])
 
+    def reduced(self, factor: float) -> Lattice:
+        """Return the lattice in an image whose pixels are so many times as large."""
+        return Lattice(self.ij, (self.xy + 0.5) / factor - 0.5, self.axes / factor)
+
 
 @dataclass(frozen=True)
 class _Seeds:

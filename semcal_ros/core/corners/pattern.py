@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tell chess boards, dots and crossed lines apart by the Fourier coefficients of their unit cell.
+"""Tell chess boards, dots, crosses and crossed lines apart by the Fourier coefficients of their unit cell.
 
-All three repeat on a square lattice, and a chess board is a lattice of squares that touch at their
+All of them repeat on a square lattice, and a chess board is a lattice of squares that touch at their
 corners. What differs is the shape of the bright part: a square on its tip (chess), a disc (dots,
-holes), or a square in line with the lattice (the opening between crossed lines). Its transform is
+holes), a plus sign (crosses), or a square in line with the lattice (the opening between crossed lines).
+Its transform is
 known in closed form; size and blur are fitted for each shape, and the best fit names the pattern.
 """
 
@@ -45,12 +46,17 @@ __all__ = [
 ]
 
 #: What a grid consists of.
-Pattern = Literal["chess", "dots", "lines"]
+Pattern = Literal["chess", "dots", "crosses", "lines"]
 #: What to search for.
-PatternChoice = Literal["auto", "chess", "dots", "lines"]
-PATTERNS = ("auto", "chess", "dots", "lines")
+PatternChoice = Literal["auto", "chess", "dots", "crosses", "lines"]
+PATTERNS = ("auto", "chess", "dots", "crosses", "lines")
 #: What they are called.
-PATTERN_NAMES = {"chess": "a chess board", "dots": "dots", "lines": "crossed lines"}
+PATTERN_NAMES = {
+    "chess": "a chess board",
+    "dots": "dots",
+    "crosses": "crosses",
+    "lines": "crossed lines",
+}
 
 # Harmonics up to this order: with more, small spacings would be judged by noise.
 ORDERS = 4
@@ -64,12 +70,11 @@ MISFIT_LEAST = 2e-4
 SIZES: Array = np.linspace(0.08, 0.98, 46)
 CHESS_SIZES: Array = np.linspace(0.7, 1.0, 16)
 BLURS: Array = np.linspace(0.0, 0.24, 13)
-# Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
-# harmonics, noise alone exceeds it once in 30 images (F test). A pattern so blurred that only its
-# first harmonics are left may be any; it is taken for the chess board that this suite was made for.
-AMBIGUOUS = 2.0
-# Misfit that the steps of sizes and blurs cause.
-MISFIT_LEAST = 2e-4
+# Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
+ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
+ARM_WIDTHS: Array = np.linspace(0.06, 0.3, 9)
+# Odds beyond this say nothing more.
+ODDS_MAX = 1e6
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ class CellShape:
         Whether the dot, the opening or the bright square is at the lattice point, rather than at the
         centre of the cell.
     size
-        Diameter of the dot, or side of the square, in cells.
+        Diameter of the dot, side of the square, or length of the cross, in cells.
     blur
         Standard deviation of the blur, in cells.
     misfit
@@ -104,7 +109,7 @@ class CellShapes:
 
     Attributes
     ----------
-    chess, dots, lines
+    chess, dots, crosses, lines
         The shapes.
     asymmetry
         Part of the power by which the cell differs from its mirror image. It is small on a square
@@ -116,25 +121,46 @@ class CellShapes:
 
     chess: CellShape
     dots: CellShape
+    crosses: CellShape
     lines: CellShape
     asymmetry: float
     power: float
 
+    @property
+    def every(self) -> tuple[CellShape, ...]:
+        """All of them."""
+        return self.chess, self.dots, self.crosses, self.lines
+
     def get(self, pattern: Pattern) -> CellShape:
         """Return the best shape of a pattern."""
-        return {"chess": self.chess, "dots": self.dots, "lines": self.lines}[pattern]
+        return next(shape for shape in self.every if shape.pattern == pattern)
 
     @property
     def best(self) -> CellShape:
         """The shape with the least misfit; that of a chess board as far as the blur allows it."""
-        if self.allows("chess"):
-            return self.chess
-        return min(self.dots, self.lines, key=lambda shape: shape.misfit)
+        return self.chess if self.allows("chess") else self._least
+
+    @property
+    def _least(self) -> CellShape:
+        return min(self.every, key=lambda shape: shape.misfit)
 
     def allows(self, pattern: Pattern) -> bool:
         """Whether it may be this pattern: whether no other one is much more likely."""
-        least = min(self.chess.misfit, self.dots.misfit, self.lines.misfit)
-        return self.get(pattern).misfit <= AMBIGUOUS * least
+        return self.get(pattern).misfit <= AMBIGUOUS * self._least.misfit
+
+    def odds_against(self, pattern: Pattern) -> float:
+        """Return how many times as likely the best pattern is; the harmonics have independent, normal errors."""
+        return self._odds(self.get(pattern).misfit, self.best.misfit)
+
+    def odds_of(self, pattern: Pattern) -> float:
+        """Return how many times as likely a pattern is as the best other one."""
+        others = min(shape.misfit for shape in self.every if shape.pattern != pattern)
+        return self._odds(others, self.get(pattern).misfit)
+
+    @staticmethod
+    def _odds(misfit: float, other: float) -> float:
+        count = len(_harmonics()[0])
+        return float(min((misfit / other) ** (0.5 * count), ODDS_MAX))
 
 
 @dataclass(frozen=True)
@@ -184,6 +210,11 @@ def _shapes() -> _Shapes:
         # Openings wider than half a cell leave lines between them; narrower ones are square dots.
         square = size * size * np.sinc(size * h) * np.sinc(size * k)
         add("lines" if size >= 0.5 else "dots", float(size), square)
+    for arm in 2.0 * ARM_LENGTHS:
+        for width in ARM_WIDTHS[arm > 2.0 * ARM_WIDTHS]:
+            one = np.sinc(arm * h) * np.sinc(width * k) + np.sinc(width * h) * np.sinc(arm * k)
+            both = width * width * np.sinc(width * h) * np.sinc(width * k)
+            add("crosses", float(arm), arm * width * one - both)
     for size in CHESS_SIZES:
         tip = np.sinc(size * (h + k) / 2.0) * np.sinc(size * (h - k) / 2.0)
         add("chess", float(size), tip)
@@ -222,4 +253,4 @@ def fit_shapes(cell: UnitCell) -> CellShapes:
             max(float(left[index]), MISFIT_LEAST),
         )
 
-    return CellShapes(best("chess"), best("dots"), best("lines"), asymmetry, power)
+    return CellShapes(best("chess"), best("dots"), best("crosses"), best("lines"), asymmetry, power)

@@ -46,7 +46,7 @@ class LatticeStatus(Enum):
     NOT_FINITE = "values that are not finite"
     BLANK = "blank"
     SATURATED = "saturated"
-    NO_LATTICE = "no chess lattice"
+    NO_LATTICE = "no grid"
     TWO_BOARDS = "two boards"
     TOO_FEW_CORNERS = "too few corners"
     OTHER_PATTERN = "another pattern"

@@ -24,8 +24,9 @@ import pytest
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.corners.dots_and_lines import (
-    find_cell_lattices,
+    bright_cells,
     fit_lattice_shapes,
+    grow_at_scale,
     refine_cells,
 )
 from semcal_ros.core.corners.saddle import prepare_image, screen_image
@@ -166,10 +167,13 @@ def test_a_grid_is_followed_to_the_frame_from_a_small_part() -> None:
     board = PatternBoard(12.0, turn_deg=4.0, noise=3.0, width=400, height=60)
     image = screen_image(prepare_image(board.picture(np.random.default_rng(3)), 0))
     assert not isinstance(image, Rejection)
-    whole = find_cell_lattices(image)[0]
+    saddles = grow_at_scale(image, 2.5, 0, (400, 60))
+    assert saddles is not None
+    whole = bright_cells(image, saddles)
+    assert whole is not None
     # Dots of the left fifth, 25 rows away from the other end.
     part = whole.select(whole.xy[:, 0] < 80.0)
-    shapes = fit_lattice_shapes(image, part)
+    shapes = fit_lattice_shapes(lambda _octave: image, part)
     assert shapes is not None
     found = refine_cells(image, part, shapes.dots)
     assert found is not None
@@ -188,18 +192,28 @@ def test_missing_dots_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("pattern", ["dots", "lines"])
-def test_another_pattern_than_the_one_asked_for_is_refused(pattern: str) -> None:
+def test_a_chess_board_is_not_seen_in_another_pattern(pattern: str) -> None:
     size = {"dots": 0.5, "lines": 0.2}[pattern]
     image = PatternBoard(20.0, turn_deg=7.0, pattern=pattern, size=size, noise=4.0).picture(
         np.random.default_rng(0)
     )
-    other = {"dots": "lines", "lines": "dots"}[pattern]
-    for wanted in ("chess", other):
-        refused = find_lattice(image, pattern=wanted)
-        assert isinstance(refused, Rejection)
-        assert refused.status is LatticeStatus.OTHER_PATTERN
-        assert f"set the pattern to {pattern} or auto" in refused.reason
+    refused = find_lattice(image, pattern="chess")
+    assert isinstance(refused, Rejection)
+    assert refused.status is LatticeStatus.OTHER_PATTERN
+    assert "by odds of" in refused.reason
+    assert f"set the pattern to {pattern} or auto" in refused.reason
     assert detected(image, pattern=pattern).pattern == pattern
+
+
+def test_the_user_may_call_dots_crosses() -> None:
+    """Both have their points at the middle of the motif, and the same pitch."""
+    board = PatternBoard(20.0, turn_deg=7.0, size=0.5, noise=4.0)
+    image = board.picture(np.random.default_rng(0))
+    found = detected(image, pattern="crosses")
+    assert found.pattern == "crosses"
+    assert found.odds < 1e-3
+    assert detected(image).odds > 1e3
+    np.testing.assert_allclose(found.xy, detected(image).xy, atol=1e-9)
 
 
 def test_a_chess_board_is_no_grid_of_dots() -> None:
@@ -211,8 +225,8 @@ def test_a_chess_board_is_no_grid_of_dots() -> None:
         refused = find_lattice(image, pattern=wanted)
         assert isinstance(refused, Rejection)
         assert refused.reason == (
-            f"a chess board, not {'dots' if wanted == 'dots' else 'crossed lines'}:"
-            " set the pattern to chess or auto"
+            f"a chess board, not {'dots' if wanted == 'dots' else 'crossed lines'}, by odds of"
+            " more than a million to one: set the pattern to chess or auto"
         )
 
 
@@ -226,5 +240,5 @@ def test_dots_too_blurred_to_tell_from_squares_are_found_if_asked_for() -> None:
 
 
 def test_an_unknown_pattern_is_an_error() -> None:
-    with pytest.raises(InvalidValueError, match="auto, chess, dots, lines"):
+    with pytest.raises(InvalidValueError, match="auto, chess, dots, crosses, lines"):
         find_lattice(np.zeros((64, 64), np.uint8), pattern="hexagons")
