@@ -89,7 +89,7 @@ class BundleResult:
     residuals_px
         (N, 2) observed minus projected pixels.
     huber_weight
-        (N,) weights in (0, 1]; below 1 where a corner is an outlier.
+        (N,) weights in [0, 1]: below 1 where a corner is an outlier, and 0 where it has no projection.
     cost
         Half the robust sum of squares, with priors.
     information
@@ -163,7 +163,9 @@ class _Change:
 def _change(
     problem: Problem, state: State, normal: NormalEquations, damping: float
 ) -> _Change | None:
-    """Return the step, or None where rounding leaves no positive definite equations: a larger damping does."""
+    """Return the step, or None where it would turn a view too far, or rounding leaves equations that cannot be solved:
+    a larger damping helps with both.
+    """
     try:
         reduced = schur_complement(problem, state, normal, damping)
         matrix, right = reduced_normal_equations(
@@ -204,13 +206,16 @@ def refine(
 ) -> BundleResult:
     """Minimise the robust reprojection error from ``state``.
 
-    With ``fixed_theta`` only the poses move. ``tolerance`` is the relative decrease of the cost
+    With ``fixed_theta`` only the unknowns of the views move; the covariance is that of all unknowns. ``tolerance`` is the relative decrease of the cost
     that ends the iteration. The function never raises for lack of convergence: the result says how
     it ended.
     """
     effects = problem.effects
-    sizes = (0, 0) if effects is None else (len(effects.visit_group), len(problem.group))
-    if (len(state.visits), len(state.drift_px)) != sizes:
+    visits, views, lattices = 0, 0, 0
+    if effects is not None:
+        visits, views = len(effects.visit_group), len(problem.group)
+        lattices = 0 if effects.lattice_sigma is None else views
+    if (len(state.visits), len(state.drift_px), len(state.lattices)) != (visits, views, lattices):
         state = empty_effects(problem, state)
     costs = view_costs(problem, state)
     if fixed_theta:
@@ -272,7 +277,7 @@ def _follow_with_poses(problem: Problem, costs: Array, step: _Change) -> _Point:
 def _refine_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
 ) -> tuple[State, Array, int, DescentStatus]:
-    """Adjust the pose of each view on its own by Levenberg-Marquardt, for all views at once.
+    """Adjust the unknowns of each view on its own by Levenberg-Marquardt, for all views at once.
 
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
@@ -284,7 +289,11 @@ def _refine_poses(
         normal = normal_equations(problem, state, poses_only=True)
         pose = normal.matrix[:, own, own].copy()
         pose[:, diagonal, diagonal] = damped_diagonal(pose, damping[:, None])
-        change = solve_scaled(pose, normal.right[:, own])
+        try:
+            change = solve_scaled(pose, normal.right[:, own])
+        except np.linalg.LinAlgError:
+            damping = 10.0 * damping
+            continue
         still = np.zeros_like(state.visits)
         trial = retract(problem, state, np.zeros_like(state.theta), change, still)
         trial_costs = view_costs(problem, trial)

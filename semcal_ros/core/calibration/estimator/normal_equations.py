@@ -48,10 +48,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of each view, (V, P, P) and (V, P).
-
-    The order is: camera and shared unknowns (C), visit, pose.
-    """
+    """Normal equations of each view, (V, P, P) and (V, P), in the columns of the problem's layout."""
 
     matrix: Array
     right: Array
@@ -62,10 +59,10 @@ class NormalEquations:
 def normal_equations(
     problem: Problem, state: State, *, poses_only: bool = False
 ) -> NormalEquations:
-    """Compute the Huber-weighted normal equations of every view, with the priors of its pose.
+    """Compute the Huber-weighted normal equations of every view, with all that is known of the view.
 
-    With ``poses_only`` the observations fill only the columns of the pose, which takes a third of
-    the time.
+    With ``poses_only`` the corners fill only the columns of the view's own unknowns, which takes a third of the time.
+    What is known of visits and of theta comes in when these are eliminated and reduced.
     """
     corners = corner_rows(problem, state, poses_only=poses_only)
     priors = stack_rows(problem.layout, view_residuals(problem, state))
@@ -84,7 +81,7 @@ def normal_equations(
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Normal equations without poses and visits, and the way back to these.
+    """Normal equations without the unknowns of views (here: poses) and visits, and the way back to these.
 
     Attributes
     ----------

@@ -197,6 +197,8 @@ def _view_costs(problem: Problem, result: BundleResult) -> Array:
     square = weighted_squares(problem, result)
     known = view_residuals(problem, result.state).values()
     own = np.sum([np.sum(residual.values**2, axis=1) for residual in known], axis=0)
+    # A pose that moves corners to where the camera shows nothing is none.
+    square = np.where(result.lost, np.inf, square)
     return np.bincount(problem.view_of_point, weights=square) + own
 
 

@@ -129,7 +129,7 @@ class Priors:
 class Setup:
     """Everything common to all problems over one set of views, in order of their magnifications.
 
-    With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.estimator.normal_equations.Problem`),
+    With ``shared`` unknowns (see :class:`~semcal_ros.core.calibration.estimator.blocks.Problem`),
     the problems also have the effects of visits and of drift within the images.
     ``stage_rotation_rad`` is where the constant error of the stage's rotation starts. ``tempering`` is by how much less
     than stated the readings of the stage are believed, as long as the corners are: else a wrong reading would win.

@@ -14,11 +14,10 @@
 
 """What an adjustment makes small: residuals of unit variance, and their derivatives by named blocks of unknowns.
 
-There are two kinds. Each corner has one of two coordinates, observed minus projected
-(:func:`corner_rows`); it is the only kind with a robust loss. And what is known of a view beside its
-corners is a :class:`Residual`: its height, its drift, the shape of its lattice, and the orientation
-that a stage says or that is untilted. Those of visits and of theta are independent priors of their
-unknowns, and need no derivatives.
+There are two kinds. A corner has a residual in x and in y, observed minus projected
+(:func:`corner_rows`), with a robust loss. What else is known of a view is a :class:`Residual`: its
+height, its drift, the shape of its lattice, and its orientation, from the stage or because it is
+untilted. The priors of visits and of theta are independent of each other and need no derivatives.
 
 To add a residual of a view, write a function like :func:`height_residual` and name it in
 :data:`VIEW_RESIDUALS`: solver, covariance and tests go through that table.
@@ -77,8 +76,8 @@ class Residual:
     values
         (V, r) observed or presumed minus predicted.
     by
-        (V, r, size) derivatives of the prediction by blocks of unknowns; of a block that a problem does not have,
-        they are left out.
+        (V, r, size) derivatives of the prediction by blocks of unknowns, divided by the same sigmas; those by a block
+        that a problem does not have are left out.
     """
 
     values: Array
@@ -86,7 +85,7 @@ class Residual:
 
 
 def height_residual(problem: Problem, state: State) -> Residual:
-    """The specimen's plane crosses the beam at the height of the visit, as far as the stage does not move it."""
+    """The specimen's plane crosses the beam at the height of its visit, but for what a tilt of the stage changes."""
     scan = np.zeros(len(problem.group))
     if problem.attitudes is not None:
         scan = problem.attitudes.scan_rotation_rad
@@ -172,9 +171,6 @@ def _shaped_grid(problem: Problem, state: State) -> Array:
     if len(state.lattices):
         own = state.lattices[problem.view_of_point]
         stretch, shear = stretch + own[:, 0], shear + own[:, 1]
-    size = np.zeros(len(x))
-    for name, shown in _square_classes(problem).items():
-        size += shown * problem.shared_values(state.theta, [name])
     grid = np.stack(
         [
             x * (1.0 + 0.5 * stretch) + shear * y,
@@ -183,7 +179,15 @@ def _shaped_grid(problem: Problem, state: State) -> Array:
         ],
         axis=1,
     )
-    return grid * (1.0 + size[:, None])
+    return grid * _square_sizes(problem, state)[:, None]
+
+
+def _square_sizes(problem: Problem, state: State) -> Array:
+    """Return the (N,) factors by which the squares are larger than stated."""
+    size = np.ones(len(problem.board_m))
+    for name, shown in _square_classes(problem).items():
+        size += shown * problem.shared_values(state.theta, [name])
+    return size
 
 
 def _square_classes(problem: Problem) -> dict[str, Array]:
@@ -300,9 +304,10 @@ class _CornerDerivatives:
 
     @cached_property
     def by_grid_point(self) -> Array:
-        """(2, 3, N) by the points of the grid, in its axes."""
+        """(2, 3, N) by the points of the grid before their squares grow, in its axes."""
         rotations = self.state.rotations[self.problem.view_of_point]
-        return np.einsum("kin,nij->kjn", self.by_point, rotations)
+        by_point = np.einsum("kin,nij->kjn", self.by_point, rotations)
+        return np.asarray(by_point * _square_sizes(self.problem, self.state))
 
     def by_camera(self) -> Array:
         """By the parameters of the camera."""
@@ -318,6 +323,7 @@ class _CornerDerivatives:
         """By the relative sizes of the squares."""
         grid = _shaped_grid(self.problem, self.state)
         along = np.einsum("kjn,nj->kn", self.by_grid_point, grid)
+        along = along / _square_sizes(self.problem, self.state) ** 2
         return np.stack([along * shown for shown in _square_classes(self.problem).values()], axis=1)
 
     def by_visit_scale(self) -> Array:

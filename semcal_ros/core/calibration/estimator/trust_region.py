@@ -14,8 +14,8 @@
 
 """Descent to a minimum of a sum of squares: Levenberg-Marquardt, with any kind of state.
 
-Every step that is taken lowers the cost; one that does not is tried again with a larger damping,
-which makes it shorter.
+No step that is taken raises the cost; one that would is tried again with a larger damping, which
+makes it shorter.
 
 Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4.
 """
@@ -34,10 +34,10 @@ __all__ = ["FIRST_DAMPING", "MIN_DAMPING", "Descent", "DescentStatus", "Step", "
 S = TypeVar("S")
 
 FIRST_DAMPING, MIN_DAMPING = 1e-5, 1e-12
-"""Damping relative to the diagonal: nearly Gauss-Newton at the start, and none at the least."""
-# Damping of steps that have no length.
+"""Damping relative to the diagonal: at the start it is nearly a Gauss-Newton step, and at the least it is one."""
+# With this damping a step has no length left.
 _MAX_DAMPING = 1e10
-# Ratio of the tolerance for the decrease that the quadratic model still predicts: where it fails, this says little.
+# How many tolerances the quadratic model may still predict at the end: where it fails, its prediction says little.
 _PREDICTED = 1e3
 
 
@@ -98,7 +98,8 @@ def descend(
         From a state to a function from the damping to the step, or to None where rounding leaves no equations that
         can be solved.
     max_iterations, tolerance
-        The descent ends at this number of steps, or when the cost falls by less than this part of it.
+        The descent ends at this number of steps, or when a step lowers the cost by less than this part of it and
+        predicts little more.
     """
     damping, relative = FIRST_DAMPING, 0.0
     for iteration in range(1, max_iterations + 1):
@@ -107,7 +108,9 @@ def descend(
         while (step is None or not step.cost <= cost) and damping < _MAX_DAMPING:
             damping *= 10.0
             step = solve(damping)
-        if step is None or not step.cost <= cost:
+        if step is None:
+            return Descent(state, cost, iteration, DescentStatus.SINGULAR, relative)
+        if not step.cost <= cost:
             return Descent(state, cost, iteration, DescentStatus.NO_DESCENT, relative)
         decrease, cost, state = cost - step.cost, step.cost, step.state
         damping = max(0.1 * damping, MIN_DAMPING)
