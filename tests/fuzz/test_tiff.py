@@ -338,7 +338,9 @@ def _odd_files(draw: st.DrawFn) -> bytes:
         elif how == "code":
             other = draw(
                 st.sampled_from([254, 258, 259, 262, 266, 274, 277, 284, 317, 320, 322, 323, 324])
-                | st.sampled_from([325, 330, 338, 339, 347, 32997, 34118, 34680, 34682, 50431, 700])
+                | st.sampled_from(
+                    [325, 330, 338, 339, 347, 32997, 33560, 34118, 34680, 34682, 50431, 700]
+                )
             )
             entries.append(
                 (

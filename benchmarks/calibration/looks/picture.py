@@ -53,7 +53,9 @@ FEWEST_POINTS = 16
 LARGEST_TILT_RAD = np.radians(50.0)
 LEAST_BLUR_PX, LARGEST_BLUR_PX, LARGEST_BLUR = 0.5, 4.0, 0.12
 # Distance of a whole motif from noise, in sigmas; 5 is what is just seen anywhere.
-LEAST_VISIBILITY = 8.0
+LEAST_VISIBILITY = 12.0
+# The arms of crosses, foreshortened, in sigmas of the blur: with less they look like dots.
+LEAST_ARM = 5.0
 # Of the amplifier, in electrons.
 AMPLIFIER_NOISE = 0.3
 # Bright level with gradients and texture, in units of that without.
@@ -294,10 +296,15 @@ def _lay_out(look: Look) -> _Layout:
     return _Layout(low, there, breaks)
 
 
-def _judge_points(look: Look, ij: Indices) -> tuple[Flags, Flags]:
+def _judge_points(look: Look, ij: Indices, between: bool) -> tuple[Flags, Flags]:
     """(n,) whether points of the lattice are whole, and whether something of them is there."""
     layout = _lay_out(look)
     i, j = ij.T
+    if between and look.kind != "mesh":
+        number = np.sum([layout.has(i + a, j + b) for a in (0, 1) for b in (0, 1)], axis=0)
+        return number == 4, number >= 2
+    if between:
+        return layout.has(i, j), layout.has(i, j)
     if look.kind in ("chess", "mesh"):
         around = [layout.has(i - a, j - b) for a in (0, 1) for b in (0, 1)]
         number = np.sum(around, axis=0)
@@ -313,13 +320,18 @@ def _judge_points(look: Look, ij: Indices) -> tuple[Flags, Flags]:
     return there & ~broken & np.all(around, axis=0), there
 
 
-def find_truth(look: Look) -> Truth:
-    """The points of the lattice that can be seen."""
+def find_truth(look: Look, between: bool = False) -> Truth:
+    """The points of the lattice that can be seen.
+
+    With ``between``, those half a pitch further along both axes: crossings of the gaps between pads, and middles of the
+    openings between lines.
+    """
+    half = 0.5 if between else 0.0
     layout = _lay_out(look)
     shape = layout.there.shape
     i, j = np.meshgrid(*(np.arange(2, n - 2) for n in shape), indexing="ij")
     ij = np.stack([i.ravel(), j.ravel()], axis=1) + layout.low
-    xy = look.project(ij.astype(np.float64))
+    xy = look.project(ij + half)
     size = np.array([look.width, look.height])
     near = np.all((xy > -0.5) & (xy < size - 0.5), axis=1)
     ij, xy = ij[near], xy[near]
@@ -328,9 +340,9 @@ def find_truth(look: Look) -> Truth:
     inside = np.all((xy > 3.0) & (xy < size - 4.0), axis=1)
     for a in (-reach, reach):
         for b in (-reach, reach):
-            corner = look.project(ij + [a, b])
+            corner = look.project(ij + half + [a, b])
             inside &= np.all((corner > -0.5) & (corner < size - 0.5), axis=1)
-    whole, there = _judge_points(look, ij)
+    whole, there = _judge_points(look, ij, between)
     for blob in look.dust:
         off = xy - [blob.x, blob.y]
         edge = blob.reach_px(off[:, 0], off[:, 1]) + 2.0 * look.blur_px
@@ -525,7 +537,10 @@ def draw_look(seed: int, index: int) -> Look:
     partial, number = either(0.2), int(rng.integers(0, 16))
     while True:
         pitch = ratio(least, LARGEST_PITCH * min(width, height))
-        blur = ratio(LEAST_BLUR_PX, min(LARGEST_BLUR_PX, LARGEST_BLUR * pitch))
+        largest = LARGEST_BLUR * pitch
+        if kind == "crosses":
+            largest = min(largest, length * pitch * np.cos(look.tilt_rad) / LEAST_ARM)
+        blur = ratio(LEAST_BLUR_PX, max(LEAST_BLUR_PX, min(LARGEST_BLUR_PX, largest)))
         look = replace(look, pitch_px=pitch, blur_px=blur)
         look = _draw_region(look, rng) if partial else look
         look = replace(look, dust=tuple(_draw_blob(look, rng) for _ in range(number)))
@@ -640,6 +655,17 @@ def _field(rng: np.random.Generator, shape: tuple[int, int], length_px: float) -
     return np.asarray(field[: shape[0], : shape[1]], dtype=np.float32)
 
 
+def _covered(px: Array, across_x: Array, across_y: Array) -> Array:
+    """Part of a pixel's square beyond a straight edge at this distance, with the normal (across_x, across_y)."""
+    # A box as wide as one side of the square appears from the edge, and one as wide as the other: a trapezium.
+    wide, narrow = np.maximum(across_x, across_y), np.maximum(np.minimum(across_x, across_y), 1e-3)
+    outer, inner = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
+    near = np.clip(-px, -outer, outer)
+    total = (near + outer) ** 2 - np.maximum(near + inner, 0.0) ** 2
+    total -= np.maximum(near - inner, 0.0) ** 2
+    return total / (2.0 * wide * narrow)
+
+
 def _draw_rows(
     look: Look, layout: _Layout, x: Array, y: Array, rough: tuple[Single, Single, Single]
 ) -> Array:
@@ -650,9 +676,10 @@ def _draw_rows(
     scale = look.roughness / np.sqrt(2.0)
     u, v = u + scale * rough[0], v + scale * rough[1]
     distance, by_u, by_v = _SHAPES[look.kind](look, layout, u, v)
-    slope = np.hypot(by_u * u_x + by_v * v_x, by_u * u_y + by_v * v_y)
-    px = (distance + scale * rough[2]) / np.maximum(slope, 1e-9)
-    part = np.clip(0.5 - px, 0.0, 1.0)
+    by_x, by_y = by_u * u_x + by_v * v_x, by_u * u_y + by_v * v_y
+    slope = np.maximum(np.hypot(by_x, by_y), 1e-9)
+    px = (distance + scale * rough[2]) / slope
+    part = _covered(px, np.abs(by_x) / slope, np.abs(by_y) / slope)
     if look.inverted:
         part = 1.0 - part
     if look.rim > 0.0:

@@ -30,7 +30,16 @@ import tifffile
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff import hitachi, jeol, phenom, tescan, thermo_fisher, xml_tag, zeiss
+from semcal_ros.files.tiff import (
+    hitachi,
+    jeol,
+    olympus,
+    phenom,
+    tescan,
+    thermo_fisher,
+    xml_tag,
+    zeiss,
+)
 from semcal_ros.files.tiff.imagej import (
     imagej_channels,
     imagej_entries,
@@ -108,6 +117,8 @@ def _tag_settings(
         # Tag 34680 of newer programs holds something else, which has no sections.
         if isinstance(value, dict) and value:
             return thermo_fisher.thermo_fisher_settings(path, value, size_px)
+    if olympus.TAG in tags and isinstance(tags[olympus.TAG].value, dict):
+        return olympus.olympus_settings(path, tags[olympus.TAG].value)
     if xml_tag.TAG in tags:
         return _xml_settings(path, tags[xml_tag.TAG].value, size_px)
     if tescan.TAG in tags:
@@ -202,8 +213,8 @@ def _settings(path: Path, page: tifffile.TiffPage, size_px: tuple[int, int]) -> 
         return settings
     raise TiffError(
         f"{path.name} has no metadata of a known SEM",
-        expected="tag 34118 (Zeiss), 34680, 34682 or 34683 (Thermo Fisher, Phenom), 50431 (TESCAN), the scale of "
-        "ImageJ, or a .txt (JEOL, Hitachi) or .hdr (TESCAN) file beside it",
+        expected="tag 34118 (Zeiss), 34680, 34682 or 34683 (Thermo Fisher, Phenom), 50431 (TESCAN), 33560 (Olympus), "
+        "the scale of ImageJ, or a .txt (JEOL, Hitachi) or .hdr (TESCAN) file beside it",
         do="use the microscope's original file, not a converted copy",
     )
 

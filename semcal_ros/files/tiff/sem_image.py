@@ -39,8 +39,8 @@ class Conditions:
     Parameters
     ----------
     maker
-        ``zeiss``, ``thermo_fisher``, ``tescan``, ``jeol``, ``hitachi``, ``phenom`` or, for a copy that ImageJ saved
-        without the maker's metadata, ``imagej``.
+        ``zeiss``, ``thermo_fisher``, ``tescan``, ``jeol``, ``hitachi``, ``phenom``, ``olympus`` or, for a copy that
+        ImageJ saved without the maker's metadata, ``imagej``.
     model, serial_number
         Name and serial number of the microscope.
     detector

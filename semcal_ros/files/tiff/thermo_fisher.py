@@ -14,12 +14,13 @@
 
 """Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections, and XML in tag 34683.
 
-All of them are in SI units throughout: ``StageT`` and ``StageR`` of ``[Stage]`` and ``ScanRotation`` of the
-beam are in rad, and so are ``Tilt/Alpha``, ``Rotation`` and ``ScanRotation`` of the XML, whose root is ``Metadata``.
+But for the old XL series all of them are in SI units: ``StageT`` and ``StageR`` of ``[Stage]`` and
+``ScanRotation`` of the beam are in rad, and so are ``Tilt/Alpha``, ``Rotation`` and ``ScanRotation`` of the XML, whose root is ``Metadata``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,49 @@ def _check_is_a_scan(
         )
 
 
+# Width of the picture for which the XL series states a magnification, m, where a file does not say it: the longer
+# side of a Polaroid picture.
+_XL_WIDTH_M = 0.1133
+
+
+def _xl_settings(path: Path, tag: Mapping[str, Any], size_px: tuple[int, int]) -> VendorSettings:
+    """Read the settings of the XL series (FEI, formerly Philips), in mm, degrees and micro-degrees.
+
+    Its files have no pixel size. The magnification refers to a picture of ``SizeY`` mm, ``RatioXY`` times as wide.
+    """
+    vector, device = _section(tag, "Vector"), _section(tag, "ImageDevice")
+    magnification = positive(plain_number(vector.get("Magnification")))
+    height = positive(plain_number(device.get("SizeY")))
+    ratio = positive(plain_number(device.get("RatioXY")))
+    width_m = _XL_WIDTH_M if height is None or ratio is None else 1e-3 * height * ratio
+    pixel = None if magnification is None else width_m / magnification / size_px[0]
+    seen = vector.get("Magnification")
+    pixel_m = check_pixel_size(path, pixel, "the pixel size by Magnification in [Vector]", seen)
+    voltage, distance = plain_number(vector.get("HighTension")), plain_number(vector.get("FWD"))
+    scan, tilt = plain_number(vector.get("ScanRotation")), plain_number(vector.get("SpecimenTilt"))
+    rotation = plain_number(vector.get("SpecimenRotation"))
+    kind = plain_number(_section(tag, "DatabarData").get("iImageType"))
+    return VendorSettings(
+        maker="thermo_fisher",
+        model="XL",
+        serial_number=str(_section(tag, "MachineData").get("MachineNumber", "")),
+        beam={1.0: "electron", 2.0: "ion"}.get(kind or 0.0, ""),
+        pixel_size_m=pixel_m,
+        pixel_size_y_m=pixel_m,
+        displayed_magnification=magnification,
+        display_width_assumed=True,
+        acceleration_voltage_v=None if voltage is None else abs(voltage),
+        working_distance_m=None if distance is None else 1e-3 * distance,
+        scan_rotation_rad=None if scan is None else math.radians(scan),
+        stage_tilt_rad=None if tilt is None else math.radians(1e-6 * tilt),
+        stage_rotation_rad=None if rotation is None else math.radians(1e-6 * rotation),
+        notes=(
+            f"the pixel size follows from the magnification and a picture {1e3 * width_m:.1f} mm wide: "
+            "it may be wrong by some per cent",
+        ),
+    )
+
+
 def thermo_fisher_settings(
     path: Path, tag: Mapping[str, Any], size_px: tuple[int, int]
 ) -> VendorSettings:
@@ -135,6 +179,8 @@ def thermo_fisher_settings(
     TiffError
         The pixel size is missing or unusable, or the size of the file contradicts the tag.
     """
+    if "Vector" in tag:
+        return _xl_settings(path, tag, size_px)
     stage = _section(tag, "Stage")
     beam, scan = _active(tag, "Beam", "EBeam"), _active(tag, "Scan", "EScan")
     common = _section(tag, "Scan")

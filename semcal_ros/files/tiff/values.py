@@ -29,6 +29,7 @@ __all__ = [
     "check_pixel_size",
     "duration",
     "first_date",
+    "is_credible_year",
     "plain_number",
     "positive",
     "quantity",
@@ -147,6 +148,11 @@ def check_pixel_size(path: Path, value: float | None, key: str, seen: object) ->
     return value
 
 
+def is_credible_year(year: int) -> bool:
+    """Whether the 32-bit seconds of a ROS stamp can hold it."""
+    return _YEARS[0] <= year <= _YEARS[1]
+
+
 def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
     """Return the first credible date that one of the (text, format) pairs gives, or None.
 
@@ -157,7 +163,7 @@ def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
             found = datetime.strptime(" ".join(text.split()), pattern)
         except ValueError:
             continue
-        if _YEARS[0] <= found.year <= _YEARS[1]:
+        if is_credible_year(found.year):
             return found
     return None
 

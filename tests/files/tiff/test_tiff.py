@@ -29,6 +29,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
+from semcal_ros.files.tiff.olympus import olympus_settings
 from semcal_ros.files.tiff.read import read_sem_settings, read_sem_tiff
 from tests.helpers.sem_files import zeiss_text
 
@@ -291,6 +292,53 @@ def test_thermo_fisher_refuses_a_resized_copy(tmp_path: Path) -> None:
     path = write_tagged(tmp_path / "f.tif", 34682, fei_text(columns=64))
     with pytest.raises(TiffError, match="original file"):
         read_sem_tiff(path)
+
+
+def test_the_xl_series_has_a_magnification_and_no_pixel_size(tmp_path: Path) -> None:
+    """10000x of a picture 85 mm high and 1.333 times as wide, in 32 columns."""
+    text = "\r\n".join(
+        [
+            "[DatabarData]", "flAccV=5000", "iImageType=2",
+            "[ImageDevice]", "SizeY=85", "RatioXY=1.333",
+            "[MachineData]", "MachineNumber=688",
+            "[Vector]", "Magnification=10000", "HighTension=5000", "FWD=16.989", "ScanRotation=180",
+            "SpecimenRotation=288000000", "SpecimenTilt=7000000",
+        ]
+    ).encode("ascii") + b"\x00"  # fmt: skip
+    path = tmp_path / "xl.tif"
+    tifffile.imwrite(path, PIXELS, extratags=[(34680, 2, len(text), text, True)])
+    sem = read_sem_tiff(path)
+    own = sem.settings
+    assert sem.pixel_size_m == pytest.approx(85e-3 * 1.333 / 1e4 / 32, rel=1e-12)
+    assert own.display_width_assumed
+    assert own.displayed_magnification == 10000.0
+    assert (own.maker, own.model, own.serial_number, own.beam) == (
+        "thermo_fisher",
+        "XL",
+        "688",
+        "ion",
+    )
+    assert (own.acceleration_voltage_v, own.working_distance_m) == (5e3, pytest.approx(16.989e-3))
+    angles = own.scan_rotation_rad, own.stage_rotation_rad, own.stage_tilt_rad
+    assert np.degrees(angles) == pytest.approx([180.0, 288.0, 7.0])
+    assert any("wrong by some per cent" in note for note in sem.notes)
+
+
+def test_olympus(tmp_path: Path) -> None:
+    tag = {
+        "datetime": datetime(2008, 2, 20, 10, 54),
+        "pixelsizex": 4.6327e-08,
+        "pixelsizey": 4.5e-08,
+        "magnification": 220.0,
+        "cameraname": "Sirion ",
+    }
+    own = olympus_settings(tmp_path / "sis.tif", tag)
+    assert (own.maker, own.pixel_size_m, own.pixel_size_y_m) == ("olympus", 4.6327e-08, 4.5e-08)
+    assert (own.displayed_magnification, own.detector) == (220.0, "Sirion")
+    assert own.time == datetime(2008, 2, 20, 10, 54)
+    assert own.notes == ("pixels are not square: 4.6327e-08 m wide, 4.5e-08 m high",)
+    with pytest.raises(TiffError, match="pixelsizex in tag 33560"):
+        olympus_settings(tmp_path / "sis.tif", {**tag, "pixelsizex": 0.0})
 
 
 def test_tescan_in_sixteen_bits(tmp_path: Path) -> None:
