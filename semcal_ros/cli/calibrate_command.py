@@ -42,7 +42,7 @@ from semcal_ros.core.calibration.options import (
     MethodOptions,
 )
 from semcal_ros.core.calibration.paper.pda import focal_length_and_skew, prime
-from semcal_ros.core.corners import PATTERN_NAMES
+from semcal_ros.core.corners import PATTERN_NAMES, describe_odds
 from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
@@ -200,8 +200,10 @@ def _echo_result(done: RecordingCalibration) -> None:
     if statistics["held_out_rms_px"] is not None:
         click.echo("held out: calibrated without that magnification; * is extrapolated")
     patterns = sorted({PATTERN_NAMES[view.detection.pattern] for view in done.collected.found})
+    odds = [view.detection.odds for view in done.collected.found if view.detection.odds > 0.0]
     if patterns:
-        click.echo(f"the grid: {' and '.join(patterns)}")
+        least = f", by odds of {describe_odds(min(odds))}" if odds else ""
+        click.echo(f"the grid: {' and '.join(patterns)}{least}")
     click.echo(
         f"{statistics['views']} of {counted(total, 'view')}, {counted(statistics['corners'], 'corner')}, "
         f"method {method}: RMS {statistics['rms_px']:.4f} px"

@@ -50,14 +50,14 @@ def grid_options(command: Command) -> Command:
             type=click.Choice(PATTERNS),
             default="auto",
             show_default=True,
-            help="What the grid consists of: chess squares, dots or holes, or crossed lines.",
+            help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
         ),
         click.option(
             "--untilted",
             callback=_parse_untilted,
             default="auto",
             show_default=True,
-            metavar="auto|none|N,N,...",
+            metavar="auto|all|none|N,N,...",
             help="Frames without tilt, by number or by file name, if no stage says the tilts.",
         ),
     )

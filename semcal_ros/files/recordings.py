@@ -402,6 +402,11 @@ class Recording(ABC):
         """Where the pixel size comes from, in words."""
         return self._describe_display()
 
+    @property
+    def pixel_size_stated(self) -> bool:
+        """Whether files or user state the size of a pixel, rather than a magnification on some display."""
+        return False
+
     def _describe_display(self, *, given: bool = False) -> str:
         source = "as given" if given else f"of the configuration {self.config.name}"
         return f"display width {self.config.display_width_m:g} m {source}"
@@ -571,6 +576,10 @@ class _BagRecording(Recording):
             return f"recorded magnifications, {self._describe_display(given=self._given.display_width_m is not None)}"
         return f"the recorded {self.config.magnification.quantity.replace('_', ' ')}"
 
+    @property
+    def pixel_size_stated(self) -> bool:
+        return self._given.pixel_size_m is not None
+
     def _frames(self) -> Iterator[RecordedFrame]:
         return self._read(lambda raw, _index: self._frame(raw))
 
@@ -704,6 +713,13 @@ class _ImageRecording(Recording):
         if self._given.magnification is not None:
             return f"the magnification given, {self._describe_display(given=self._given.display_width_m is not None)}"
         return "the pixel size in the files"
+
+    @property
+    def pixel_size_stated(self) -> bool:
+        if self._given.pixel_size_m is not None or self._given.magnification is not None:
+            return self._given.pixel_size_m is not None
+        settings = (image.page.settings for image in self._series.images)
+        return all(own is not None and not own.display_width_assumed for own in settings)
 
     def _outlines(self, wanted: Container[int]) -> Iterator[FrameOutline]:
         chosen = {id(image) for k, image in enumerate(self._series.images) if k in wanted}

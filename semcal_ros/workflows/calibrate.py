@@ -33,7 +33,7 @@ from semcal_ros.core.calibration.nominal_scale import (
     is_scale_far,
 )
 from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
-from semcal_ros.core.calibration.pipeline import calibrate_views
+from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import (
     FoundView,
@@ -43,7 +43,13 @@ from semcal_ros.core.calibration.views import (
     assign_squares,
 )
 from semcal_ros.core.camera.provenance import Provenance
-from semcal_ros.core.errors import CalibrationError, InvalidValueError, SemcalError
+from semcal_ros.core.corners import PATTERN_NAMES
+from semcal_ros.core.errors import (
+    CalibrationError,
+    InvalidValueError,
+    SemcalError,
+    UnusableCalibrationError,
+)
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
@@ -51,6 +57,7 @@ from semcal_ros.workflows.find_grid import (
     CollectedViews,
     collect_views,
     find_views,
+    group_reasons,
     named_frames,
 )
 from semcal_ros.workflows.inputs import (
@@ -80,6 +87,10 @@ __all__ = [
 
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
+# Microscopes state their pixel sizes within some per cent.
+_STATED_WITHIN = 1.1
+# Ratios of the scales, as logarithms, that are near enough to the square root of 2.
+_ROOT_TWO = 0.03
 # What numerical code raises on degenerate views.
 _NUMERIC = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 # Views that must agree before a recording is refused without the others: three that are misread are not all misread
@@ -142,6 +153,35 @@ class _FirstViews:
         if np.all(is_scale_far((spacing / nominal)[:, None] / self._squares_m)):
             assignment = assign_squares(spacing, nominal, self._squares_m.tolist())
             _check_scale(assignment, self._views, self._display_width_m)
+
+
+def _check_stated_scale(collected: CollectedViews) -> None:
+    """Refuse views that all contradict the pixel sizes that their files, or the user, state.
+
+    Raises
+    ------
+    UnusableCalibrationError
+        If the grid of no view has the size that the pixel sizes say, within ten per cent.
+    """
+    factor, spread = collected.assignment.scale_factor, collected.assignment.spread
+    if abs(np.log(factor)) - np.log(spread) <= np.log(_STATED_WITHIN):
+        return
+    seen = collected.found[0]
+    side = float(collected.assignment.square_m[0])
+    pattern = PATTERN_NAMES[seen.detection.pattern]
+    advice = "correct --squares (squares_m), or --pixel-size"
+    if abs(abs(np.log(factor)) - 0.5 * np.log(2.0)) < _ROOT_TWO:
+        advice += (
+            "; crosses or dots that are taken for a chess board, or the other way round, are off by the square root "
+            "of 2: state --pattern"
+        )
+    raise UnusableCalibrationError(
+        f"{pattern} {1e9 * side:.4g} nm apart by squares_m, and {1e9 * side * factor:.4g} nm apart by the stated pixel "
+        f"sizes (a factor of {factor:.4g}, the same in all views within {100.0 * (spread - 1.0):.2g} %)",
+        expected=f"two readings of the scale within {100.0 * (_STATED_WITHIN - 1.0):.0f} % of each other",
+        do=advice
+        + "; where the stated pixel sizes mean nothing, give --display-width or --magnification instead",
+    )
 
 
 def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[Finding]:
@@ -220,6 +260,7 @@ def calibrate_found(
     grid_certificate: str = "",
     provenance: Provenance | None = None,
     conditions: Mapping[str, Conditions | None] | None = None,
+    pixel_size_stated: bool = False,
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
 ) -> RecordingCalibration:
     """Calibrate from found corners.
@@ -227,15 +268,27 @@ def calibrate_found(
     Views that ``options.untilted`` lists may be named by their number or file, too.
     ``grid_certificate`` is kept in the statistics. ``provenance`` is what is known of the origin,
     ``conditions`` how each view was taken, by its name; the names and conditions of the views that are used are
-    added, and the date. ``on_stage`` is called with what begins and the
+    added, and the date. ``pixel_size_stated`` says that the magnifications come from pixel sizes in the files, or
+    from the user. ``on_stage`` is called with what begins and the
     fraction of the work that is done.
     """
     options = options or CalibrationOptions()
     if found:
         options = replace(options, untilted=name_untilted(options.untilted, found))
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
+    few = len(collected.views) < FEWEST_VIEWS and options.untilted != "all"
+    if few and collected.rejected:
+        count = len(collected.views) + len(collected.rejected)
+        raise CalibrationError(
+            f"a calibration from {counted(len(collected.views), 'view')} of {counted(count, 'image')} "
+            f"({group_reasons(collected.rejected)})",
+            expected=f"at least {FEWEST_VIEWS} views of the grid in different directions, or views whose tilt is known",
+            do="mend what was refused, add views, or say that the grid was not tilted (--untilted all)",
+        )
     _check_scale(collected.assignment, collected.found, display_width_m)
     factor = collected.assignment.scale_factor
+    if pixel_size_stated:
+        _check_stated_scale(collected)
     check_square_sides(factor, display_width_m)
 
     def calibrated(views: Sequence[GridView]) -> CalibrationResult:
@@ -345,7 +398,7 @@ def calibrate_recording(
             pattern=pattern,
             on_found=_FirstViews(chosen.display_width_m, chosen.squares_m).add,
         )
-        notes = recording.notes
+        notes, stated = recording.notes, recording.pixel_size_stated
     done = calibrate_found(
         found,
         rejected,
@@ -353,6 +406,7 @@ def calibrate_recording(
         squares_m=chosen.squares_m,
         options=options_for(chosen, options),
         grid_certificate=chosen.grid_certificate,
+        pixel_size_stated=stated,
         on_stage=show_stage,
     )
     used = {view.name: frames[view.name] for view in done.result.views}

@@ -67,10 +67,12 @@ Progress = Callable[[int], object]
 _MUCH_LONGER, _AS_LONG = 3.0, 0.5
 # Fewer images are processed before other processes have started.
 _TOO_FEW_TO_SHARE = 12
-# In place of an image that is on its way.
+# Reasons that a message about refused views gives.
+_MOST_REASONS = 4
 # Frames that this process takes itself where a grid can end the search, before it starts others that would not end
 # with it.
 _FIRST_HERE = 4
+# In place of an image that is on its way.
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 
 
@@ -235,6 +237,18 @@ def find_views(
     return found, [view for view in views if isinstance(view, RejectedView)]
 
 
+def group_reasons(rejected: Sequence[RejectedView]) -> str:
+    """Say why views were refused, the most frequent reasons first, with the number of views and one of their names."""
+    counts = Counter(view.reason for view in rejected)
+    example = {view.reason: view.name for view in reversed(rejected)}
+    texts = [
+        f"{number} x {reason}" if number > 1 else f"{example[reason]}: {reason}"
+        for reason, number in counts.most_common(_MOST_REASONS)
+    ]
+    left = len(counts) - len(texts)
+    return "; ".join(texts) + (f"; and {counted(left, 'other reason')}" if left > 0 else "")
+
+
 def collect_views(
     found: Sequence[FoundView],
     rejected: Sequence[RejectedView],
@@ -250,12 +264,11 @@ def collect_views(
         If no view is left; the message gives the most frequent reason.
     """
     if not found:
-        reasons = Counter(r.reason for r in rejected).most_common(1)
         other_pattern = any(r.rejection.status is LatticeStatus.OTHER_PATTERN for r in rejected)
         raise CalibrationError(
             f"no usable view among {counted(len(rejected), 'image')}"
-            + (f" (mostly: {reasons[0][0]})" if reasons else ""),
-            expected="images of a grid: a chess board, dots or crossed lines",
+            + (f" ({group_reasons(rejected)})" if rejected else ""),
+            expected="images of a grid: a chess board, dots, crosses or crossed lines",
             do="choose --pattern auto, or the right images"
             if other_pattern
             else "check focus, contrast, and that the grid fills the image",

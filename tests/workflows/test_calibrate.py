@@ -101,7 +101,7 @@ def test_colour_images_are_read_by_their_luma(frames):
 def test_no_grid_at_all_is_refused_with_the_commonest_reason():
     blank = np.full((128, 128), 9, dtype=np.uint8)
     with pytest.raises(
-        CalibrationError, match=r"no usable view among 3 images .mostly: the image is blank"
+        CalibrationError, match=r"no usable view among 3 images .3 x the image is blank"
     ):
         calibrate([(blank, 1000.0)] * 3)
 

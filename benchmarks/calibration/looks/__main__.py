@@ -342,8 +342,10 @@ def show_one(own: Outcome, trace: str) -> None:
     """Print everything about one picture."""
     for part in (own.look, own):
         for field in fields(part):
-            if field.name != "look":
+            if field.name not in ("look", "dust"):
                 print(f"{field.name:18s} {getattr(part, field.name)}")
+    for blob in own.look.dust:
+        print(f"{'dust':18s} at ({blob.x:.0f}, {blob.y:.0f}), radius {blob.radius_px:.0f} px")
     print(f"{'visibility':18s} {visibility(own.look):.1f}")
     print(line_of(own))
     print(trace, end="")

@@ -39,9 +39,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import variance_factor
 from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
 from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
@@ -51,7 +53,7 @@ from semcal_ros.core.calibration.judgement.outliers import (
     find_wrong_tilts,
     measure_deviations,
 )
-from semcal_ros.core.calibration.method_fit import MethodFit
+from semcal_ros.core.calibration.method_fit import MethodFit, make_model
 from semcal_ros.core.calibration.nominal_scale import (
     advise_scale,
     check_nominal_scale,
@@ -68,7 +70,7 @@ from semcal_ros.core.calibration.stage import (
     stage_rotations,
 )
 from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start
-from semcal_ros.core.calibration.untilted import mark_untilted
+from semcal_ros.core.calibration.untilted import look_untilted, mark_untilted
 from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
 from semcal_ros.core.errors import (
     CalibrationError,
@@ -78,19 +80,22 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 
-__all__ = ["calibrate_views", "fit_joint"]
+__all__ = ["FEWEST_VIEWS", "calibrate_views", "fit_joint"]
 
-# Twice as many as determine a homography, so that there are residuals to judge a view by. Less than
-# the corner finder accepts (MINIMUM_CORNERS), since views may also come from other corner finders.
+# Twice as many as determine a homography, so that there are residuals to judge a view by.
 _MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
-_MIN_VIEWS = 3
+FEWEST_VIEWS = 3
 # Display widths and squares that are stated are right to some per cent, and tilts shorten lengths by as much.
 _TELLING_FACTOR = 1.2
 # A grid that seems to be so many times less regular than lithography makes it: perhaps one view is wrong.
 _IRREGULAR = 4.0
 # Views that are left out to see.
 _SUSPECTS = 3
+# Part of the untilted recordings that are seen to be such, and the part of the uncertainty that knowing it leaves.
+_CONFIDENCE, _MUCH_LESS = 0.95, 0.5
+# By how much more the corners may scatter with zero tilts than without, px and as a factor: no visible difference.
+_SAME_SCATTER_PX, _SAME_SCATTER = 0.002, 1.05
 # Part of the tilts that are refused, and of the angle to the stage's own, at which it is the axis that is wrong.
 _MOST_REFUSED, _MUCH_NEARER = 0.5, 0.3
 
@@ -135,7 +140,7 @@ def calibrate_views(
         For breakpoints outside the magnifications of the views.
     """
     options = options or CalibrationOptions()
-    ordered = _check_views(views)
+    ordered = _check_views(views, options)
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _check_breakpoints(options.breakpoints, magnifications)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
@@ -154,6 +159,8 @@ def calibrate_views(
         return judge(setup, fit, options, None, ())
     joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
     fit = describe_fit(setup, joint)
+    if options.untilted == "auto":
+        notes += _propose_untilted(setup, joint, fit)
     fit = replace(fit, findings=(*notes, *fit.findings))
     _check_converged(setup, fit, factor)
     on_stage("held-out magnifications", 0.95)
@@ -172,19 +179,24 @@ def fit_joint(
     return solve(select(started, residual), on_stage)
 
 
-def _check_views(views: Sequence[GridView]) -> tuple[GridView, ...]:
-    """Return the views in the order of their magnifications, or raise if they are too few."""
+def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tuple[GridView, ...]:
+    """Return the views in the order of their magnifications, or raise if they are too few.
+
+    One is enough if its tilt is known.
+    """
     if not views:
         raise CalibrationError(
             "no usable view",
             expected="images of a chess grid",
             do="check focus and contrast, and that the grid fills the image",
         )
-    if len(views) < _MIN_VIEWS:
+    named = set() if isinstance(options.untilted, str) else set(options.untilted)
+    known = options.untilted == "all" or all(v.has_stage_tilt or v.name in named for v in views)
+    if len(views) < FEWEST_VIEWS and not (known and options.method == "joint"):
         raise CalibrationError(
             f"a calibration from {counted(len(views), 'view')}",
-            expected=f"at least {_MIN_VIEWS} views of the grid in different directions",
-            do="add tilted views",
+            expected=f"at least {FEWEST_VIEWS} views of the grid in different directions, or views whose tilt is known",
+            do="add tilted views, or say that the grid was not tilted (--untilted all)",
         )
     for view in views:
         if (count := len(view.board_xy_m)) < _MIN_CORNERS:
@@ -269,6 +281,47 @@ def _fit_without_outliers(
         # At least two views of every magnification stay, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         setup = replace(setup, views=views)
+
+
+def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Finding]:
+    """Return a finding if zero tilts explain all views, and would make the scale much more certain.
+
+    They do where half the chi-square of the adjustment rises by no more than that of so many unknowns does by chance
+    once in twenty. They are not taken for granted: all views of a specimen on a slanted stub are tilted alike.
+    """
+    if any(v.untilted or v.has_stage_tilt for v in setup.views) or not look_untilted(setup):
+        return []
+    flat = add_shared_unknowns(mark_untilted(setup, "all"))
+    adjustment = joint.adjustment
+    try:
+        other = fit_joint(flat, "off")
+    except CalibrationError:
+        return []
+    factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
+    rise = 2.0 * (other.adjustment.result.cost - adjustment.result.cost) / factor
+    limit = float(chi2.ppf(_CONFIDENCE, 2 * len(setup.views)))
+    now, then = (_worst_sigma(setup, own) for own in (fit, describe_fit(flat, other)))
+    scatters = other.excess_px > _SAME_SCATTER * joint.excess_px + _SAME_SCATTER_PX
+    if scatters or rise > limit or then > _MUCH_LESS * now:
+        return []
+    return [
+        Finding(
+            f"scale: none of the {counted(len(setup.views), 'view')} looks tilted (zero tilts raise chi-square by "
+            f"{max(rise, 0.0):.0f}, by chance up to {limit:.0f}): if none is, --untilted all lowers the uncertainty "
+            f"of nm per px from {100.0 * now:.2g} % to {100.0 * then:.2g} %",
+            cost_relative=now,
+        )
+    ]
+
+
+def _worst_sigma(setup: Setup, fit: MethodFit) -> float:
+    """Return the largest relative 1-sigma of the pixel sizes at the magnifications of the views."""
+    model = make_model(setup, fit.functions, fit.covariance, "joint", fit.residual)
+    sigmas = [
+        np.array(camera.pixel_size_sigma_m) / np.array(camera.pixel_size_m)
+        for camera in (model.at(float(g)) for g in setup.magnifications)
+    ]
+    return float(np.max(sigmas))
 
 
 def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:

@@ -21,13 +21,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.initial_values import initial_values
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["UNTILTED_MODES", "mark_untilted"]
+__all__ = ["UNTILTED_MODES", "look_untilted", "mark_untilted"]
 
-UNTILTED_MODES = ("auto", "none")
+UNTILTED_MODES = ("auto", "all", "none")
 
 # Apparent tilt below which a view may be untilted: an aspect ratio that is 1 % off looks like 8
 # degrees. Views up to twice as much could be either.
@@ -40,7 +41,7 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
     Parameters
     ----------
     untilted
-        Names of such views, ``"none"``, or ``"auto"``: the view with the least apparent tilt of
+        Names of such views, ``"all"``, ``"none"``, or ``"auto"``: the view with the least apparent tilt of
         each visit, if it looks untilted and every other view of the visit is clearly tilted.
 
     Raises
@@ -52,11 +53,13 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
         if untilted not in UNTILTED_MODES:
             raise InvalidValueError(
                 f"untilted {untilted!r}",
-                expected=f"{' or '.join(UNTILTED_MODES)}, or a list of names of views",
+                expected=f"{', '.join(UNTILTED_MODES)}, or a list of names of views",
             )
-        if untilted == "none" or any(v.has_stage_tilt for v in setup.views):
+        if untilted == "none" or (
+            untilted == "auto" and any(v.has_stage_tilt for v in setup.views)
+        ):
             return setup
-        chosen = _apparently_untilted(setup)
+        chosen = set(range(len(setup.views))) if untilted == "all" else _apparently_untilted(setup)
     else:
         names = {view.name for view in setup.views}
         unknown = [name for name in untilted if name not in names]
@@ -72,10 +75,20 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
     return replace(setup, views=views)
 
 
-def _apparently_untilted(setup: Setup) -> set[int]:
+def look_untilted(setup: Setup) -> bool:
+    """Whether no view looks tilted by more than an aspect ratio that is not 1 makes it look."""
+    return bool(np.all(_apparent_tilts(setup) < _FLAT_RAD))
+
+
+def _apparent_tilts(setup: Setup) -> Array:
+    """Return the (V,) tilts, rad, under a camera with square pixels and no distortion."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
-    tilt = np.arccos(np.clip(start.rotations[:, 2, 2], -1.0, 1.0))
+    return np.arccos(np.clip(start.rotations[:, 2, 2], -1.0, 1.0))
+
+
+def _apparently_untilted(setup: Setup) -> set[int]:
+    tilt = _apparent_tilts(setup)
     visit, groups = setup.visits
     chosen = set()
     for own in (np.flatnonzero(visit == j) for j in range(len(groups))):

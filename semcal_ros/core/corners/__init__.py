@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from semcal_ros.core.corners.detection import LatticeDetection, LatticeStatus, find_lattice
-from semcal_ros.core.corners.pattern import PATTERN_NAMES, PATTERNS, check_pattern
+from semcal_ros.core.corners.pattern import PATTERN_NAMES, PATTERNS, check_pattern, describe_odds
 
 __all__ = [
     "PATTERNS",
@@ -25,5 +25,6 @@ __all__ = [
     "LatticeDetection",
     "LatticeStatus",
     "check_pattern",
+    "describe_odds",
     "find_lattice",
 ]

@@ -48,6 +48,7 @@ from semcal_ros.core.corners.pattern import (
     Pattern,
     PatternChoice,
     check_pattern,
+    describe_odds,
 )
 from semcal_ros.core.corners.saddle import LatticeStatus, prepare_image, screen_image
 from semcal_ros.core.errors import Rejection
@@ -59,9 +60,11 @@ __all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice
 # best. The first suits the small squares of low magnifications; the largest one is bounded by the picture.
 _SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0, 168.0, 286.0, 486.0)
 _LARGEST_SCALE_PART = 0.075
-# A view with fewer corners is refused. The cubic in the search for the distortion centre has 10
-# terms per coordinate.
-MINIMUM_CORNERS = 12
+# A view with fewer corners is refused: twice as many as determine a homography, so that there are residuals to judge
+# it by.
+MINIMUM_CORNERS = 8
+# Points of a lattice that is looked at closely: less would be a seed and its neighbours.
+_LEAST_GROWN = 6
 # A lattice that covers this part of the image will not be surpassed at another scale.
 _FILLED = 0.6
 # Part of the expected points that pass beyond which no coarser picture shows more of them.
@@ -268,7 +271,7 @@ def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
             continue
         octave = max(0, int(np.log2(scale / _SCALES_PX[0])))
         corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
-        if corners is None or len(corners.ij) < MINIMUM_CORNERS // 2:
+        if corners is None or len(corners.ij) < _LEAST_GROWN:
             continue
         cells = bright_cells(image, corners)
         shapes = None if cells is None else fit_lattice_shapes(pyramid.level, cells)
@@ -321,14 +324,10 @@ def _likely_shapes(
             Rejection(
                 LatticeStatus.OTHER_PATTERN,
                 f"{PATTERN_NAMES[seen]}, not {PATTERN_NAMES[wanted]}, by odds of"
-                f" {_describe_odds(shapes.odds_against(wanted))}: set the pattern to {seen} or auto",
+                f" {describe_odds(shapes.odds_against(wanted))}: set the pattern to {seen} or auto",
             )
         ]
     return [shapes.get(wanted)]
-
-
-def _describe_odds(odds: float) -> str:
-    return "more than a million to one" if odds >= 1e6 else f"{odds:.0f} to one"
 
 
 def _measure(
@@ -424,7 +423,7 @@ def _judge(
             f"no grid: only {round(100 * points.quality)} % of the expected {what}"
             f" look like {what}",
         )
-    if points.foreign > max(_FOREIGN_MAX * len(points.ij), MINIMUM_CORNERS // 2):
+    if points.foreign > max(_FOREIGN_MAX * len(points.ij), _LEAST_GROWN):
         return Rejection(
             LatticeStatus.TWO_BOARDS,
             f"two boards: {points.foreign} {what} do not continue the lattice of the other"

@@ -42,6 +42,7 @@ __all__ = [
     "Pattern",
     "PatternChoice",
     "check_pattern",
+    "describe_odds",
     "fit_shapes",
 ]
 
@@ -73,7 +74,7 @@ BLURS: Array = np.linspace(0.0, 0.24, 13)
 # Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
 ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
 ARM_WIDTHS: Array = np.linspace(0.06, 0.3, 9)
-# Odds beyond this say nothing more.
+# A million: odds beyond this say nothing more.
 ODDS_MAX = 1e6
 
 
@@ -179,6 +180,13 @@ def check_pattern(pattern: str) -> PatternChoice:
     if pattern not in PATTERNS:
         raise InvalidValueError(f"pattern {pattern!r}", expected=", ".join(PATTERNS))
     return cast("PatternChoice", pattern)
+
+
+def describe_odds(odds: float) -> str:
+    """Put odds into words."""
+    if odds >= ODDS_MAX:
+        return "more than a million to one"
+    return f"{odds:.0f} to one" if odds >= 10.0 else f"{odds:.2g} to one"
 
 
 def _harmonics() -> tuple[Array, Array]:

@@ -15,7 +15,8 @@
 """Thermo Fisher (FEI): tags 34680 (FEI_SFEG) and 34682 (FEI_HELIOS), text in sections, and XML in tag 34683.
 
 But for the old XL series all of them are in SI units: ``StageT`` and ``StageR`` of ``[Stage]`` and
-``ScanRotation`` of the beam are in rad, and so are ``Tilt/Alpha``, ``Rotation`` and ``ScanRotation`` of the XML, whose root is ``Metadata``.
+``ScanRotation`` of the beam are in rad, and so are ``Tilt/Alpha``, ``Rotation`` and ``ScanRotation`` of
+the XML, whose root is ``Metadata``.
 """
 
 from __future__ import annotations

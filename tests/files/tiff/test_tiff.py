@@ -296,15 +296,11 @@ def test_thermo_fisher_refuses_a_resized_copy(tmp_path: Path) -> None:
 
 def test_the_xl_series_has_a_magnification_and_no_pixel_size(tmp_path: Path) -> None:
     """10000x of a picture 85 mm high and 1.333 times as wide, in 32 columns."""
-    text = "\r\n".join(
-        [
-            "[DatabarData]", "flAccV=5000", "iImageType=2",
-            "[ImageDevice]", "SizeY=85", "RatioXY=1.333",
-            "[MachineData]", "MachineNumber=688",
-            "[Vector]", "Magnification=10000", "HighTension=5000", "FWD=16.989", "ScanRotation=180",
-            "SpecimenRotation=288000000", "SpecimenTilt=7000000",
-        ]
-    ).encode("ascii") + b"\x00"  # fmt: skip
+    text = (
+        b"[DatabarData]\r\nflAccV=5000\r\niImageType=2\r\n[ImageDevice]\r\nSizeY=85\r\nRatioXY=1.333\r\n"
+        b"[MachineData]\r\nMachineNumber=688\r\n[Vector]\r\nMagnification=10000\r\nHighTension=5000\r\n"
+        b"FWD=16.989\r\nScanRotation=180\r\nSpecimenRotation=288000000\r\nSpecimenTilt=7000000\0"
+    )
     path = tmp_path / "xl.tif"
     tifffile.imwrite(path, PIXELS, extratags=[(34680, 2, len(text), text, True)])
     sem = read_sem_tiff(path)

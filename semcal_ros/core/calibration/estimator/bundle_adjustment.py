@@ -207,8 +207,8 @@ def refine(
     """Minimise the robust reprojection error from ``state``.
 
     With ``fixed_theta`` only the unknowns of the views move; the covariance is that of all unknowns. ``tolerance`` is
-    the relative decrease of the cost that ends the iteration. The function never raises for lack of convergence: the result says how
-    it ended.
+    the relative decrease of the cost that ends the iteration. The function never raises for lack of convergence: the
+    result says how it ended.
     """
     effects = problem.effects
     visits, views, lattices = 0, 0, 0

@@ -36,9 +36,11 @@ from semcal_ros.core.camera.plane_geometry import (
     normalising_similarity,
     transform_points,
 )
-from semcal_ros.core.corners.detection import MINIMUM_CORNERS
 
 __all__ = ["DistortionCentre", "find_distortion_centre"]
+
+# The cubic has 10 terms per coordinate.
+_FEWEST_CORNERS = 12
 
 
 # Level of the F-test: seven magnifications without distortion are all recognised in 99 % of cases.
@@ -108,13 +110,12 @@ def find_distortion_centre(
     Parameters
     ----------
     views
-        Views; those with fewer corners than the corner finder accepts are ignored, since the cubic
-        needs 10.
+        Views; those with fewer than 12 corners are ignored, since the cubic needs 10.
     tau_px
         With a value, the paper's threshold on the RMS homography error decides instead of the
         F-test.
     """
-    usable = [v for v in views if len(v.board_xy_m) >= MINIMUM_CORNERS]
+    usable = [v for v in views if len(v.board_xy_m) >= _FEWEST_CORNERS]
     mean = np.mean([v.image_xy.mean(axis=0) for v in views], axis=0)
     if not usable:
         return DistortionCentre(True, mean, float("nan"), float("nan"), 1.0)
