@@ -117,10 +117,12 @@ def test_the_pattern_of_most_views_is_that_of_the_grid():
     assert [v.name for v in collected.found] == ["0", "1"]
     assert [v.reason for v in collected.rejected] == ["a chess board, not dots as in most images"]
 
-    found, rejected = find_views(frames, processes=1, pattern="lines")
-    assert not found
-    with pytest.raises(CalibrationError, match=r"dots, not crossed lines.*--pattern auto"):
-        collect_views(found, rejected, display_width_m=0.12, squares_m=[8e-6])
+    found, rejected = find_views(frames, processes=1, pattern="chess")
+    assert [v.name for v in found] == ["2"]
+    with pytest.raises(
+        CalibrationError, match=r"dots, not a chess board, by odds of.*--pattern auto"
+    ):
+        collect_views([], rejected, display_width_m=0.12, squares_m=[8e-6])
 
 
 @pytest.fixture(scope="module")

@@ -73,8 +73,9 @@ LEAST_RATIO, LARGEST_RATIO = 0.7, 1.5
 REACH = 0.25
 MOST_FALSE_OF_LATTICE, LEAST_AGREEMENT, MOST_SPACING_ERROR = 0.25, 0.95, 0.1
 MOST_FALSE, LEAST_SHARE, MOST_SIGMAS = 0.02, 0.5, 2.0
-# Openings are drawn from a side of 0.6 on, and pads up to 0.65.
-LEAST_LIKE, LARGEST_LIKE = 0.6, 0.65
+# Openings are drawn from a side of 0.6 on, and pads up to 0.65; pads of more than a half are what is left open between
+# bars that are narrower than they are.
+LEAST_LIKE, LARGEST_LIKE = 0.5, 0.65
 
 PATTERNS: Mapping[str, str] = {
     "chess": "chess",

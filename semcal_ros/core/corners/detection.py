@@ -37,10 +37,12 @@ from semcal_ros.core.corners.dots_and_lines import (
     fit_lattice_shapes,
     grow_at_scale,
     refine_cells,
+    split_mixture,
 )
 from semcal_ros.core.corners.lattice import Lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
+from semcal_ros.core.corners.neighbour_consistency import estimate_scatter_px
 from semcal_ros.core.corners.pattern import (
     PATTERN_NAMES,
     CellShape,
@@ -128,7 +130,7 @@ class LatticeDetection:
     image_size
         (width, height) without the databar, px.
     covariance_px2
-        (n, 2, 2) covariance of each position, px^2.
+        (n, 2, 2) covariance of each position, px^2: from the noise of the pixels, and the scatter beyond it.
     blur_px
         Median standard deviation of the blur of the edges, px.
     rejected_xy
@@ -249,6 +251,8 @@ class _Candidate:
         The lattices, and the shapes; None where too little is in view.
     filled, regular
         Parts of the image that its squares cover, and that those of them cover which continue their neighbours.
+    is_mixture
+        Whether only every other bright square is a cell, so that the lattice is not that of a chess board.
     """
 
     corners: Lattice
@@ -256,6 +260,7 @@ class _Candidate:
     shapes: CellShapes | None
     filled: float
     regular: float
+    is_mixture: bool
 
     @property
     def is_clear(self) -> bool:
@@ -273,18 +278,16 @@ def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
         corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
         if corners is None or len(corners.ij) < _LEAST_GROWN:
             continue
-        cells = bright_cells(image, corners)
+        bright = bright_cells(image, corners)
+        cells = None if bright is None else split_mixture(pyramid.level, bright)
         shapes = None if cells is None else fit_lattice_shapes(pyramid.level, cells)
         area = size[0] * size[1]
         filled = float(np.abs(np.linalg.det(corners.axes)).sum()) / area
-        candidate = _Candidate(corners, cells, shapes, filled, count_regular_area(corners) / area)
+        regular = count_regular_area(corners) / area
+        candidate = _Candidate(corners, cells, shapes, filled, regular, cells is not bright)
         yield candidate
-        if (
-            filled > _FILLED
-            and candidate.is_clear
-            and shapes is not None
-            and shapes.allows("chess")
-        ):
+        is_chess = shapes is not None and shapes.allows("chess") and not candidate.is_mixture
+        if filled > _FILLED and candidate.is_clear and is_chess:
             return
 
 
@@ -315,6 +318,8 @@ def _likely_shapes(
         return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
     if wanted == "auto":
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
+        if candidate.is_mixture:
+            likely = [s for s in shapes.every if s.pattern != "chess"]
         likely.sort(key=lambda s: (s.pattern != "chess", s.misfit))
         return list(likely)
     # The same points lie at the middle of dots and of crosses: only a chess board has others.
@@ -336,7 +341,9 @@ def _measure(
     """Fit the points of a pattern, at full resolution or where most of them pass, and judge them."""
     best: RefinedCorners | None = None
     spacing = np.linalg.norm(candidate.corners.axes, axis=2)
-    typical = float(np.median(spacing)) * (1.0 if shape.pattern == "chess" else np.sqrt(2.0))
+    if shape.pattern != "chess" and candidate.cells is not None:
+        spacing = np.linalg.norm(candidate.cells.axes, axis=2)
+    typical = float(np.median(spacing))
     first = (
         0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / _CELL_FULL_PX))))
     )
@@ -453,14 +460,16 @@ def _make_detection(
         corners.ij[nearest : nearest + 1], corners.ij, corners.xy, leave_out_self=False
     )
     spacing = float(np.linalg.svd(maps.axes[0], compute_uv=False)[0])
-    trace = np.trace(corners.covariance, axis1=1, axis2=2)
+    scatter = estimate_scatter_px(corners.ij, corners.xy, corners.covariance)
+    covariance = corners.covariance + scatter**2 * np.eye(2)
+    trace = np.trace(covariance, axis1=1, axis2=2)
     return LatticeDetection(
         corners.ij,
         corners.xy,
         np.sqrt(trace / 2.0),
         spacing,
         size,
-        corners.covariance,
+        covariance,
         corners.blur_px,
         corners.rejected_xy,
         pattern,

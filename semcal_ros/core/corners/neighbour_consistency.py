@@ -24,7 +24,7 @@ from semcal_ros.core.corners.corner_fit import PositionFit
 from semcal_ros.core.corners.local_map import SUPPORT_MIN, LocalMaps, fit_local_maps
 from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
 
-__all__ = ["find_consistent"]
+__all__ = ["estimate_scatter_px", "find_consistent"]
 
 
 # Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
@@ -34,6 +34,8 @@ MISS_SIGMAS = (5.0, 4.3, 3.7)
 MAP_ERROR_PX = 2.0
 # That error is concentrated in parts of the image, where it is this many times its median.
 MAP_ERROR_RATIO = 4.0
+# Scatter beyond that of chance: once in 400 images of a regular grid with independent errors.
+SCATTER_SIGMAS = 2.8
 # A trend of this degree follows smooth distortions and perspectives to a few hundredths of a pixel.
 # Twice as many corners as terms keep single corners from bending it.
 TREND_DEGREE = 5
@@ -68,6 +70,33 @@ def _agree_with_neighbours(
     covariance = covariance + (error**2)[:, None, None] * np.eye(2)
     passed = _squared_mahalanobis(miss, covariance) < sigmas**2
     return passed & (maps.support >= SUPPORT_MIN)
+
+
+def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array) -> float:
+    """Estimate by how much points scatter about their neighbours beyond their covariances, 1-sigma per axis in px.
+
+    Pixel noise does not tell it: edges are rough, debris lies beside them, and lines jitter. The result is 0 where
+    chance explains the scatter, which it does in 399 of 400 images of a regular grid.
+
+    Parameters
+    ----------
+    cells, xy, covariance
+        (n, 2), (n, 2) and (n, 2, 2) of the points.
+    """
+    every = np.ones(len(cells), dtype=np.bool_)
+    rest = xy - _trend(cells, every, xy)
+    maps = fit_local_maps(cells, cells, rest)
+    told = maps.support >= SUPPORT_MIN
+    if told.sum() < CORNERS_MIN:
+        return 0.0
+    miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
+    squared = _squared_mahalanobis(miss, covariance)[told]
+    excess = float(np.median(squared)) / MEDIAN_CHI2_2 - 1.0
+    # The median of n chi-squares of two degrees of freedom has a relative 1-sigma of 1 / (ln 2 sqrt(n)).
+    if excess < SCATTER_SIGMAS / (np.log(2.0) * np.sqrt(len(squared))):
+        return 0.0
+    variance = 0.5 * np.trace(covariance[told], axis1=1, axis2=2)
+    return float(np.sqrt(excess * np.median(variance)))
 
 
 def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:

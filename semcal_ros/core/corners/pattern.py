@@ -74,6 +74,9 @@ BLURS: Array = np.linspace(0.0, 0.24, 13)
 # Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
 ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
 ARM_WIDTHS: Array = np.linspace(0.06, 0.3, 9)
+# Least opening between lines, in cells. Square dots that wide could as well be what bars 0.45 of their distance wide
+# leave open.
+LINES_LEAST = 0.55
 # A million: odds beyond this say nothing more.
 ODDS_MAX = 1e6
 
@@ -215,9 +218,9 @@ def _shapes() -> _Shapes:
 
     for size in SIZES:
         add("dots", float(size), j1(np.pi * size * radius) * size / radius)
-        # Openings wider than half a cell leave lines between them; narrower ones are square dots.
+        # Openings wider than this leave lines between them; narrower ones are square dots.
         square = size * size * np.sinc(size * h) * np.sinc(size * k)
-        add("lines" if size >= 0.5 else "dots", float(size), square)
+        add("lines" if size >= LINES_LEAST else "dots", float(size), square)
     for arm in 2.0 * ARM_LENGTHS:
         for width in ARM_WIDTHS[arm > 2.0 * ARM_WIDTHS]:
             one = np.sinc(arm * h) * np.sinc(width * k) + np.sinc(width * h) * np.sinc(arm * k)
