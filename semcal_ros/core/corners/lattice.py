@@ -44,6 +44,8 @@ SEEDS_TRIED = 8
 # Number of the strongest saddle points among which seeds are looked for; one seed in the middle of
 # a board is enough.
 SEED_POINTS = 1200
+# Cells from the seed to the rim at most: with more than 1000 in a row, a tenth of a gigabyte.
+_MOST_CELLS = 1400
 # From a cell to its four neighbours.
 STEPS: Indices = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 
@@ -167,10 +169,12 @@ class _Growth:
         self._tree = tree
         self._size = np.array(image_size, dtype=np.float64)
         shortest = max(2.0, float(np.linalg.norm(axes, axis=1).min()))
-        self._half = min(400, 8 + int(1.5 * np.hypot(*image_size) / shortest))
+        # No more cells lie in a row than would have saddle points, nor than memory allows.
+        across = min(1.5 * np.hypot(*image_size) / shortest, len(saddles.xy))
+        self._half = min(_MOST_CELLS, 8 + int(across))
         side = 2 * self._half + 1
-        self._member = np.full((side, side), -1, dtype=np.int64)
-        self._axes = np.zeros((side, side, 2, 2))
+        self._member = np.full((side, side), -1, dtype=np.int32)
+        self._axes = np.zeros((side, side, 2, 2), dtype=np.float32)
         self._tried = np.zeros((side, side), dtype=np.int8)
 
     def run(self, seed: int, axes: Array) -> tuple[Lattice, Indices]:
@@ -182,9 +186,10 @@ class _Growth:
         while len(frontier):
             frontier = self._advance(frontier)
         ij = np.argwhere(self._member >= 0)
-        members = self._member[ij[:, 0], ij[:, 1]]
+        members = self._member[ij[:, 0], ij[:, 1]].astype(np.intp)
+        axes_of = self._axes[ij[:, 0], ij[:, 1]].astype(np.float64)
         return (
-            Lattice(ij - self._half, self._saddles.xy[members], self._axes[ij[:, 0], ij[:, 1]]),
+            Lattice(ij - self._half, self._saddles.xy[members], axes_of),
             members,
         )
 

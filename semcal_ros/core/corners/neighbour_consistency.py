@@ -83,20 +83,62 @@ def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array) -> float:
     cells, xy, covariance
         (n, 2), (n, 2) and (n, 2, 2) of the points.
     """
-    every = np.ones(len(cells), dtype=np.bool_)
-    rest = xy - _trend(cells, every, xy)
+    flat = xy - _trend(cells, np.ones(len(cells), dtype=np.bool_), xy, 1)
+    # Whatever a smooth model leaves of the distortion looks like scatter: the model that leaves least counts.
+    scores = [_score_neighbours(cells, flat, covariance), _score_lens(xy, flat, covariance)]
+    scores += [
+        _score_trend(cells, flat, covariance, degree) for degree in range(2, TREND_DEGREE + 1)
+    ]
+    excess = min(scores) - 1.0
+    # The median of n chi-squares of two degrees of freedom has a relative 1-sigma of 1 / (ln 2 sqrt(n)).
+    if not 0.0 < SCATTER_SIGMAS / (np.log(2.0) * np.sqrt(len(cells))) < excess < np.inf:
+        return 0.0
+    variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
+    return float(np.sqrt(excess * np.median(variance)))
+
+
+def _score_lens(xy: Array, flat: Array, covariance: Array) -> float:
+    """Return the variance, about a perspective with radial and decentring distortion, relative to the covariances."""
+    x, y = ((xy - xy.mean(axis=0)) / np.std(xy)).T
+    none, one, square = np.zeros_like(x), np.ones_like(x), x * x + y * y
+    columns = [
+        *((basis, none) for basis in (one, x, y)),
+        *((none, basis) for basis in (one, x, y)),
+        (x * x, x * y),
+        (x * y, y * y),
+        (x * square, y * square),
+        (square + 2.0 * x * x, 2.0 * x * y),
+        (2.0 * x * y, square + 2.0 * y * y),
+    ]
+    design = np.array(columns).reshape(len(columns), -1).T
+    freedom = design.shape[0] - design.shape[1]
+    if freedom < CORNERS_MIN:
+        return np.inf
+    target = flat.T.ravel()
+    rest = (target - design @ np.linalg.lstsq(design, target, rcond=None)[0]).reshape(2, -1).T
+    median = float(np.median(_squared_mahalanobis(rest, covariance))) / MEDIAN_CHI2_2
+    return median * design.shape[0] / freedom
+
+
+def _score_neighbours(cells: Indices, flat: Array, covariance: Array) -> float:
+    """Return the variance, about predictions of neighbours, relative to the covariances; infinite without any."""
+    rest = flat - _trend(cells, np.ones(len(cells), dtype=np.bool_), flat)
     maps = fit_local_maps(cells, cells, rest)
     told = maps.support >= SUPPORT_MIN
     if told.sum() < CORNERS_MIN:
-        return 0.0
+        return np.inf
     miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
-    squared = _squared_mahalanobis(miss, covariance)[told]
-    excess = float(np.median(squared)) / MEDIAN_CHI2_2 - 1.0
-    # The median of n chi-squares of two degrees of freedom has a relative 1-sigma of 1 / (ln 2 sqrt(n)).
-    if excess < SCATTER_SIGMAS / (np.log(2.0) * np.sqrt(len(squared))):
-        return 0.0
-    variance = 0.5 * np.trace(covariance[told], axis1=1, axis2=2)
-    return float(np.sqrt(excess * np.median(variance)))
+    return float(np.median(_squared_mahalanobis(miss, covariance)[told])) / MEDIAN_CHI2_2
+
+
+def _score_trend(cells: Indices, flat: Array, covariance: Array, degree: int) -> float:
+    """Return the same about a polynomial trend; infinite with more than half as many terms as points."""
+    count, terms = len(cells), (degree + 1) * (degree + 2) // 2
+    if 2 * terms > count:
+        return np.inf
+    rest = flat - _trend(cells, np.ones(count, dtype=np.bool_), flat, degree)
+    median = float(np.median(_squared_mahalanobis(rest, covariance))) / MEDIAN_CHI2_2
+    return median * count / (count - terms)
 
 
 def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:
@@ -120,10 +162,10 @@ def _map_error(maps: LocalMaps, good: Mask, covariance: Array, squared: Array) -
     return np.maximum(seen, np.minimum(worst, MAP_ERROR_RATIO * seen))
 
 
-def _trend(cells: Indices, good: Mask, xy: Array) -> Array:
-    """Return (n, 2) positions of all cells on a polynomial through the good corners."""
+def _trend(cells: Indices, good: Mask, xy: Array, most: int = TREND_DEGREE) -> Array:
+    """Return (n, 2) positions of all cells on a polynomial through the good corners, of at most the degree ``most``."""
     known = int(good.sum())
-    degree = max(d for d in range(1, TREND_DEGREE + 1) if d == 1 or (d + 1) * (d + 2) <= known)
+    degree = max(d for d in range(1, most + 1) if d == 1 or (d + 1) * (d + 2) <= known)
     low, high = cells.min(axis=0), cells.max(axis=0)
     scaled = (2.0 * cells - low - high) / max(1, int((high - low).max()))
     u, v = (np.vander(column, degree + 1, increasing=True) for column in scaled.T)

@@ -35,9 +35,10 @@ RELATIVE_THRESHOLD = 0.1
 # Rank of the response that stands for the strong saddles: as many corners as a usable image has at
 # least, so that a few specks brighter than the board do not set the threshold.
 STRONG_RANK = 12
-# Bounds the time. Squares of 11 px, small ones for a calibration, have 2200 corners in a 512 px
-# image.
-MAX_POINTS = 6000
+# Bounds the time: the saddle points of a lattice to which a scale is suited are four times the scale apart, and there
+# may be three times as many. An image of noise has some thousands at any scale that is looked at.
+LEAST_POINTS = 6000
+POINT_AREA = 5.0  # in squares of the scale
 
 
 class LatticeStatus(Enum):
@@ -94,7 +95,8 @@ def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
 
     xx, yy, xy = derive(kernel_2, kernel_0), derive(kernel_0, kernel_2), derive(kernel_1, kernel_1)
     response = (xy * xy - xx * yy) * np.float32(scale_px**4)
-    rows, columns = _strong_maxima(response, scale_px)
+    most = max(LEAST_POINTS, int(image.size / (POINT_AREA * scale_px**2)))
+    rows, columns = _strong_maxima(response, scale_px, most)
     hessian = np.empty((len(rows), 2, 2))
     hessian[:, 0, 0] = xx[rows, columns]
     hessian[:, 1, 1] = yy[rows, columns]
@@ -118,7 +120,9 @@ def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
     return SaddlePoints(points, hessian, response[rows, columns].astype(np.float64))
 
 
-def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _strong_maxima(
+    response: Image, scale_px: float, most: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     radius = max(1, round(1.2 * scale_px))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     peaks = (response >= cv2.dilate(response, kernel)) & (response > 0)
@@ -130,7 +134,7 @@ def _strong_maxima(response: Image, scale_px: float) -> tuple[NDArray[np.int64],
     order = np.argsort(-strength, kind="stable")
     if len(order):
         strong = strength[order[min(STRONG_RANK, len(order)) - 1]]
-        order = order[strength[order] > RELATIVE_THRESHOLD * strong][:MAX_POINTS]
+        order = order[strength[order] > RELATIVE_THRESHOLD * strong][:most]
     return rows[order].astype(np.int64), columns[order].astype(np.int64)
 
 
