@@ -21,12 +21,13 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timezone
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.stage import doubt_unit
@@ -35,6 +36,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.bags.reader import is_bag
+from semcal_ros.files.images.databar import find_databar
 from semcal_ros.files.images.image_file import (
     ImageFile,
     ImagePage,
@@ -62,6 +64,8 @@ MIN_SPACING_NS = 1_000_000
 """Least time between two images, whose files have whole seconds: 1000 images fit into one."""
 # What a maker's file and a user say about a pixel may differ in their last digits.
 _SAME_SCALE = 5e-3
+# Files in which a bar of text is looked for.
+_LOOKED_AT = 3
 
 
 @dataclass(frozen=True)
@@ -488,6 +492,37 @@ def _scale(
     return stated, skipped, []
 
 
+def _cut_databars(
+    images: tuple[SeriesImage, ...], display_width_m: float
+) -> tuple[tuple[SeriesImage, ...], list[str]]:
+    """Return the images without the bars of text that their files do not tell of, and a note.
+
+    Some of the images are looked at. Those of one size have bars of one height, if they have any.
+    """
+    # The first one of a file, since others of it may be far into a video.
+    firsts = {id(image.file): image for image in reversed(images)}
+    untold = [image for image in firsts.values() if image.databar_rows == 0]
+    looked = untold[:: max(1, len(untold) // _LOOKED_AT)][:_LOOKED_AT]
+    rows: dict[tuple[int, int], list[int]] = {}
+    stored = ImageSeries(tuple(looked), display_width_m, (), ())
+    for image, pixels in stored.read():
+        if isinstance(pixels, np.ndarray):
+            rows.setdefault(image.page.size_px, []).append(find_databar(pixels))
+    bars = {size: found[0] for size, found in rows.items() if len(set(found)) == 1 and found[0]}
+    if not bars:
+        return images, []
+    cut = tuple(
+        replace(image, databar_rows=bars.get(image.page.size_px, 0))
+        if image.databar_rows == 0
+        else image
+        for image in images
+    )
+    heights = " and ".join(str(height) for height in sorted(set(bars.values())))
+    return cut, [
+        f"the lowest {heights} rows are a data bar and are cut off; --databar-rows 0 keeps them"
+    ]
+
+
 def list_image_series(
     paths: Sequence[Path],
     *,
@@ -558,6 +593,9 @@ def list_image_series(
         for item, reading in zip(stamped, readings, strict=True)
     )
     left_out = (*skipped, *unscaled)
+    bar_notes: list[str] = []
+    if databar_rows is None:
+        images, bar_notes = _cut_databars(images, display_width_m)
     return ImageSeries(
         images,
         display_width_m,
@@ -567,6 +605,7 @@ def list_image_series(
             *stamp_notes,
             *detector_notes,
             *stage_notes,
+            *bar_notes,
             *_group_notes(files),
             *group_skipped(left_out),
         ),
