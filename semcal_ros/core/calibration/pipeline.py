@@ -42,8 +42,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses
 from semcal_ros.core.calibration.estimator.priors import Priors, Setup
-from semcal_ros.core.calibration.estimator.problem import variance_factor
+from semcal_ros.core.calibration.estimator.problem import build_problem, variance_factor
 from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
 from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
@@ -69,7 +70,7 @@ from semcal_ros.core.calibration.stage import (
     attitudes,
     stage_rotations,
 )
-from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start
+from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start, with_excess
 from semcal_ros.core.calibration.untilted import look_untilted, mark_untilted
 from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
 from semcal_ros.core.errors import (
@@ -93,9 +94,7 @@ _IRREGULAR = 4.0
 # Views that are left out to see.
 _SUSPECTS = 3
 # Part of the untilted recordings that are seen to be such, and the part of the uncertainty that knowing it leaves.
-_CONFIDENCE, _MUCH_LESS = 0.95, 0.5
-# By how much more the corners may scatter with zero tilts than without, px and as a factor: no visible difference.
-_SAME_SCATTER_PX, _SAME_SCATTER = 0.002, 1.05
+_CONFIDENCE, _MUCH_LESS = 0.95, 0.7
 # Part of the tilts that are refused, and of the angle to the stage's own, at which it is the axis that is wrong.
 _MOST_REFUSED, _MUCH_NEARER = 0.5, 0.3
 
@@ -289,20 +288,27 @@ def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Fin
     They do where half the chi-square of the adjustment rises by no more than that of so many unknowns does by chance
     once in twenty. They are not taken for granted: all views of a specimen on a slanted stub are tilted alike.
     """
-    if any(v.untilted or v.has_stage_tilt for v in setup.views) or not look_untilted(setup):
+    told = any(v.untilted or v.has_stage_tilt for v in setup.views) or joint.field is not None
+    if told or not setup.shared or not look_untilted(setup):
         return []
     flat = add_shared_unknowns(mark_untilted(setup, "all"))
-    adjustment = joint.adjustment
+    # The same functions, from which only the tilts are taken.
+    own = joint.adjustment
+    noisy = with_excess(flat, joint.excess_px)
+    problem = build_problem(noisy, own.functions, noisy.views, own.spread)
+    result, _ = adjust_with_other_poses(noisy, own.functions, own.spread, problem, own.result.state)
+    rise = (
+        2.0 * (result.cost - own.result.cost) / max(variance_factor(own.problem, own.result), 1.0)
+    )
+    limit = float(chi2.ppf(_CONFIDENCE, 2 * len(setup.views)))
+    if rise > limit:
+        return []
     try:
         other = fit_joint(flat, "off")
     except CalibrationError:
         return []
-    factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
-    rise = 2.0 * (other.adjustment.result.cost - adjustment.result.cost) / factor
-    limit = float(chi2.ppf(_CONFIDENCE, 2 * len(setup.views)))
-    now, then = (_worst_sigma(setup, own) for own in (fit, describe_fit(flat, other)))
-    scatters = other.excess_px > _SAME_SCATTER * joint.excess_px + _SAME_SCATTER_PX
-    if scatters or rise > limit or then > _MUCH_LESS * now:
+    now, then = (_worst_sigma(setup, one) for one in (fit, describe_fit(flat, other)))
+    if then > _MUCH_LESS * now:
         return []
     return [
         Finding(

@@ -76,8 +76,8 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
 
 
 def look_untilted(setup: Setup) -> bool:
-    """Whether no view looks tilted by more than an aspect ratio that is not 1 makes it look."""
-    return bool(np.all(_apparent_tilts(setup) < _FLAT_RAD))
+    """Whether every view looks tilted by no more than an aspect ratio that is not 1 makes it look."""
+    return bool(np.all(_apparent_tilts(setup) < _CLEARLY_TILTED_RAD))
 
 
 def _apparent_tilts(setup: Setup) -> Array:
