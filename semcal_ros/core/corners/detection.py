@@ -67,7 +67,7 @@ _LARGEST_SCALE_PART = 0.075
 MINIMUM_CORNERS = 8
 # Points of a lattice that is looked at closely: less would be a seed and its neighbours.
 _LEAST_GROWN = 6
-# A lattice that covers this part of the image will not be surpassed at another scale.
+# A lattice whose regular squares cover this part of the image will not be surpassed at another scale.
 _FILLED = 0.6
 # Part of the expected points that pass beyond which no coarser picture shows more of them.
 _CONVINCING = 0.8
@@ -287,7 +287,7 @@ def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
         candidate = _Candidate(corners, cells, shapes, filled, regular, cells is not bright)
         yield candidate
         is_chess = shapes is not None and shapes.allows("chess") and not candidate.is_mixture
-        if filled > _FILLED and candidate.is_clear and is_chess:
+        if candidate.regular > _FILLED and candidate.is_clear and is_chess:
             return
 
 

@@ -65,6 +65,8 @@ __all__ = [
 
 # Distance between cells up to which they are classified at full resolution, px: the coarse mean has 16 bins.
 COARSE_PX = 64.0
+# Least sine of the angle between the axes of a cell: a tilt of 75 degrees makes it so acute.
+LEAST_SINE = 0.25
 # Mean square difference of two kinds of cells, in variances of their mean, from which they are not alike: noise in a
 # mean of 40 cells makes a hundredth at a signal to noise ratio of 1, and dots and gaps differ by several.
 MIXTURE, MIXTURE_ROUNDS = 0.5, 2
@@ -110,7 +112,12 @@ def grow_at_scale(
     moved = SaddlePoints(
         factor * saddles.xy + 0.5 * (factor - 1.0), saddles.hessian, saddles.response
     )
-    return grow_best_lattice(moved, size)
+    lattice = grow_best_lattice(moved, size)
+    if lattice is None:
+        return None
+    # In noise the axes of a cell may fall onto each other: it is none.
+    length = np.linalg.norm(lattice.axes, axis=2).prod(axis=1)
+    return lattice.select(np.abs(np.linalg.det(lattice.axes)) > LEAST_SINE * length)
 
 
 def count_regular_area(cells: Lattice) -> float:
