@@ -320,7 +320,8 @@ def _likely_shapes(
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
         if candidate.is_mixture:
             likely = [s for s in shapes.every if s.pattern != "chess"]
-        likely.sort(key=lambda s: (s.pattern != "chess", s.misfit))
+        # Blurred dots may as well be crosses, which are rarer.
+        likely.sort(key=lambda s: (s.pattern != "chess", s.pattern == "crosses", s.misfit))
         return list(likely)
     # The same points lie at the middle of dots and of crosses: only a chess board has others.
     if (shapes.best.pattern == "chess") != (wanted == "chess") and not shapes.allows(wanted):
