@@ -60,6 +60,7 @@ from semcal_ros.core.calibration.start import Start, tempered
 from semcal_ros.core.calibration.views import estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import TERM_NAMES
 from semcal_ros.core.camera.residual_field import ResidualField
+from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = ["Selection", "excess_px", "select", "select_and_adjust"]
 
@@ -167,7 +168,13 @@ def _add_field(
             return start, None, None
         system = field_system(setup, adjustment.problem, adjustment.result, field)
         if turn < _CHOOSING_TURNS:
-            choice = choose_field(setup, system, blank)
+            try:
+                choice = choose_field(setup, system, blank)
+            except UnusableCalibrationError:
+                if always:
+                    raise
+                # What cannot be predicted from the rest does not show that there is a field.
+                return start, None, None
             if not (choice.worthwhile or always):
                 return start, None, None
             if turn == 0 and setup.shared and not always:
