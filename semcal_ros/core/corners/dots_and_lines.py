@@ -74,8 +74,9 @@ MIXTURE, MIXTURE_ROUNDS = 0.5, 2
 SAMPLE = 60
 SAMPLE_PIXELS = 400_000
 SAMPLE_MIN = 12
-# Cells for the classification, which needs less.
+# Cells for the classification, which needs less, but as many pixels of small cells as of large ones.
 SAMPLE_COARSE = 40
+COARSE_PIXELS = 100_000
 # Rounds of mean and fit. Positions from saddle points, good to a twentieth of the spacing, smear
 # the first mean; the second has converged.
 MEAN_ROUNDS = 3
@@ -209,7 +210,9 @@ def _mean_cell(level: Callable[[int], Array32], cells: Lattice) -> UnitCell | No
     spacing = float(np.median(np.linalg.norm(cells.axes, axis=2)))
     octave = max(0, int(np.ceil(np.log2(spacing / COARSE_PX))))
     image, cells = level(octave), cells.reduced(2.0**octave)
-    few = np.random.default_rng(0).permutation(len(cells.ij))[:SAMPLE_COARSE]
+    area = max(float(np.median(np.abs(np.linalg.det(cells.axes)))), 1.0)
+    most = max(SAMPLE_COARSE, int(COARSE_PIXELS / area))
+    few = np.random.default_rng(0).permutation(len(cells.ij))[:most]
     count = len(few)
     # Cells may be too few for local maps, and their axes are good enough.
     flat = np.zeros((count, 2, 2))
