@@ -21,11 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.certificate import certify
 from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import Functions, variance_factor
-from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
 from semcal_ros.core.calibration.judgement.evaluate import ViewPose, fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
 from semcal_ros.core.calibration.judgement.outliers import find_change_point
@@ -146,13 +144,8 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
         tuple(findings),
         None if fit.field is None else fit.field.field,
         estimate_repeatability(setup, fit),
-        "" if result.converged or _is_long(result) else result.status.value,
+        "" if result.converged else result.status.value,
     )
-
-
-def _is_long(result: BundleResult) -> bool:
-    """Whether only the number of steps ended an adjustment: its certificate says whether more would matter."""
-    return result.status is DescentStatus.ITERATION_LIMIT and not np.any(result.lost)
 
 
 def _predict_held_out(setup: Setup, fit: MethodFit, method: str) -> dict[float, float]:

@@ -179,6 +179,9 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
             residuals = result.prior_residuals["height"][own, 0] * sigma / sigma[0]
             variance = result.prior_variance["height"][own, 0]
             height[own] = _update(float(sigma[0]), priors.height_sigma_m, residuals, variance).sigma
+    if len(height) < _ENOUGH_HEIGHTS:
+        # Otherwise a height would widen its own prior, and a camera could run away with it.
+        height = np.minimum(height, priors.height_sigma_m)
     effects = problem.effects
     if effects is None:
         start = initial_components(setup)
