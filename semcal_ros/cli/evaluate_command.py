@@ -21,7 +21,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, dask_option, json_option
+from semcal_ros.cli.options import PATH, dask_option, json_option, squares_option
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -43,12 +43,15 @@ __all__ = ["command"]
 @click.command("evaluate")
 @click.argument("calibration", type=PATH)
 @recording_input
+@squares_option(
+    "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
+)
 @click.option(
     "--pattern",
     type=click.Choice(PATTERNS),
     default="auto",
     show_default=True,
-    help="What the grid consists of: chess squares, dots or holes, or crossed lines.",
+    help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
 )
 @dask_option
 @json_option
@@ -56,6 +59,7 @@ def command(
     calibration: Path,
     recording: RecordedFiles,
     config: MicroscopeConfig,
+    squares: tuple[float, ...] | None,
     pattern: str,
     dask: str | None,
     as_json: bool,
@@ -74,6 +78,7 @@ def command(
             calibration,
             recording,
             config=config,
+            squares_m=squares,
             pattern=pattern,
             dask=dask,
             on_progress=on_progress,

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from semcal_ros.core.calibration.judgement.evaluate import (
@@ -32,6 +33,7 @@ from semcal_ros.workflows.inputs import (
     ConfigSource,
     OnProgress,
     Source,
+    check_positives,
     count_frames,
     ignore_progress,
     open_source,
@@ -103,6 +105,7 @@ def evaluate(
     *,
     config: ConfigSource | None = None,
     magnification: float | None = None,
+    squares_m: Sequence[float] | None = None,
     pattern: str = "auto",
     dask: str | None = None,
     on_progress: OnProgress = ignore_progress,
@@ -122,6 +125,8 @@ def evaluate(
         A ``msg_configs`` name or file; the default is ``generic``.
     magnification
         Magnification of a folder of ordinary images, which do not contain it.
+    squares_m
+        Sides of the squares of the grid, or pitches, in place of those of the configuration, m.
     pattern
         What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`.
     dask
@@ -154,7 +159,9 @@ def evaluate(
         found,
         rejected,
         display_width_m=microscope.display_width_m,
-        squares_m=microscope.squares_m,
+        squares_m=microscope.squares_m
+        if squares_m is None
+        else check_positives(squares_m, "squares_m"),
     )
     on_progress("fitting the views", 0, None)
     record = model.record or FitRecord(_HEIGHT_SIGMA_M)
