@@ -357,6 +357,12 @@ def test_evaluate_says_how_far_nm_per_pixel_is_off(folder, tmp_path, capsys):
     assert difference == pytest.approx(0.02, abs=0.002)
     # The reprojection error hardly sees it.
     assert errors["wrong"]["rms_px"] < 1.5 * errors["right"]["rms_px"]
+    # Squares that are 2 % larger than the images' say the same.
+    capsys.readouterr()
+    larger = "25.5um,10.2um,5.1um,2.04um,1.02um"
+    assert run("evaluate", folder / "cal.yaml", other, "--squares", larger, "--json") == 0
+    (row,) = json.loads(capsys.readouterr().out)["by_magnification"]
+    assert row["scale_error"] - errors["right"]["scale_error"] == pytest.approx(-0.02, abs=0.002)
 
 
 @pytest.mark.parametrize(
