@@ -234,8 +234,9 @@ def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     drift = drift - mean[visit]
     scale = np.min(problem.unit_m) / problem.unit_m
     design = np.stack([np.ones_like(scale), scale**2], axis=1)
-    own = np.maximum(1.0 - result.prior_variance["drift"], 0.0)
-    determined = np.sum(np.minimum(own, 1.0 - 1.0 / count[visit, None]), axis=1)
+    # Of the deviations from the mean, as much of the prior variance as the posterior does not leave.
+    left = result.prior_variance["drift"] - result.mean_drift_variance[visit] / sigma[:, None] ** 2
+    determined = np.sum(np.maximum(1.0 - 1.0 / count[visit, None] - left, 0.0), axis=1)
     square = np.sum(drift**2, axis=1)
     # The weights are those of chi-squares of the spread before, with as many degrees of freedom as
     # are determined; the last row is the usual one.
