@@ -33,7 +33,7 @@ from semcal_ros.core.calibration.nominal_scale import (
     is_scale_far,
 )
 from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
-from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, calibrate_views
+from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, are_enough, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import (
     FoundView,
@@ -276,8 +276,7 @@ def calibrate_found(
     if found:
         options = replace(options, untilted=name_untilted(options.untilted, found))
     collected = collect_views(found, rejected, display_width_m=display_width_m, squares_m=squares_m)
-    few = len(collected.views) < FEWEST_VIEWS and options.untilted != "all"
-    if few and collected.rejected:
+    if collected.rejected and not are_enough(collected.views, options):
         count = len(collected.views) + len(collected.rejected)
         raise CalibrationError(
             f"a calibration from {counted(len(collected.views), 'view')} of {counted(count, 'image')} "

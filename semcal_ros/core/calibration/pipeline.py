@@ -81,7 +81,7 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 
-__all__ = ["FEWEST_VIEWS", "calibrate_views", "fit_joint"]
+__all__ = ["FEWEST_VIEWS", "are_enough", "calibrate_views", "fit_joint"]
 
 # Twice as many as determine a homography, so that there are residuals to judge a view by.
 _MIN_CORNERS = 8
@@ -178,6 +178,15 @@ def fit_joint(
     return solve(select(started, residual), on_stage)
 
 
+def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
+    """Whether there are as many views as a calibration needs: :data:`FEWEST_VIEWS`, or one if all tilts are known."""
+    if len(views) >= FEWEST_VIEWS:
+        return True
+    named = set() if isinstance(options.untilted, str) else set(options.untilted)
+    known = options.untilted == "all" or all(v.has_stage_tilt or v.name in named for v in views)
+    return bool(views) and known and options.method == "joint"
+
+
 def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tuple[GridView, ...]:
     """Return the views in the order of their magnifications, or raise if they are too few.
 
@@ -189,9 +198,7 @@ def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tupl
             expected="images of a chess grid",
             do="check focus and contrast, and that the grid fills the image",
         )
-    named = set() if isinstance(options.untilted, str) else set(options.untilted)
-    known = options.untilted == "all" or all(v.has_stage_tilt or v.name in named for v in views)
-    if len(views) < FEWEST_VIEWS and not (known and options.method == "joint"):
+    if not are_enough(views, options):
         raise CalibrationError(
             f"a calibration from {counted(len(views), 'view')}",
             expected=f"at least {FEWEST_VIEWS} views of the grid in different directions, or views whose tilt is known",

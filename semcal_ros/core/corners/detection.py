@@ -362,7 +362,7 @@ def _measure(
         )
     if shape.pattern == "chess":
         return _judge_chess(pyramid, candidate, best)
-    return _judge(best, candidate, pyramid.size, shape)
+    return _judge(best, candidate, pyramid.size, shape.pattern)
 
 
 def _passed(points: RefinedCorners) -> float:
@@ -395,9 +395,7 @@ def _judge_chess(
     pyramid: _Pyramid, candidate: _Candidate, corners: RefinedCorners
 ) -> LatticeDetection | Rejection[LatticeStatus]:
     """Return the corners if they are good enough and, as fitted, still those of a chess board."""
-    shapes = candidate.shapes
-    chess = CellShape("chess", True, 1.0, 0.0, 0.0) if shapes is None else shapes.chess
-    judged = _judge(corners, candidate, pyramid.size, chess)
+    judged = _judge(corners, candidate, pyramid.size, "chess")
     if isinstance(judged, Rejection) or candidate.is_clear:
         return judged
     maps = fit_local_maps(judged.ij, judged.ij, judged.xy, leave_out_self=False)
@@ -421,10 +419,10 @@ def _filled_by(points: LatticeDetection) -> float:
 
 
 def _judge(
-    points: RefinedCorners, candidate: _Candidate, size: tuple[int, int], shape: CellShape
+    points: RefinedCorners, candidate: _Candidate, size: tuple[int, int], pattern: Pattern
 ) -> LatticeDetection | Rejection[LatticeStatus]:
     """Return the points of a candidate, if they are good enough."""
-    what = _POINTS[shape.pattern]
+    what = _POINTS[pattern]
     if points.quality < 0.5:
         return Rejection(
             LatticeStatus.NO_LATTICE,
@@ -448,8 +446,8 @@ def _judge(
             LatticeStatus.TOO_FEW_CORNERS,
             f"too few {what}: {len(points.ij)} found, at least {MINIMUM_CORNERS} needed",
         )
-    odds = float("nan") if candidate.shapes is None else candidate.shapes.odds_of(shape.pattern)
-    return _make_detection(points, size, shape.pattern, odds)
+    odds = float("nan") if candidate.shapes is None else candidate.shapes.odds_of(pattern)
+    return _make_detection(points, size, pattern, odds)
 
 
 def _make_detection(
