@@ -21,7 +21,8 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import PATH, dask_option, json_option, squares_option
+from semcal_ros.cli.grid_options import squares_and_pattern
+from semcal_ros.cli.options import PATH, dask_option, json_option
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -32,7 +33,6 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.corners import PATTERNS
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.evaluate import evaluate
@@ -43,16 +43,7 @@ __all__ = ["command"]
 @click.command("evaluate")
 @click.argument("calibration", type=PATH)
 @recording_input
-@squares_option(
-    "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
-)
-@click.option(
-    "--pattern",
-    type=click.Choice(PATTERNS),
-    default="auto",
-    show_default=True,
-    help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
-)
+@squares_and_pattern
 @dask_option
 @json_option
 def command(

@@ -39,31 +39,32 @@ def _parse_untilted(
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def squares_and_pattern(command: Command) -> Command:
+    """``--squares`` and ``--pattern``."""
+    pattern = click.option(
+        "--pattern",
+        type=click.Choice(PATTERNS),
+        default="auto",
+        show_default=True,
+        help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
+    )
+    squares = squares_option(
+        "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
+    )
+    return squares(pattern(command))
+
+
 def grid_options(command: Command) -> Command:
     """``--squares``, ``--pattern`` and ``--untilted``."""
-    options = (
-        squares_option(
-            "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
-        ),
-        click.option(
-            "--pattern",
-            type=click.Choice(PATTERNS),
-            default="auto",
-            show_default=True,
-            help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
-        ),
-        click.option(
-            "--untilted",
-            callback=_parse_untilted,
-            default="auto",
-            show_default=True,
-            metavar="auto|all|none|N,N,...",
-            help="Frames without tilt, by number or by file name, if no stage says the tilts.",
-        ),
+    untilted = click.option(
+        "--untilted",
+        callback=_parse_untilted,
+        default="auto",
+        show_default=True,
+        metavar="auto|all|none|N,N,...",
+        help="Frames without tilt, by number or by file name, if no stage says the tilts.",
     )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    return squares_and_pattern(untilted(command))
 
 
 def refuse_grid_options(why: str) -> None:

@@ -156,13 +156,17 @@ def _squares(lattice: Lattice, parity: int) -> Lattice:
     i, j = (lattice.ij - low).T
     corners = np.stack([member[i, j], member[i + 1, j], member[i, j + 1], member[i + 1, j + 1]])
     keep = np.all(corners >= 0, axis=0) & (lattice.ij.sum(axis=1) % 2 == parity)
-    first = lattice.ij[keep] - np.array([parity, 0])
-    ij = np.stack([first.sum(axis=1) // 2, (first[:, 1] - first[:, 0]) // 2], axis=1)
     xy = lattice.xy[corners[:, keep]].mean(axis=0)
+    return _along_diagonals(Lattice(lattice.ij[keep], xy, lattice.axes[keep]), parity)
+
+
+def _along_diagonals(cells: Lattice, parity: int) -> Lattice:
+    """Return cells whose i + j all have this parity, as a lattice of their own."""
+    i, j = (cells.ij - np.array([parity, 0])).T
+    ij = np.stack([(i + j) // 2, (j - i) // 2], axis=1).astype(np.intp)
     # A step along the new i is one along both old axes; along the new j, back along i and on along j.
-    old = lattice.axes[keep]
-    axes = np.stack([old[:, 0] + old[:, 1], old[:, 1] - old[:, 0]], axis=1)
-    return Lattice(ij.astype(np.intp), xy, axes)
+    axes = np.stack([cells.axes.sum(axis=1), cells.axes[:, 1] - cells.axes[:, 0]], axis=1)
+    return Lattice(ij, cells.xy, axes)
 
 
 def _median_at(image: Image, xy: Array) -> float:
@@ -188,11 +192,7 @@ def split_mixture(level: Callable[[int], Array32], cells: Lattice) -> Lattice:
         if np.mean((even - odd) ** 2) < MIXTURE * np.var(0.5 * (even + odd)):
             break
         brighter = int(odd.mean() > even.mean())
-        part = parts[brighter]
-        i, j = (part.ij - np.array([brighter, 0])).T
-        ij = np.stack([(i + j) // 2, (j - i) // 2], axis=1).astype(np.intp)
-        axes = np.stack([part.axes.sum(axis=1), part.axes[:, 1] - part.axes[:, 0]], axis=1)
-        cells = Lattice(ij, part.xy, axes)
+        cells = _along_diagonals(parts[brighter], brighter)
     return cells
 
 
